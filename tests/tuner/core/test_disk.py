@@ -1,11 +1,18 @@
+"""Files: a full disk, damaged arrays, what ships with the program."""
+
+from __future__ import annotations
+
 import errno
 import os
 import sys
+from pathlib import Path
 
 import pytest
 
 from tuner.core.disk import cache_folder, check_folder, exists, make_folder, whole_file, write_text
-from tuner.core.errors import InputError, OutputError
+from tuner.core.errors import ConfigError, InputError, OutputError
+from tuner.core.files import read_arrays
+from tuner.core.shipped import configs_folder, find_config
 
 
 @pytest.fixture
@@ -76,3 +83,31 @@ def test_cache_folder_follows_the_platform(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(sys, "platform", "darwin")
     assert cache_folder() == tmp_path / "Library" / "Caches" / "multirotor-tune"
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not a zip", b"plain text", b"\x93NUMPY"])
+def test_damaged_arrays_are_one_line(content, tmp_path):
+    path = tmp_path / "x.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"x\.npz: is damaged .*; run tune again"):
+        read_arrays(path, remedy="run tune again")
+    with pytest.raises(InputError, match="is damaged"):
+        read_arrays(tmp_path / "none.npz", remedy="run tune again")
+
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def test_a_checkout_reads_the_folder_at_its_root():
+    assert configs_folder() == ROOT / "configs"
+
+
+def test_a_path_is_a_path_and_a_bare_name_is_a_shipped_file(tmp_path):
+    assert find_config("vehicles", "v.yaml", tmp_path) == tmp_path / "v.yaml"
+    assert find_config("vehicles", "sub/v", tmp_path) == tmp_path / "sub" / "v"
+    shipped = configs_folder() / "vehicles" / "hovergames.yaml"
+    assert find_config("vehicles", "hovergames", tmp_path) == shipped
+    (tmp_path / "hovergames").touch()
+    assert find_config("vehicles", "hovergames", tmp_path) == tmp_path / "hovergames"
+    with pytest.raises(ConfigError, match="did you mean 'hovergames'"):
+        find_config("vehicles", "hovergaems", tmp_path)

@@ -1,4 +1,4 @@
-"""What to fly next, on a problem whose answer is known."""
+"""What to fly next, on a problem whose answer is known, and as sentences."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from tests.tuner.uncertainty import making
 from tuner.core.errors import InputError
 from tuner.design import ranking as proposed
 from tuner.design.proposals import (
+    Proposal,
     Proposals,
     proposals_in_words,
 )
@@ -144,3 +145,38 @@ def test_proposals_can_be_read_back(proposals: Proposals, tmp_path: Path) -> Non
     lines = (tmp_path / "next_flight.csv").read_text().splitlines()
     assert len(lines) == 1 + len(proposals.flights)
     assert lines[0].startswith("flight,mean_shrink,volume_shrink,")
+
+
+def in_a_hall(*flights: Proposal) -> Proposals:
+    return Proposals(
+        arena=(4.0, 3.0, 2.0),
+        seconds=20.0,
+        targets=["inertia_xx", "moment_constant", "mass"],
+        fixed_targets=["mass"],
+        all_known=False,
+        flights=list(flights),
+    )
+
+
+def flight(name: str, **shrinks: float) -> Proposal:
+    return Proposal(name=name, trajectory={}, shrinks=shrinks, volume=0.9)
+
+
+def test_sentences_name_each_flight_and_what_it_would_narrow() -> None:
+    sentences = proposals_in_words(
+        in_a_hall(
+            flight("a circle", inertia_xx=0.2, moment_constant=0.95, mass=0.97),
+            flight("a yaw spin at 4 rad/s", inertia_xx=0.8, moment_constant=0.5, mass=0.99),
+        )
+    )
+    not_narrowed = "No single flight in this arena would narrow the interval of mass (fixed so far)"
+    assert sentences == [
+        "A circle would narrow the interval of inertia_xx to 20% of what it is.",
+        "A yaw spin at 4 rad/s would halve the interval of moment_constant.",
+        f"{not_narrowed} by more than 10%.",
+    ]
+
+
+def test_an_arena_in_which_nothing_flies() -> None:
+    (sentence,) = proposals_in_words(in_a_hall())
+    assert "stays in the air" in sentence
