@@ -28,7 +28,14 @@ from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, State
 from sim_jax.terms import total
-from tuner.objective.flight import MOTION, SPEEDS, TURNED, beginning_of, recorded_of
+from tuner.objective.flight import (
+    MOTION,
+    SETPOINTS,
+    SPEEDS,
+    TURNED,
+    beginning_of,
+    recorded_of,
+)
 from tuner.objective.initial_conditions import SPIN
 from tuner.objective.segments import Segments
 from tuner.vehicle import COEFFICIENTS
@@ -41,7 +48,10 @@ from tuner.vehicle.model import (
 
 Array = NDArray[np.float64]
 
-LOGGED = ("position", "attitude", "body_rate", "rotor_speed", "command", MOTION, TURNED, SPEEDS)
+LOGGED = (
+    *("position", "attitude", "body_rate", "rotor_speed", "command"),
+    *(MOTION, TURNED, SPEEDS, SETPOINTS),
+)
 """What every program without derivatives logs; what nobody asks for is not written."""
 AT_ONCE = 2
 """Columns of derivatives in one pass over a block of segments: with more, code leaves the
