@@ -205,6 +205,11 @@ class Predictor:
             np.mean(~(white <= GATE)) <= LOST for _, white in self._sizes() if len(white) > 0
         )
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether some innovation is no number: a flight left the recorded one for good."""
+        return not all(np.isfinite(white).all() for _, white in self._sizes())
+
     def _sizes(self) -> Iterator[tuple[str, Array]]:
         """Return each channel with the sizes (n,) of its whitened innovations."""
         assert self.found is not None

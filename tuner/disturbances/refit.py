@@ -119,7 +119,8 @@ class _Equations(NamedTuple):
     def step(self, space: Space, point: Point, damping: float = 0.0) -> Array | None:
         """Return the Gauss-Newton step in which what would leave its bounds stays where it is.
 
-        A share of the Hessian's diagonal is added to it. None where it is not worth taking.
+        A share of the Hessian's diagonal is added to it. None where it is not worth taking, or is
+        none, since the filter has lost a flight.
         """
         free = self.free.copy()
         hessian = self.hessian + damping * np.diag(np.diag(self.hessian))
@@ -130,7 +131,7 @@ class _Equations(NamedTuple):
             share = _share_after(space, point, change)
             leaves = np.flatnonzero(free[: len(space)] & ((share <= 0.0) | (share >= 1.0)))
             if not len(leaves):
-                return None if -0.5 * (self.gradient @ change) < ENOUGH else change
+                return change if -0.5 * (self.gradient @ change) >= ENOUGH else None
             free[leaves] = False
 
 

@@ -40,6 +40,7 @@ dozen coefficients beyond three in every sixth fit, and beyond four in every thi
 
 SELECTIONS = 3
 """How often innovations may call for other terms, each time beside those of the last."""
+LACKS = "Disturbances cannot be estimated: the model lacks something else."
 ROUGHLY = 2
 """Steps before they do so first: what is missing would in time be taken for disturbances."""
 
@@ -100,6 +101,9 @@ def with_disturbances(
     clock = time.perf_counter()
     on_message("The residuals hold more than noise: refitting with estimated disturbances.")
     there, predictor = _descended(selected, fitted, predictor, steps=ROUGHLY)
+    if predictor.is_lost:
+        on_message(LACKS)
+        return None
     seen = Innovations.of(selected, there, predictor)
     had = _kept(selected)
     for number in range(SELECTIONS):
@@ -113,7 +117,7 @@ def with_disturbances(
         there, predictor = _descended(selected, there, predictor)
         seen = Innovations.of(selected, there, predictor)
     if not predictor.keeps_track:
-        on_message("Disturbances cannot be estimated: the model lacks something else.")
+        on_message(LACKS)
         return None
     job = seen.selected.job
     offsets = free_offsets(job)
