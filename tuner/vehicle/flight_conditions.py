@@ -141,7 +141,8 @@ SURROUNDING_ROWS = (
         place=(EFFECTS, "tachometer_lag"),
         scale="linear",
         bounds=(-0.1, 0.1),
-        prior_sd=0.01,
+        # of filters at 8 to 20 Hz; a tenth of it stamps hide, which tell the period of a loop alone
+        prior_sd=0.02,
         step=0.002,
         neutral=0.0,
         group="tachometer_lag",
