@@ -150,11 +150,11 @@ def with_disturbances(
         )
     otherwise = alternatives_of(fitted.objective, fitted.point)
     before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt, lack=lack)
-    if not _agree(examination.uncertainty, before.uncertainty):
+    agree = _agree(examination.uncertainty, before.uncertainty)
+    if not agree:
         on_message("It contradicts the fit of the simulated flights, which is kept.")
-        return None
-    sharper = _is_sharper(examination.uncertainty, before.uncertainty)
-    return (seen.selected, again, examination) if sharper else None
+    better = agree and _is_sharper(examination.uncertainty, before.uncertainty)
+    return (seen.selected, again, examination) if better else None
 
 
 def _kept(selected: Selected) -> list[str]:
