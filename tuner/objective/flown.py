@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from lanes import Argument, Program
 from sim_jax.crash import Limits
 from sim_jax.environment import Environment
-from sim_jax.inlet import Inlet
+from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, State
@@ -146,16 +146,17 @@ def fly(
     logged = names if moves else tuple(dict.fromkeys((*LOGGED, *names)))
     coefficients = {**coefficients_in(model), **coefficients}
     own = not moves or any(np.ndim(value) for value in coefficients.values())
-    if segments.freedom is None:  # as flights with a spin have it: one program serves both
+    if segments.freedom is None and isinstance(segments.inlet, ReferenceInlet):
+        # as flights with a spin have it: one program serves both
         nothing = np.zeros((len(SPIN), segments.count))
         segments = replace(segments, freedom=nothing, freed=SPIN)
-    if states is None:
+    if segments.freedom is not None and states is None:
         states = np.zeros((len(segments.freed), segments.count))
     given = _Given(
         model=model,
         coefficients={name: np.asarray(value, float) for name, value in coefficients.items()},
         segments=flown_part(segments),
-        states=states,
+        states=None if segments.freedom is None else states,
         conditions=dict(conditions),
     )
     if own:
@@ -277,7 +278,8 @@ def _directions(given: _Given, tangents: Mapping[str, Array]) -> list[Array]:
     count = len(next(iter(tangents.values())))
     still = np.zeros(count)
     moved = [tangents.get(name, still) for name in sorted(given.coefficients)]
-    moved.append(tangents.get("states", np.zeros((count, len(given.states)))))
+    if given.states is not None:
+        moved.append(tangents.get("states", np.zeros((count, len(given.states)))))
     return [*moved, *(tangents.get(name, still) for name in sorted(given.conditions))]
 
 

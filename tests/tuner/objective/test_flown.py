@@ -10,13 +10,19 @@ import numpy as np
 import pytest
 
 from lanes import joined
+from sim_jax.crash import AIRBORNE
+from sim_jax.inlet import ActuatorInlet
 from sim_jax.rollout import rollout
+from sim_jax.state import hover
+from tests.sim_jax.support import controller, vec
+from tests.sim_jax.test_rotor_counts import SCHEDULE, STEPS, round_airframe
 from tuner.config import Options, settle
 from tuner.objective import flown
 from tuner.objective.flight import beginning_of, recorded_of
+from tuner.objective.segments import Segments
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
-from tuner.vehicle.model import with_coefficients
+from tuner.vehicle.model import Model, with_coefficients
 
 MOVING = ("inertia_xx", "time_constant_up", "rotor_drag_coefficient", "estimate_latency")
 SAMPLES = 120
@@ -75,3 +81,18 @@ def test_a_kernel_flies_as_jax_does_and_so_do_its_derivatives(objective):
         slope = np.moveaxis(np.asarray(slopes[name]), 2, 0)
         scale = np.abs(slope).max(axis=(0, 1, 2)) + 1e-9
         np.testing.assert_allclose(columns / scale, slope / scale, atol=1e-8)
+
+
+@pytest.mark.parametrize("effects", [{}, {"linear_drag_x": np.asarray(0.1)}])
+def test_six_rotors_fly_from_where_they_were_recorded(effects):
+    """In the base model, and with a term, with which all others are computed."""
+    craft = replace(round_airframe(6), effects=effects)
+    model = Model(craft, controller())
+    one = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], hover(craft, vec(0.0, 0.0, 1.0)))
+    commands = tuple(np.tile(command, (STEPS + 2, 1)) for command in one.command)
+    segments = Segments(ActuatorInlet(commands), one, {}, np.zeros(1, int))
+    found = flown.fly(
+        model, segments, SCHEDULE, samples=STEPS, limits=AIRBORNE, channels=("position",)
+    )
+    place = found.channels["position"][0]
+    np.testing.assert_allclose(place, np.broadcast_to([0.0, 0.0, 1.0], place.shape), atol=1e-6)
