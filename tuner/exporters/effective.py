@@ -65,7 +65,7 @@ from tuner.vehicle import (
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import model_of
 
-STAGES = 3
+STAGES = slice(-3, None)
 """Of the search: whole flights, then the polish in the weights that what is missing leaves."""
 
 
@@ -579,7 +579,7 @@ def _fit(
     progress = replace(progress, points=Point(progress.points.coefficients, np.asarray(offsets)))
     progress = grow(
         objective,
-        stages_of(problem, objective)[-STAGES if simulator.start is None else 0 :],
+        stages_of(problem, objective)[STAGES if simulator.start is None else slice(None)],
         progress,
         free=Free(np.ones(len(problem.space), bool), np.zeros(offsets.shape[1:], bool)),
         undecided=(),

@@ -89,7 +89,8 @@ def _match(objective: Objective, vector: NDArray[np.float64]) -> _Match:
     point, start = objective.start(vector), beginning(objective, vector[None])
     unscaled = plain_criterion(objective, objective.samples)
     sums = objective.sums_of(start.points, unscaled, derivatives=False)
-    scale = misfit(root_mean_squares(objective, start.losses, sums))
+    residual = root_mean_squares(objective, sums)
+    scale = misfit({name: of_starts[0] for name, of_starts in residual.items()})
     criterion = plain_criterion(objective, objective.samples, scale)
     return _Match(objective, point, criterion, scale, float(np.sum(np.asarray(sums.loss))))
 

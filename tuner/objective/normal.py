@@ -81,8 +81,13 @@ class Objective(eqx.Module):
         """The model and what moves it."""
         return tunable_of(self.model, self.space)
 
-    def sums(self, point: Point, criterion: Criterion, *, derivatives: bool = True) -> SegmentSums:
-        """Return every segment's contribution at a point."""
+    def sums(
+        self, point: Point, criterion: Criterion, *, derivatives: bool = True, still: bool = False
+    ) -> SegmentSums:
+        """Return every segment's contribution at a point.
+
+        Where coefficients are ``still``, derivatives are those by what each flight has of its own.
+        """
         sums = self.simulator.sums(
             self.data(point.offsets, criterion),
             self.tunable,
@@ -90,6 +95,7 @@ class Objective(eqx.Module):
             int(criterion.horizon),
             float(criterion.huber),
             derivatives=derivatives,
+            still=still,
         )
         if self.multiplicity is None:
             return sums

@@ -80,7 +80,7 @@ class Simulator:
             coefficients=model.values(coefficients),
             states=None if data.states is None else np.asarray(data.states),
             conditions=conditions,
-            tangents=self._directions(data, model, coefficients, moving) if moving else None,
+            tangents=self._directions(data, model, coefficients, moving) or None,
         )
 
     def _directions(
@@ -134,9 +134,11 @@ class Simulator:
         huber: float,
         *,
         derivatives: bool,
+        still: bool = False,
     ) -> SegmentSums:
         """Return what some segments contribute; see `Objective.sums`."""
         moving = self._moving(data, derivatives=derivatives)
+        moving = moving[1:] if still and derivatives else moving
         parts = [
             self._sums_of(part, model, coefficients, (horizon, huber), moving)
             for part in self._in_turn(data, horizon, self._columns(data, coefficients, moving))
@@ -179,13 +181,14 @@ class Simulator:
     ) -> SegmentSums:
         horizon, huber = criterion
         flown = self.fly(data, model, coefficients, horizon, moving=moving)
-        derivatives, segments = "coefficients" in moving, len(flown.crash_time)
-        size = len(coefficients) + len(np.asarray(data.offsets))
+        derivatives, segments = "conditions" in moving, len(flown.crash_time)
+        first = len(coefficients) if "coefficients" in moving else 0
+        size = first + len(np.asarray(data.offsets))
         reading = self.reading(
             data,
             horizon,
             self._columns(data, coefficients, moving),
-            len(coefficients) if derivatives else None,
+            first if derivatives else None,
         )
         total = reading.total
         gradient, hessian = np.zeros((segments, total)), np.zeros((segments, total, total))
@@ -220,6 +223,7 @@ class Simulator:
                     "fl,fl->f", change, 2.0 * slope + np.einsum("flm,fm->fl", bend, change)
                 )
         if not derivatives:
+            size += len(coefficients)
             gradient, hessian = np.zeros((segments, size)), np.zeros((segments, size, size))
         return SegmentSums(
             loss,

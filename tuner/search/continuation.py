@@ -10,20 +10,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.core.numerics import scaled_inverse, scaled_solve
 from tuner.objective.batch import sums_at
-from tuner.objective.criterion import OFFSET_UNIT, Point
+from tuner.objective.criterion import OFFSET_UNIT, Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
-from tuner.search.clocks import clocks_that_differ
 from tuner.search.evolution import CmaEs
 from tuner.search.iteration import Iteration
 from tuner.search.least_squares import LeastSquares, starts_asked_for
 from tuner.search.loop import FROM_START, GAIN, with_loop
+from tuner.search.normal_equations import normal_equations
 from tuner.search.optimiser import OPTIMISERS, Free, Iterate, StageProblem
-from tuner.search.progress import Progress, criterion_of
+from tuner.search.progress import Progress, criterion_of, point_of
 from tuner.search.stages import Stage
 from tuner.search.weights import misfit, root_mean_squares, strays
 
@@ -33,6 +35,11 @@ NO_OFFSET = np.array([0.0005, 0.0005, 0.002, 0.002, 0.002])
 """s: clocks that differ by less are taken to agree. A recording's clocks either share a source or
 differ by much more, and a tenth of a millisecond of freedom costs a percent of inertia. rad/s: a
 gyro that reads so little when at rest is taken to have no bias."""
+
+MATERIAL = 0.01
+"""Share of the loss by which it may rise, over all clocks that are set right."""
+RIDGE = 1e-12
+"""Added to a Hessian of unit diagonal."""
 
 OnProgress = Callable[[Progress], None]
 
@@ -178,7 +185,7 @@ def _with_clocks_set_right(problem: StageProblem, best: int) -> StageProblem:
     if not free.offsets[: len(CLOCKS)].any():
         return problem
     sums = sums_at(problem.objective, points, problem.criterion)
-    stay = clocks_that_differ(problem.objective, points, best, problem.criterion, free, sums=sums)
+    stay = _clocks_that_differ(problem, best, sums)
     if not np.any(points.offsets[:, ~stay]):  # nothing moves: the points are flown already
         return replace(problem, free=Free(free.coefficients, free.offsets & stay), sums=sums)
     points = Point(points.coefficients, points.offsets * stay)
@@ -189,6 +196,46 @@ def _with_clocks_set_right(problem: StageProblem, best: int) -> StageProblem:
         criterion=replace(problem.criterion, reference_offset=clocks),
         free=Free(free.coefficients, free.offsets & stay),
     )
+
+
+def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> NDArray[np.bool_]:
+    """Return (offsets, N) which offsets stay: those that flights would be met worse without.
+
+    A clock that is late looks like latency, and a tenth of a millisecond of freedom costs a percent
+    of inertia. Gusts move an estimated clock by milliseconds. So clocks are taken to agree unless
+    that makes the loss rise by more than two simulators of one vehicle differ.
+
+    From the loss's quadratic at the best point: setting the clocks Z right, everything else
+    following, makes it rise by ``½ oᵀ(C_ZZ)⁻¹o``, o being what they are late by at the minimum and
+    C the inverse Hessian. The one that matters least goes first.
+    """
+    objective, free = problem.objective, problem.free
+    here: SegmentSums = jax.tree.map(lambda leaf: np.asarray(leaf)[best], sums)
+    point = point_of(problem.points, best)
+    loss, gradient, hessian = normal_equations(
+        objective.space, objective.segments.flight, point, problem.criterion, here
+    )
+    moves = np.flatnonzero(np.concatenate([free.coefficients, free.offsets.ravel()]))
+    inverse = scaled_inverse(hessian[np.ix_(moves, moves)], RIDGE)
+    late = np.concatenate([np.zeros(len(objective.space)), np.ravel(point.offsets)])[moves]
+    late = late - inverse @ gradient[moves]
+    first, clocks = len(objective.space), len(CLOCKS) * objective.flights
+    left: list[int] = np.flatnonzero((moves >= first) & (moves < first + clocks)).tolist()
+    right: list[int] = []
+    while left:
+        rises = [_rise(inverse, late, [*right, clock]) for clock in left]
+        least = int(np.argmin(rises))
+        if rises[least] > MATERIAL * float(loss):
+            break
+        right.append(left.pop(least))
+    stay = np.ones(free.offsets.size, bool)
+    stay[moves[right] - first] = False
+    return stay.reshape(free.offsets.shape)
+
+
+def _rise(inverse: NDArray[np.float64], late: NDArray[np.float64], clocks: list[int]) -> float:
+    square = inverse[np.ix_(clocks, clocks)]
+    return float(0.5 * late[clocks] @ scaled_solve(square, late[clocks]))
 
 
 def _offsets_that_matter(stage: Stage, progress: Progress) -> tuple[Point, NDArray[np.bool_]]:
@@ -228,20 +275,23 @@ def _finished(problem: StageProblem, progress: Progress) -> Progress:
     """Return where the search stands after the stage, the next one's weights included."""
     stage, iterate = problem.stage, progress.iterate
     assert iterate is not None, "a stage takes at least one step"
-    next_start = None if problem.last else iterate.next_start
+    points, damping = iterate.points, np.ones(len(iterate.losses))
+    if iterate.next_start is not None and not problem.last:
+        points, damping = iterate.next_start
     progress = replace(
         progress,
         stage=progress.stage + 1,
-        points=iterate.points if next_start is None else next_start.points,
+        points=points,
         losses=iterate.losses,
         steps=0,
         iterate=None,
-        damping=np.ones(len(iterate.losses)) if next_start is None else next_start.damping,
+        damping=damping,
     )
     if iterate.sums is None:
         return progress
-    residual = root_mean_squares(problem.objective, iterate.losses, iterate.sums)
-    scales = misfit(residual) if stage.weighs else strays(residual, stage.noise_inflation)
     best = int(np.argmin(iterate.losses))
+    every = root_mean_squares(problem.objective, iterate.sums)
+    residual = {name: of_starts[best] for name, of_starts in every.items()}
+    scales = misfit(residual) if stage.weighs else strays(residual, stage.noise_inflation)
     states = starts_asked_for(iterate.sums, best, progress.states)
     return replace(progress, scales=scales, states=states)

@@ -95,6 +95,12 @@ class Fitted:
     held: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def vector(self) -> dict[str, float]:
+        """Coefficient -> number of the search vector."""
+        numbers = np.asarray(self.point.coefficients).tolist()
+        return dict(zip(self.objective.space.names, numbers, strict=True))
+
+    @property
     def residuals_at_noise_level(self) -> bool:
         """Whether residuals hold no more than measurement noise, on any flight and channel."""
         return max(max(scale.values()) for scale in self.scales.values()) < COLOURED

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from tuner.objective.criterion import Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import Step, advance, begin
-from tuner.search.optimiser import Iterate, NextStageStart, Optimiser, StageProblem
-from tuner.search.weights import NEAR, worst_channels
+from tuner.search.optimiser import Iterate, Optimiser, StageProblem
+from tuner.search.stages import WEIGHED
+from tuner.search.weights import NEAR, root_mean_squares
 
 FAR = 5.0
 """Standard deviations beyond which no start is believed to lie."""
@@ -132,7 +133,7 @@ class LeastSquares(Optimiser):
         """
         if not state.losses:
             return False
-        tolerance, last = problem.stage.tolerance, state.losses[-1]
+        tolerance, last = self._tolerance(problem, state.step), state.losses[-1]
         ended = (last <= problem.stage.enough) | np.asarray(state.step.still)
         ended |= _predicts_little(problem, state.step)
         if len(state.losses) == 1:
@@ -142,8 +143,19 @@ class LeastSquares(Optimiser):
         by_three_tries = len(state.losses) > 3 and _gains_little(state.losses[-4:], tolerance)
         return bool(np.all(by_last_step | by_three_tries | ended))
 
+    @staticmethod
+    def _tolerance(problem: StageProblem, step: Step) -> NDArray[np.float64]:
+        """Return (S,) the share of the loss that a step has to gain for another one.
 
-def _gains_little(losses: Sequence[NDArray[np.float64]], tolerance: float) -> NDArray[np.bool_]:
+        Windows that a model meets far from noise have no minimum that can be told from its valley.
+        """
+        vague = problem.objective.segments.windowed & (_worst_of_most(problem, step) > NEAR)
+        return np.where(vague, max(problem.stage.tolerance, WEIGHED), problem.stage.tolerance)
+
+
+def _gains_little(
+    losses: Sequence[NDArray[np.float64]], tolerance: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """Return (S,) whether the loss fell by no more than a share of itself."""
     first, *_, last = losses
     return np.asarray(first - last <= tolerance * np.abs(last))
@@ -165,13 +177,21 @@ def _is_near(problem: StageProblem, step: Step) -> NDArray[np.bool_]:
     A model that lacks something is led astray by long steps: the damping that a stage begins with
     holds it where the last one ended.
     """
+    return np.asarray(np.asarray(step.accepted) & (_worst_of_most(problem, step) <= NEAR))
+
+
+def _worst_of_most(problem: StageProblem, step: Step) -> NDArray[np.float64]:
+    """Return (S,) by how many σ the middle flight's worst channel is off."""
     assert step.sums is not None, "what has stepped has sums"
-    worst = worst_channels(problem.objective, step.sums)
-    return np.asarray(np.asarray(step.accepted) & (np.median(worst, axis=-1) <= NEAR))
+    channels = list(root_mean_squares(problem.objective, step.sums).values())
+    return np.asarray(np.median(np.nan_to_num(channels).max(axis=0), axis=-1))
 
 
-def _next_stage_start(problem: StageProblem, step: Step) -> NextStageStart:
-    """Return what a next stage begins with: the trust that was earned, if the fit is near."""
+def _next_stage_start(problem: StageProblem, step: Step) -> tuple[Point, NDArray[np.float64]]:
+    """Return what a next stage begins with: the trust that was earned, if the fit is near.
+
+    Or if it sees no further: weights alone differ then.
+    """
     near = _is_near(problem, step)
     untried = np.asarray(near & (step.predicted_reduction <= HANDED_ON))
     points: Point = jax.tree.map(
@@ -179,8 +199,9 @@ def _next_stage_start(problem: StageProblem, step: Step) -> NextStageStart:
         step.tried,
         step.point,
     )
-    damping = np.where(near, np.clip(step.damping, LEAST_DAMPING, 1.0), 1.0)
-    return NextStageStart(points, damping)
+    trusted = near | (problem.stage.horizon >= problem.objective.samples)
+    damping = np.where(trusted, np.clip(step.damping, LEAST_DAMPING, 1.0), 1.0)
+    return points, damping
 
 
 def _position_rmse(objective: Objective, step: Step, start: int) -> float:

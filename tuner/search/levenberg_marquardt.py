@@ -3,8 +3,10 @@
 About the best point so far the loss is the quadratic of its normal equations, c + gᵀd + ½ dᵀHd. The
 next point to be tried lies at d = -(H + λI)⁻¹ g. It is accepted if the loss falls by more than a
 twentieth of what the quadratic says; λ is then kept, or divided by five where it falls by more than
-0.7 of that; a point that is rejected multiplies λ by five (Madsen, Nielsen and Tingleff, "Methods
-for non-linear least squares problems", 2004, section 3.2).
+0.7 of that (Madsen, Nielsen and Tingleff, "Methods for non-linear least squares problems", 2004,
+section 3.2). A point that is rejected multiplies λ by five; that of whole flights by as much more
+as a parabola through the losses says that the step was too long. Those of many short windows have
+kinks, where controllers' and motors' steps pass each other, of which a parabola knows nothing.
 """
 
 from __future__ import annotations
@@ -146,7 +148,8 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     if sums is None:
         sums = sums_at(objective, before.tried, criterion)
     tried = tried or quadratics(sums)
-    steps = [_stepped(before, start, tried[start], moves) for start in starts]
+    longest = FACTOR if objective.segments.windowed else FACTOR**3
+    steps = [_stepped(before, start, tried[start], moves, longest) for start in starts]
     accepted = np.array([step.accepted for step in steps])
     best = before.best
 
@@ -179,8 +182,13 @@ class _Stepped:
     predicted_reduction: float
 
 
-def _stepped(before: Step, start: int, here: NormalEquations, moves: NDArray[np.intp]) -> _Stepped:
-    """Return what becomes of a start, given the quadratic at the point that was to be tried."""
+def _stepped(
+    before: Step, start: int, here: NormalEquations, moves: NDArray[np.intp], longest: float
+) -> _Stepped:
+    """Return what becomes of a start, given the quadratic at the point that was to be tried.
+
+    ``longest`` is by how much a rejected step is taken to have been too long at most.
+    """
     point, tried = _of(before.point, start), _of(before.tried, start)
     damping, still, accepted = float(before.damping[start]), False, True
     if before.quadratics:
@@ -189,7 +197,9 @@ def _stepped(before: Step, start: int, here: NormalEquations, moves: NDArray[np.
         rise = here.loss - last.loss
         accepted, predicted = _tried(before, start, here.loss, moves)
         if not accepted:
-            damping *= FACTOR
+            slope = -float(last.gradient[moves] @ change)
+            too_long = 2.0 * (1.0 + rise / slope) if slope > 0.0 else FACTOR
+            damping *= float(np.nan_to_num(np.clip(too_long, FACTOR, longest), nan=FACTOR))
         elif predicted < 0.0 and rise < WELL_PREDICTED * predicted:
             damping /= FACTOR
         at_rest = np.abs(change) < STILL * (1.0 + np.abs(_packed(tried)[moves]))

@@ -78,22 +78,6 @@ class StageProblem:
 
 
 @dataclass(frozen=True)
-class NextStageStart:
-    """What a stage hands on.
-
-    Attributes
-    ----------
-    points
-        S points; one predicted to differ by little has not been tried.
-    damping
-        (S,) λ.
-    """
-
-    points: Point
-    damping: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
 class Iterate:
     """Where an optimiser stands after a step.
 
@@ -113,7 +97,8 @@ class Iterate:
         The segments' sums at the best points, S first; None where they were not computed. The next
         stage's weights and starts follow from those of the last step.
     next_start
-        What the next stage begins with, if there is one; None for ``points`` and a damping of 1.
+        What the next stage begins with, if there is one: S points, of which one predicted to differ
+        by little has not been tried, and (S,) λ. None for ``points`` and a damping of 1.
     """
 
     points: Point
@@ -122,7 +107,7 @@ class Iterate:
     position_rmse: float
     damping: float = float("nan")
     sums: SegmentSums | None = None
-    next_start: NextStageStart | None = None
+    next_start: tuple[Point, NDArray[np.float64]] | None = None
 
 
 class Optimiser(ABC):

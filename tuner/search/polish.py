@@ -12,11 +12,15 @@ from tuner.objective.criterion import Point
 from tuner.search.continuation import grow
 from tuner.search.estimation import stages_of
 from tuner.search.fitted import Fitted, by_flight
+from tuner.search.least_squares import LEAST_DAMPING
 from tuner.search.loop import loop_of, with_loop
 from tuner.search.optimiser import Free
 from tuner.search.problem import Job
 from tuner.search.progress import Progress, beginning, criterion_of, point_of
 from tuner.search.stages import Stage
+
+LAST_TWO, LAST, ROUGHLY = slice(-2, None), slice(-1, None), slice(-2, -1)
+"""Stages: polish and polish again, the latter alone where the weights are known, or the former."""
 
 
 def polished(
@@ -26,7 +30,7 @@ def polished(
     free: Free,
     title: str,
     on_progress: Callable[[Progress], None],
-    stages: int = 2,
+    stages: slice = LAST_TWO,
 ) -> Fitted:
     """Return a fit polished again, by the last stages from its point.
 
@@ -43,7 +47,7 @@ def polished(
     on_progress
         Called after every iteration.
     stages
-        How many of the last stages.
+        Which of the stages: of the last two the first weighs what the second polishes.
     """
     names = [flight.name for flight in job.fitted]
     progress = Progress(
@@ -59,19 +63,25 @@ def polished(
         losses=np.array([fitted.loss_best]),
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
-        damping=np.ones(1),
+        damping=np.array([_damping_of(fitted)]),
         loop=loop_of(fitted.objective),
     )
     return _grown(
         job,
         fitted,
         progress,
-        stages_of(job, fitted.objective)[-stages:],
+        stages_of(job, fitted.objective)[stages],
         free=free,
         undecided=(),
         title=title,
         on_progress=on_progress,
     )
+
+
+def _damping_of(fitted: Fitted) -> float:
+    """Return the damping with which a fit's last step would have been followed."""
+    last = fitted.iterations[-1].damping if fitted.iterations else None
+    return float(np.clip(last, LEAST_DAMPING, 1.0)) if last else 1.0
 
 
 def searched_again(

@@ -14,43 +14,17 @@ STRAY = 3.0
 """A flight that is met this many times worse than the median one counts less."""
 
 
-def root_mean_squares(
-    objective: Objective, losses: NDArray[np.float64], sums: SegmentSums
-) -> dict[str, NDArray[np.float64]]:
-    """Return channel -> (N,) root mean square residual in σ at the best start's point, or NaN.
+def root_mean_squares(objective: Objective, sums: SegmentSums) -> dict[str, NDArray[np.float64]]:
+    """Return channel -> (S, N) root mean square residual in σ of each flight, NaN without any.
 
-    Parameters
-    ----------
-    objective
-        Says which segment belongs to which flight.
-    losses, sums
-        (S,) losses, and the segments' sums with S first.
+    ``objective`` says which segment belongs to which flight; the segments' sums have S first.
     """
-    best, residual = int(np.argmin(losses)), {}
-    flight, flights = np.asarray(objective.segments.flight), objective.flights
+    owner, residual = np.eye(objective.flights)[np.asarray(objective.segments.flight)], {}
     for name, squares in sums.squares.items():
-        counts = np.bincount(flight, np.asarray(sums.counts[name][best]), flights)
-        mean = np.bincount(flight, np.asarray(squares[best]), flights) / np.maximum(counts, 1.0)
+        counts = np.asarray(sums.counts[name]) @ owner
+        mean = np.asarray(squares) @ owner / np.maximum(counts, 1.0)
         residual[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
     return residual
-
-
-def worst_channels(objective: Objective, sums: SegmentSums) -> NDArray[np.float64]:
-    """Return (S, N) root mean square residual in σ of each flight's worst channel.
-
-    Parameters
-    ----------
-    objective
-        Says which segment belongs to which flight.
-    sums
-        The segments' sums with S first.
-    """
-    owner = np.eye(objective.flights)[np.asarray(objective.segments.flight)]
-    squares = [
-        (np.asarray(total) @ owner) / np.maximum(np.asarray(sums.counts[name]) @ owner, 1.0)
-        for name, total in sums.squares.items()
-    ]
-    return np.asarray(np.sqrt(np.max(squares, axis=0)))
 
 
 def strays(

@@ -178,9 +178,9 @@ def with_groups(
     base: tuple[Job, Fitted],
     groups: Groups,
     fitted: Fitted,
-    vector: Mapping[str, float],
     *,
     said: Collection[Finding],
+    vector: Mapping[str, float] | None = None,
 ) -> tuple[Job, Fitted]:
     """Return a base job with some groups in it, and its fit at the numbers of another one.
 
@@ -190,12 +190,15 @@ def with_groups(
         Job and fit without any groups.
     groups
         What is free beside the base model.
-    fitted, vector
-        Where the fit with the groups is, and coefficient -> number of its search vector.
+    fitted
+        Where the fit with the groups is.
     said
         What that fit's findings say of its own coefficients.
+    vector
+        Coefficient -> number of the search vector, where it is not the fit's own.
     """
     job, grown = with_free(*base, coefficients_in(groups), around=conditions_in(groups))
+    vector = fitted.vector if vector is None else vector
     there = replace(
         fitted,
         objective=with_loop(grown.objective, loop_of(fitted.objective)),

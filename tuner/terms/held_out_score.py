@@ -8,13 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.numeric import Array
 from tuner.core.numerics import scaled_solve
-from tuner.objective.batch import sums_at
 from tuner.objective.criterion import OFFSET_SD, Point, SegmentSums
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
@@ -44,22 +42,22 @@ def predicted_losses(
     """
     objective, criterion = fitted.objective, replace(fitted.criterion, scale=dict(scale))
     space, flight = objective.space, np.asarray(objective.segments.flight)
-    movable, vectors = offsets_fitted(fitted), []
+    movable, losses = offsets_fitted(fitted), []
     alone = objective.flights == 1
     for number in range(objective.flights):
         change = np.zeros(len(own))
         if not alone:
             change = linear.step(model, inside=linear.flight != number)[own]
-        vectors.append(vector_after(space, fitted.point.coefficients, change))
-    offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
-    points = Point(np.stack(vectors), np.asarray(offsets))
-    of_each = sums_at(objective, points, criterion, derivatives=bool(movable.any()))
-    losses = []
-    for number in range(objective.flights):
-        sums = jax.tree.map(lambda leaf, at=number: leaf[at], of_each)
+        vector = vector_after(space, fitted.point.coefficients, change)
+        sums = objective.sums(
+            Point(vector, fitted.point.offsets),
+            criterion,
+            derivatives=bool(movable.any()),
+            still=True,
+        )
         inside = flight == number
         loss = float(np.asarray(sums.loss)[inside].sum())
-        losses.append(loss - _gain_of_offsets(sums, inside, len(space), movable[:, number]))
+        losses.append(loss - _gain_of_offsets(sums, inside, movable[:, number]))
     return np.array(losses) * (lost_by_sections(linear, model) if alone else 1.0)
 
 
@@ -84,10 +82,10 @@ def offsets_fitted(fitted: Fitted) -> NDArray[np.bool_]:
 
 
 def _gain_of_offsets(
-    sums: SegmentSums, inside: NDArray[np.bool_], count: int, movable: NDArray[np.bool_]
+    sums: SegmentSums, inside: NDArray[np.bool_], movable: NDArray[np.bool_]
 ) -> float:
     """Return by how much a flight's loss falls when its offsets follow, in one linear step."""
-    free = count + np.flatnonzero(movable)
+    free = np.flatnonzero(movable)
     if not len(free):
         return 0.0
     gradient = np.asarray(sums.gradient)[free][:, inside].sum(axis=-1)

@@ -133,6 +133,7 @@ class Innovations:
             stand_ins=[name for name in begin if is_stand_in(name)],
             no_gusts=list(begin),  # they are followed
             material=0.0,
+            at_once=True,
         )
         change = self._change(model, tried, kept)
         size = np.abs(self.linear.scaled + change - self._neutral(tried)) / self.linear.prior_sd
@@ -154,7 +155,7 @@ class Innovations:
         moved = vector_after(self.space, np.asarray(self.vector), change)
         vector = dict(zip(self.space.names, moved.tolist(), strict=True))
         said = findings_at(self.selected.job, self.selected.fitted)
-        job, fitted = with_groups(base, groups, self.fitted, vector, said=said)
+        job, fitted = with_groups(base, groups, self.fitted, said=said, vector=vector)
         return replace(self.selected, job=job, fitted=fitted, rows=tuple(rows))
 
     def _tried(self) -> dict[str, tuple[str, ...]]:

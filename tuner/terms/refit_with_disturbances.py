@@ -21,7 +21,7 @@ from tuner.search.estimation import free_offsets
 from tuner.search.explanation import Explanation
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
-from tuner.search.polish import polished
+from tuner.search.polish import LAST, polished
 from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.terms.candidates import is_stand_in, names_in
@@ -127,7 +127,7 @@ def with_disturbances(
         free=Free(np.zeros(len(job.space), bool), offsets),
         title="clocks",
         on_progress=partial(on_progress, job),
-        stages=1,
+        stages=LAST,
     )
     again = replace(
         again,

@@ -253,6 +253,7 @@ def surviving(
     stand_ins: Collection[str] = (),
     no_gusts: Collection[str] = (),
     material: float = MATERIAL,
+    at_once: bool = False,
 ) -> tuple[dict[str, Score], dict[str, Score]]:
     """Return the scores of the groups that a backward elimination leaves, and of those it takes.
 
@@ -260,7 +261,9 @@ def surviving(
     others are scored without it: a few flights left out say little about which of two it should be,
     where one flight alone shows something. Of groups that can do without each other the stand-ins
     go first: with more coefficients they do what one term of the vehicle does, and noise would
-    choose between the two.
+    choose between the two. Then go those without which the fit loses nothing. Of the others one
+    goes at a time, and none beside those, before it is fitted without them: beside what is there in
+    vain all else looks like chance.
 
     Parameters
     ----------
@@ -276,6 +279,8 @@ def surviving(
         Names of groups that describe as a whole what others do one by one.
     no_gusts
         Names of groups for which no gust can pass.
+    at_once
+        Whether all go that have to, without a fit between.
     """
     left, taken = dict(groups), dict[str, Score]()
     while True:
@@ -296,10 +301,18 @@ def surviving(
         idle = [name for name, found in scores.items() if not found.earns_place]
         if not idle:
             return scores, taken
+        vain = [name for name in idle if scores[name].reason is SelectionCode.IMMATERIAL]
         least = max(
             idle,
-            key=lambda name: (name in stand_ins, scores[name].chance, -scores[name].gain_fit),
+            key=lambda name: (
+                name in stand_ins,
+                name in vain,
+                1.0 if name in vain else scores[name].chance,
+                -scores[name].gain_fit,
+            ),
         )
+        if taken and not (at_once or least in vain or least in stand_ins):
+            return scores, taken
         taken[least] = scores[least]
         del left[least]
 

@@ -29,7 +29,7 @@ from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
 from tuner.search.loop import loop_of, with_loop
 from tuner.search.optimiser import Free
-from tuner.search.polish import polished, searched_again
+from tuner.search.polish import LAST, ROUGHLY, polished, searched_again
 from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.terms.candidates import (
@@ -93,13 +93,14 @@ class Selection:
             if set(grown.added) <= set(state.added):
                 break
             state = grown
-        base = self.job, self.fitted
-        job, fitted = with_groups(
-            base, state.added, state.fitted, state.vector, said=findings_at(*base)
-        )
-        rows = self._rows(state, dropped)
-        selected = Selected(job, fitted if state.added else self.fitted, rows, base=base)
-        return replace(selected, in_doubt=self._in_doubt(state, selected.left_out))
+        base, rows = (self.job, self.fitted), self._rows(state, dropped)
+        selected = Selected(*base, rows, base=base)
+        doubt = self._in_doubt(state, selected.left_out)
+        if state.added:
+            fitted = self._fitted(state, state.added, stages=LAST)
+            job, fitted = with_groups(base, state.added, fitted, said=findings_at(*base))
+            selected = replace(selected, job=job, fitted=fitted)
+        return replace(selected, in_doubt=doubt)
 
     def _in_doubt(self, state: LinearisedFit, groups: Sequence[Sequence[str]]) -> dict[str, float]:
         """Return how far each coefficient of the model would move with what is not in it."""
@@ -147,10 +148,7 @@ class Selection:
             f"The flights call for more than the base model: searching again with all "
             f"{len(groups)} groups of terms, to see which can go."
         )
-        rough = self._refitted(base, groups, anew=True)
-        trial = self._pruned(rough)
-        if trial is rough:
-            trial = self._refitted(rough, rough.added)
+        trial = self._pruned(self._refitted(base, groups, anew=True))
         if trial.added and self._predicts_better(trial, base, by_flight=True):
             return trial
         return None
@@ -158,14 +156,20 @@ class Selection:
     def _grown(
         self, state: LinearisedFit, wanted: Mapping[str, Score], dropped: dict[str, SelectionCode]
     ) -> LinearisedFit | None:
-        """Return the fit with the groups that hold their places in it, if it predicts better."""
+        """Return the fit with the groups that hold their places in it, if it predicts better.
+
+        Those that do not hold them beside all others are not tried again.
+        """
         best = max(wanted, key=lambda name: wanted[name].gain_holdout)
         for names in dict.fromkeys([tuple(wanted), (best,)]):
             self.on_message(f"Fitting again with {listed(names)}.")
             groups = {**state.added, **{name: self.candidates[name] for name in names}}
             trial = self._pruned(self._refitted(state, groups))
             by_flight = wanted[best].reason is SelectionCode.PREDICTS_FLIGHTS
-            if trial.added and self._predicts_better(trial, state, by_flight=by_flight):
+            gone = [name for name in names if name not in trial.added]
+            dropped |= dict.fromkeys(gone, SelectionCode.WORSE_AFTER_REFIT)
+            other = set(trial.added) not in (set(), set(state.added))
+            if other and self._predicts_better(trial, state, by_flight=by_flight):
                 return trial
         dropped[best] = SelectionCode.WORSE_AFTER_REFIT
         return None
@@ -213,15 +217,17 @@ class Selection:
     def _refitted(
         self, state: LinearisedFit, groups: Groups, *, anew: bool = False
     ) -> LinearisedFit:
+        """Return a rough fit with exactly these groups: a step that is left is a linear one."""
+        return self.linearised(self._fitted(state, groups, anew=anew), groups)
+
+    def _fitted(
+        self, state: LinearisedFit, groups: Groups, *, anew: bool = False, stages: slice = ROUGHLY
+    ) -> Fitted:
         """Return the fit with exactly these groups, from where the last one ended or anew."""
         wanted, around = coefficients_in(groups), conditions_in(self.candidates)
         idle = tuple(name for name in around if name not in conditions_in(groups))
-        objective, point = with_terms(
-            self._objective_of(state.fitted), self.fitted.point, wanted, self.job.settings.job
-        )
-        objective, _ = with_conditions(objective, point, around)
-        start, names = np.array(point.coefficients), objective.space.names
-        vector = [state.vector.get(name, start[i]) for i, name in enumerate(names)]
+        objective, start = self._problem(state.fitted, wanted)
+        names, vector = objective.space.names, _known(state.fitted, objective, start)
         new = [group for group in groups if group not in state.added]
         new_ones = [name for group in new for name in groups[group] if name in wanted]
         from_here = replace(
@@ -246,46 +252,46 @@ class Selection:
         if anew:
             start[: len(self.job.space)] = self.job.space.initial
             start = begun(objective.space, start, wanted)
-            fitted = searched_again(
+            return searched_again(
                 self.job, from_here, start, free=free_ones, title=title, on_progress=on_progress
             )
-        else:
-            fitted = polished(
-                self.job, from_here, free=free_ones, title=title, on_progress=on_progress
-            )
-        return self.linearised(fitted, groups)
+        return polished(
+            self.job,
+            from_here,
+            free=free_ones,
+            title=title,
+            on_progress=on_progress,
+            stages=stages,
+        )
 
     def linearised(self, fitted: Fitted, added: Groups) -> LinearisedFit:
         """Return a fit as all candidates see it."""
-        objective, point = with_terms(
-            self._objective_of(fitted),
-            self.fitted.point,
-            coefficients_in(self.candidates),
-            self.job.settings.job,
-        )
-        around = conditions_in(self.candidates)
-        objective, _ = with_conditions(objective, point, around)
-        own = dict(
-            zip(fitted.objective.space.names, np.asarray(fitted.point.coefficients), strict=True)
-        )
-        start = np.asarray(point.coefficients)
-        vector = [own.get(name, start[i]) for i, name in enumerate(objective.space.names)]
+        objective, start = self._problem(fitted, coefficients_in(self.candidates))
+        vector = _known(fitted, objective, start)
         at = Point(np.asarray(vector), offsets_of(fitted, objective))
         linear = linear_at(
             objective,
             at,
             fitted.criterion,
             offsets_fitted=np.asarray(at.offsets) != 0.0,
-            around=around,
+            around=conditions_in(self.candidates),
         )
         return LinearisedFit(fitted, added, linear)
 
-    def _objective_of(self, fitted: Fitted) -> Objective:
-        """Return a fit's base problem with all candidates in the model, at their neutral values."""
+    def _problem(
+        self, fitted: Fitted, names: Sequence[str]
+    ) -> tuple[Objective, NDArray[np.float64]]:
+        """Return a fit's base problem with some coefficients free, and its start vector (K,).
+
+        All candidates are in the model, at their neutral values, and all that may surround flights.
+        """
         objective = with_loop(self.fitted.objective, loop_of(fitted.objective))
         neutral = start_of(coefficients_in(self.candidates))
         values = {name: np.asarray(value) for name, value in neutral.items()}
-        return replace(objective, model=with_coefficients(objective.model, values))
+        objective = replace(objective, model=with_coefficients(objective.model, values))
+        objective, point = with_terms(objective, self.fitted.point, names, self.job.settings.job)
+        objective, point = with_conditions(objective, point, conditions_in(self.candidates))
+        return objective, np.array(point.coefficients)
 
     @cached_property
     def _space(self) -> dict[str, list[int]]:
@@ -318,15 +324,8 @@ class Selection:
 
     def _score(self, state: LinearisedFit, group: str) -> Score:
         """Return what a group is worth beside the others in the model."""
-        others = {name: names for name, names in state.added.items() if name != group}
-        return score(
-            state.linear,
-            self._columns([*self.job.space.names, *names_in(others)]),
-            self._columns(self.candidates[group]),
-            candidates=len(self.candidates),
-            neutral=self._neutral if group in state.added else None,
-            no_gust=_no_gust(state, group),
-        )
+        inside, names = group in state.added, self.candidates[group]
+        return self._worth(state, names, inside=inside, no_gust=_no_gust(state, group))
 
     def _rows(
         self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
@@ -359,15 +358,23 @@ class Selection:
             for group, names in groups.items()
         ]
 
-    def _worth(self, state: LinearisedFit, names: Sequence[str]) -> Score:
-        """Return what a group of the base model is worth beside all else in the model."""
-        others = [name for name in self.job.space.names if name not in names]
+    def _worth(
+        self,
+        state: LinearisedFit,
+        names: Sequence[str],
+        *,
+        inside: bool = True,
+        no_gust: bool = False,
+    ) -> Score:
+        """Return what some names are worth beside all else in the model."""
+        others = [*self.job.space.names, *names_in(state.added)]
         return score(
             state.linear,
-            self._columns([*others, *names_in(state.added)]),
+            self._columns([name for name in others if name not in names]),
             self._columns(names),
             candidates=len(self.candidates),
-            neutral=self._neutral,
+            neutral=self._neutral if inside else None,
+            no_gust=no_gust,
         )
 
     def _predicts_better(
@@ -389,6 +396,12 @@ class Selection:
         model = self._columns([*self.job.space.names, *names_in(state.added)])
         own = self._columns(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)
+
+
+def _known(fitted: Fitted, objective: Objective, start: NDArray[np.float64]) -> list[float]:
+    """Return a start vector (K,) of a problem with a fit's own numbers where it has some."""
+    own, names = fitted.vector, objective.space.names
+    return [own.get(name, start[i]) for i, name in enumerate(names)]
 
 
 def _no_gust(state: LinearisedFit, group: str) -> bool:

@@ -100,12 +100,6 @@ class LinearisedFit:
     added: Groups
     linear: Linear
 
-    @property
-    def vector(self) -> dict[str, float]:
-        """Coefficient -> number of the search vector."""
-        names, numbers = self.fitted.objective.space.names, self.fitted.point.coefficients
-        return dict(zip(names, np.asarray(numbers).tolist(), strict=True))
-
 
 def offsets_of(fitted: Fitted, objective: Objective, *, gone: Collection[str] = ()) -> Array:
     """Return a fit's offsets, without some, as the rows of another problem of the same flights."""

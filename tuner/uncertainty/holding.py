@@ -17,14 +17,17 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
+from tuner.core.numerics import scaled_solve
 from tuner.core.phrases import listed
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Point
 from tuner.search.estimation import free_offsets
 from tuner.search.fitted import Fitted
+from tuner.search.normal_equations import normal_equations
 from tuner.search.optimiser import Free
-from tuner.search.polish import polished
+from tuner.search.polish import LAST, LAST_TWO, polished
 from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.uncertainty.estimates import Uncertainty
@@ -38,6 +41,8 @@ MAX_ROUNDS = 3
 NOTHING = 0.002
 """Share of the loss by which it may rise where one of what trades off exactly is held: what an
 optimiser leaves. More says that the others cannot follow, their bounds being in the way, say."""
+RIDGE = 1e-12
+"""Added to a Hessian of unit diagonal."""
 MUCH = 2.0
 """Times the loss of flights in their closed loop, likewise: gusts make less of a difference."""
 
@@ -79,7 +84,7 @@ def with_undetermined_held(
             f"The flights do not identify {listed(names)}: held at the initial value, and the "
             "others are fitted again."
         )
-        rest = hold(job, fitted, stand_ins, on_progress)
+        rest = hold(job, fitted, stand_ins, on_progress, stages=LAST if predicts else LAST_TWO)
         if _rises(fitted, rest) > NOTHING if predicts else _misses(fitted, rest):
             on_message(
                 f"With {listed(names)} at the initial value the flights are met worse: all keep "
@@ -185,8 +190,12 @@ def hold(
     fitted: Fitted,
     stand_ins: Mapping[str, str],
     on_progress: Callable[[Job, Progress], None],
+    *,
+    stages: slice = LAST_TWO,
 ) -> Fitted:
     """Return the fit with the held coefficients at their initial values and the others polished.
+
+    From where the others make up for that to first order.
 
     Parameters
     ----------
@@ -196,22 +205,42 @@ def hold(
         Coefficient -> stand-in, as of `stand_ins_of`; the stand-ins are held, the others stay free.
     on_progress
         Called after every iteration.
+    stages
+        As of `polished`.
     """
     names, space = set(stand_ins.values()), job.space
     is_held = np.array([name in names for name in space.names])
     if not is_held.any():
         return fitted
     clock = time.perf_counter()
-    vector = np.where(is_held, space.initial, np.asarray(fitted.point.coefficients))
     free = Free(~is_held, free_offsets(job))
-    point = Point(np.asarray(vector), fitted.point.offsets)
+    point = _moved(fitted, np.where(is_held, space.initial, fitted.point.coefficients), free)
     end = polished(
         job,
         replace(fitted, point=point),
         free=free,
+        stages=stages,
         title=f"with {len(names)} held",
         on_progress=lambda progress: on_progress(job, progress),
     )
     return replace(
         end, held=dict(stand_ins), wall_time=fitted.wall_time + time.perf_counter() - clock
+    )
+
+
+def _moved(fitted: Fitted, vector: NDArray[np.float64], free: Free) -> Point:
+    """Return the point with some coefficients elsewhere (K,), what is free following them."""
+    objective, point = fitted.objective, fitted.point
+    sums = objective.sums(point, fitted.criterion)
+    hessian = normal_equations(
+        objective.space, objective.segments.flight, point, fitted.criterion, sums
+    ).hessian
+    change = np.zeros(len(hessian))
+    change[: len(vector)] = vector - point.coefficients
+    follow = np.flatnonzero(np.concatenate([free.coefficients, free.offsets.ravel()]))
+    square = hessian[np.ix_(follow, follow)]
+    change[follow] = -scaled_solve(square, (hessian @ change)[follow], RIDGE)
+    return Point(
+        point.coefficients + change[: len(vector)],
+        point.offsets + change[len(vector) :].reshape(point.offsets.shape),
     )

@@ -55,6 +55,18 @@ def test_no_wind_and_a_steady_battery_change_nothing():
         np.testing.assert_allclose(after.squares[name], squares, rtol=1e-12)
 
 
+@pytest.mark.parametrize("names", [(), NAMES])
+def test_derivatives_by_what_a_flight_has_of_its_own_are_those_among_all(names):
+    plain = problem(("motor_constant",))
+    objective, point = with_conditions(plain, plain.start(plain.space.initial + 0.2), names)
+    criterion = criterion_of(objective)
+    among, own = (objective.sums(point, criterion, still=still) for still in (False, True))
+    np.testing.assert_allclose(own.loss, among.loss, rtol=1e-12)
+    np.testing.assert_allclose(own.gradient, among.gradient[1:], rtol=1e-9)
+    np.testing.assert_allclose(own.hessian, among.hessian[1:, 1:], rtol=1e-9)
+    assert np.abs(own.gradient).max() > 0.0
+
+
 def test_the_gradient_is_the_finite_difference(fit):
     objective, point = fit
     point = Point(point.coefficients, 0.5 * point.offsets)

@@ -8,7 +8,7 @@ import pytest
 
 from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
-from tuner.search import clocks
+from tuner.search import continuation
 from tuner.search.optimiser import Free
 
 FLIGHTS, POSE = 3, 0
@@ -27,7 +27,7 @@ def stays(monkeypatch, late):
     rows[np.arange(FLIGHTS), 1 + POSE * FLIGHTS + np.arange(FLIGHTS)] = 1.0
     hessian = KNOWN * rows.T @ rows + ALONE * np.eye(1 + kinds * FLIGHTS)
     monkeypatch.setattr(
-        clocks, "normal_equations", lambda *_: (100.0, np.zeros(len(hessian)), hessian)
+        continuation, "normal_equations", lambda *_: (100.0, np.zeros(len(hessian)), hessian)
     )
     objective = SimpleNamespace(
         space=[None], flights=FLIGHTS, segments=SimpleNamespace(flight=np.arange(FLIGHTS))
@@ -37,7 +37,8 @@ def stays(monkeypatch, late):
     offsets[0, -1] = 1.0  # a gyro's bias is no clock
     points = Point(jnp.zeros((1, 1)), jnp.asarray(offsets))
     free = Free(np.ones(1, bool), np.ones(offsets.shape[1:], bool))
-    stay = clocks.clocks_that_differ(objective, points, 0, None, free, sums=np.zeros(1))
+    problem = SimpleNamespace(objective=objective, points=points, criterion=None, free=free)
+    stay = continuation._clocks_that_differ(problem, 0, np.zeros(1))
     assert stay[2:].all()
     return stay[POSE].tolist()
 

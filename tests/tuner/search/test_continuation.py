@@ -12,8 +12,7 @@ from tests.tuner.uncertainty.making import problem, truth, with_data
 from tuner.objective.batch import sums_at
 from tuner.objective.segments import OFFSETS
 from tuner.search import continuation, levenberg_marquardt
-from tuner.search.clocks import clocks_that_differ
-from tuner.search.continuation import grow
+from tuner.search.continuation import _clocks_that_differ, grow
 from tuner.search.normal_equations import normal_equations
 from tuner.search.optimiser import Free
 from tuner.search.progress import beginning, criterion_of, point_of
@@ -106,13 +105,13 @@ def test_no_point_is_flown_twice_where_clocks_are_looked_at(fit, monkeypatch):
             flown.append(tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(numbers)))
         return sums_at(objective, points, criterion, derivatives=derivatives)
 
-    def judged(*given, **sums):
-        looked_at.append(clocks_that_differ(*given, **sums))
+    def judged(*given):
+        looked_at.append(_clocks_that_differ(*given))
         return looked_at[-1]
 
     for module in (continuation, levenberg_marquardt):
         monkeypatch.setattr(module, "sums_at", recorded)
-    monkeypatch.setattr(continuation, "clocks_that_differ", judged)
+    monkeypatch.setattr(continuation, "_clocks_that_differ", judged)
     late = {
         name: eqx.tree_at(lambda m: m.time, measured, measured.time + np.array([0.0, 0.02]))
         for name, measured in fit.segments.measured.items()

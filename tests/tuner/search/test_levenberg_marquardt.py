@@ -39,9 +39,10 @@ def advanced(monkeypatch):
         "normal_equations",
         lambda _, __, tried, ___, ____: valley(tried.coefficients),
     )
-    objective = SimpleNamespace(space=range(2), segments=SimpleNamespace(flight=np.zeros(1, int)))
 
-    def steps(points, count, free=(1.0, 1.0), damping=None, unknown=0):
+    def steps(points, count, *, free=(1.0, 1.0), damping=None, unknown=0, windowed=False):
+        segments = SimpleNamespace(flight=np.zeros(1, int), windowed=windowed)
+        objective = SimpleNamespace(space=range(2), segments=segments)
         criterion = SimpleNamespace(states=np.zeros((unknown, 1)) if unknown else None)
         found = [begin(Point(np.asarray(points), np.zeros((len(points), 0, 1))), damping)]
         for _ in range(count):
@@ -71,12 +72,20 @@ def test_every_start_reaches_the_minimum_and_stands_still(advanced):
     assert last.predicted_reduction.max() < 1e-9
 
 
-def test_a_loss_that_rises_is_rejected_and_damps_more(advanced):
-    steps = advanced([START], 12, damping=np.array([1e-9]))
+@pytest.mark.parametrize("windowed", [False, True])
+def test_a_loss_that_rises_is_rejected_and_damps_more(advanced, windowed):
+    """The more, the shorter the step to the least of a parabola through whole flights' losses."""
+    steps = advanced([START], 12, damping=np.array([1e-9]), windowed=windowed)
     for before, after in pairwise(steps[1:]):
         assert after.loss <= before.loss
         if not after.accepted[0]:
-            assert after.damping == 5.0 * before.damping
+            change = (before.tried.coefficients - before.point.coefficients)[0]
+            here = valley(before.point.coefficients[0])
+            rise = valley(before.tried.coefficients[0]).loss - here.loss
+            slope = here.gradient @ change
+            share = -slope / (2.0 * (rise - slope))
+            grown = 5.0 if windowed else np.clip(1.0 / share, 5.0, 125.0)
+            assert after.damping == pytest.approx(grown * before.damping)
             np.testing.assert_array_equal(after.point.coefficients, before.point.coefficients)
     assert not all(step.accepted[0] for step in steps)
 

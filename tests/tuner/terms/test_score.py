@@ -100,6 +100,26 @@ def test_what_chance_explains_goes_before_what_it_does_not(monkeypatch):
     assert (list(kept), list(taken)) == (["first"], ["second"])
 
 
+def test_beside_what_is_there_in_vain_nothing_else_goes(monkeypatch):
+    """Whatever chance says of it there: it is judged once the fit is without the others."""
+
+    def scored(_, __, columns, **___):
+        if columns is FIRST:
+            return Score(1e-3, 0.0, 0.1, 0.5, SelectionCode.IMMATERIAL)
+        return Score(0.5, 0.4, 0.1, 1.0, SelectionCode.NOT_SIGNIFICANT)
+
+    monkeypatch.setattr("tuner.terms.score.score", scored)
+    of = {"candidates": 2, "neutral": np.zeros(4)}
+    kept, taken = surviving(linear_fit(0.0), MODEL, {"first": FIRST, "second": SECOND}, **of)
+    assert (list(kept), list(taken)) == (["second"], ["first"])
+    kept, taken = surviving(linear_fit(0.0), MODEL, {"second": SECOND}, **of)
+    assert (list(kept), list(taken)) == ([], ["second"])
+    # what stands in for others goes all the same, and before all
+    groups = {"first": FIRST, "second": SECOND}
+    kept, taken = surviving(linear_fit(0.0), MODEL, groups, **of, stand_ins=["second"])
+    assert list(taken) == ["second", "first"]
+
+
 def test_backward_elimination_leaves_the_term_of_the_truth_at_the_fit_with_both():
     linear = moved_to_minimum(linear_fit(0.5), np.concatenate([MODEL, FIRST, SECOND]))
     kept, taken = surviving(

@@ -156,7 +156,6 @@ def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
     searched, own = [], selection.Selection
     fitted = SimpleNamespace(residuals_at_noise_level=False, point=None, objective=None)
     standing = LinearisedFit(fitted, {}, None)
-    monkeypatch.setattr(LinearisedFit, "vector", {})
     monkeypatch.setattr(own, "_score", lambda *_: Score(0.4, 0.3, 0.1, 0.5, reason))
     monkeypatch.setattr(own, "linearised", lambda *_: standing)
     monkeypatch.setattr(own, "_with_all", lambda *_: searched.append(True))

@@ -57,7 +57,7 @@ def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, afte
     monkeypatch.setattr(holding, "examine", lambda *_, **__: nothing)
     monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded | alone)
 
-    def hold(_, fitted, stand_ins, __):
+    def hold(_, fitted, stand_ins, __, **___):
         assert stand_ins == traded
         return SimpleNamespace(**vars(fitted) | {"point": after, "held": stand_ins})
 
@@ -102,7 +102,7 @@ def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
     monkeypatch.setattr(holding, "examine", lambda *_, **__: examined)
     monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded)
 
-    def hold(_, fitted, stand_ins, __):
+    def hold(_, fitted, stand_ins, __, **___):
         return SimpleNamespace(**vars(fitted) | {"held": stand_ins})
 
     monkeypatch.setattr(holding, "hold", hold)
