@@ -107,7 +107,7 @@ def test_two_fits_contradict_each_other_by_the_errors_of_both(moved, errors, agr
 def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_for, descents):
     """What is missing would be taken for disturbances by a descent to its end."""
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
-    predictor = SimpleNamespace(memory=0, keeps_track=False)
+    predictor = SimpleNamespace(memory=0, is_lost=False, keeps_track=False)
     predictor.without_gains = predictor
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
     monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
@@ -138,11 +138,25 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
     assert within[-1] == [group for group in called_for[: len(descents) - 1] if group]
 
 
+def test_no_terms_are_chosen_by_innovations_of_a_filter_that_lost_a_flight(monkeypatch):
+    full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
+    predictor = SimpleNamespace(memory=0, is_lost=True)
+    monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
+    monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
+    monkeypatch.setattr(disturbances, "_descended", lambda *_, **__: (None, predictor))
+    settings = SimpleNamespace(job=JobFile(disturbances="follow"))
+    job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
+    said: list[str] = []
+    found = with_disturbances(Selected(job, fitted(2.0 * COLOURED)), lambda *_: None, said.append)
+    assert found is None
+    assert said[-1] == disturbances.LACKS
+
+
 @pytest.mark.parametrize(("group", "titles"), [("angular_drag", 2), ("fuselage_drag", 1)])
 def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, group, titles):
     """What stood in for other terms made another model of it: it cannot contradict this one."""
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
-    predictor = SimpleNamespace(memory=0, keeps_track=True, strengths=USUAL)
+    predictor = SimpleNamespace(memory=0, is_lost=False, keeps_track=True, strengths=USUAL)
     predictor.without_gains = predictor
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
