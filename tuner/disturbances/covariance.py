@@ -21,6 +21,8 @@ from jax import Array, lax
 
 from lanes import dependent
 
+MADE_SYMMETRIC = 16
+"""Ticks after which the covariance is made symmetric again."""
 BESIDE = 16
 """Numbers of a row that stay in registers while others are added to them."""
 
@@ -196,6 +198,8 @@ def propagated(
     samples: Samples,
     follow: Callable[[Array], Array],
     unrest: Array,
+    *,
+    tick: Array,
 ) -> tuple[Array, Array]:
     """Return F (P - W Wᵀ) Fᵀ + Q: a tick later, when samples have told what they do.
 
@@ -207,6 +211,8 @@ def propagated(
         Whose gains are W.
     follow, unrest
         F, as a function of a column, and the diagonal (n,) of Q.
+    tick
+        Its number.
     """
     covariance, scratch = matrices
     size = len(covariance)
@@ -232,10 +238,11 @@ def propagated(
         return _with_entry(matrix, i, i, _entry(matrix, i, i) + at(unrest, i))
 
     covariance = lax.fori_loop(0, size, second, covariance)
-    return lax.fori_loop(0, size, added, covariance), scratch
+    covariance = lax.fori_loop(0, size, added, covariance)
+    return _symmetric(covariance, jnp.where(tick % MADE_SYMMETRIC == 0, size, 0)), scratch
 
 
-def symmetric(matrix: Array, count: Array) -> Array:
+def _symmetric(matrix: Array, count: Array) -> Array:
     """Return a square matrix whose first rows and columns, so many, are the mean of both."""
 
     def mean(i: Array, matrix: Array) -> Array:

@@ -38,7 +38,6 @@ from tuner.disturbances.covariance import (
     propagated,
     row,
     rows_of,
-    symmetric,
 )
 from tuner.disturbances.disturbances import COUNT
 from tuner.disturbances.observer import (
@@ -58,8 +57,6 @@ WIDER = 4.0
 """Times, each innovation in a row that lies beyond."""
 AT_ONCE = 4
 """Columns of derivatives in one pass over a block of segments."""
-MADE_SYMMETRIC = 16
-"""Ticks after which the covariance is made symmetric again."""
 WIDEST = 5
 """In a row beyond which the gate grows no further."""
 
@@ -374,8 +371,9 @@ def _filter(given: _Given, static: _Static, ticks: int) -> Any:
             return jnp.concatenate([numbers, processes.keeps * change[-COUNT:]]), after
 
         _, follow, after = jax.linearize(advance, jnp.zeros(size), has_aux=True)
-        covariance, scratch = propagated((covariance, scratch), told, samples, follow, unrest)
-        covariance = symmetric(covariance, jnp.where(number % MADE_SYMMETRIC == 0, size, 0))
+        covariance, scratch = propagated(
+            (covariance, scratch), told, samples, follow, unrest, tick=number
+        )
         gains = rows_of(lambda i: row(told.gain, i, size).astype(jnp.float32), wide)
         matrices = covariance, told.gain, scratch
         carried = after, pushed * processes.keeps, matrices, before, beyond

@@ -1,4 +1,13 @@
-"""The one-step predictor of a fit: its innovations and what they say of the coefficients."""
+"""The one-step predictor of a fit: its innovations and what they say of the coefficients.
+
+And of the strengths of the disturbances: how strong they are and how long they last is what makes
+the recordings likeliest (Schweppe 1965). Strengths trade off: gusts and turbulence explain the same
+innovations, and where they are too large or too small together, that biases the coefficients. So
+they all move together, and with the coefficients: by Gauss and Newton's steps with Fisher's
+information of innovations and their covariance (Maine and Iliff, "Formulation and implementation of
+a practical algorithm for parameter estimation with process and measurement noise", 1980; Harvey,
+"Forecasting, structural time series models and the Kalman filter", 1989, 3.4.5).
+"""
 
 from __future__ import annotations
 

@@ -13,9 +13,7 @@ from tuner.disturbances.covariance import (
     Sparse,
     innovations_of,
     propagated,
-    symmetric,
 )
-from tuner.disturbances.extended_kalman_filter import MADE_SYMMETRIC
 
 SIZE, SHOWN, WIDE = 23, 9, 6
 
@@ -71,16 +69,10 @@ def test_samples_tell_and_time_spreads_what_products_of_matrices_say(sampled: li
         samples,
         lambda column: jnp.asarray(follow) @ column,
         jnp.asarray(unrest),
+        tick=jnp.asarray(1),
     )
     expected = follow @ (covariance - gain.T @ gain) @ follow.T + np.diag(unrest)
     np.testing.assert_allclose(after, expected, atol=1e-8)
-
-
-def test_halves_that_differ_become_their_mean_and_otherwise_stay() -> None:
-    matrix = np.random.default_rng(0).standard_normal((SIZE, SIZE))
-    np.testing.assert_array_equal(symmetric(jnp.asarray(matrix), jnp.asarray(0)), matrix)
-    mean = symmetric(jnp.asarray(matrix), jnp.asarray(SIZE))
-    np.testing.assert_allclose(mean, 0.5 * (matrix + matrix.T), rtol=1e-15)
 
 
 def test_the_covariance_of_an_unstable_vehicle_settles_as_riccatis_equation_says() -> None:
@@ -102,10 +94,14 @@ def test_the_covariance_of_an_unstable_vehicle_settles_as_riccatis_equation_says
         covariance, gain, scratch = matrices
         told = innovations_of(covariance, gain, samples)
         covariance, scratch = propagated(
-            (covariance, scratch), told, samples, lambda c: follow @ c, jnp.asarray(unrest)
+            (covariance, scratch),
+            told,
+            samples,
+            lambda c: follow @ c,
+            jnp.asarray(unrest),
+            tick=number,
         )
-        rows = jnp.where(number % MADE_SYMMETRIC == 0, size, 0)
-        return (symmetric(covariance, rows), told.gain, scratch), None
+        return (covariance, told.gain, scratch), None
 
     begin = jnp.eye(size), jnp.zeros((2, size)), jnp.zeros((size, size))
     (covariance, *_), _ = lax.scan(tick, begin, jnp.arange(ticks))
