@@ -182,14 +182,31 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
         )
     ]
 
+    # short rows are collected, and several of them laid at once
+    collected = (
+        into if once or p["reverse"] else [lower.rows_of(memory) or memory for memory in into]
+    )
+    together = sorted({few.shape[0] for few in collected if few not in into})
+
+    def lay(end: ir.Value, rows: int, count: ir.Value) -> None:
+        for memory, few in zip(into, collected, strict=True):
+            if few is not memory and few.shape[0] == rows:
+                lower.lay_rows(memory, few, b.sub(end, count), count)
+
     def turn(number: ir.Value, carry: Sequence[Value]) -> list[Value]:
         place = number
         if p["reverse"]:
             place = b.sub(b.sub(lower.size(length), constant(I64, 1)), number)
         now = [_row(lower, v, place) for v in rows]
         outs = lower.run(body.jaxpr, body.consts, [*fixed, *carry, *now])
-        for memory, out in zip(into, outs[carried:], strict=True):
-            lower.store_rows(memory, place, out)
+        for memory, few, out in zip(into, collected, outs[carried:], strict=True):
+            at = place if few is memory else b.urem(number, constant(I64, few.shape[0]))
+            lower.store_rows(few, at, out)
+        after = b.add(number, constant(I64, 1))
+        for count in together:
+            rest = b.urem(after, constant(I64, count))
+            with b.if_then(b.icmp_signed("==", rest, constant(I64, 0))):
+                lay(after, count, constant(I64, count))
         return outs[:carried]
 
     start = operands[consts : consts + carried]
@@ -197,7 +214,10 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
         return [*turn(constant(I64, 0), start), *into]
     kinds = list(zip(lanes[:carried], columns[:carried], strict=True))
     carry = _Carry(lower, start, kinds, [*fixed, *rows])
-    end = _counted(lower, lower.size(length), carry, turn)
+    size = lower.size(length)
+    end = _counted(lower, size, carry, turn)
+    for count in together:
+        lay(size, count, b.urem(size, constant(I64, count)))
     return [*end, *into]
 
 

@@ -62,8 +62,8 @@ class _Frame(NamedTuple):
     passes: ir.Value
     first_lane: ir.Value
     own_lane: ir.Value
-    segment: list[ir.Value]
-    turn: list[ir.Value]
+    segment: ir.Value
+    turn: ir.Value
 
 
 @dataclass(frozen=True)
@@ -139,9 +139,11 @@ class Layout:
         at_once = constant(I64, width)
         first_lane = b.mul(block, at_once)
 
-        def of_lanes(table: ir.Value) -> list[ir.Value]:
-            places = (b.add(first_lane, constant(I64, lane)) for lane in range(width))
-            return [b.load(b.gep(table, [place])) for place in places]
+        def of_lanes(table: ir.Value) -> ir.Value:
+            place = b.bitcast(b.gep(table, [first_lane]), emitter.vector(I64).as_pointer())
+            found = b.load(place)
+            found.align = 8
+            return found
 
         frame = _Frame(
             given,
@@ -191,7 +193,7 @@ class Layout:
                 (column if apart else constant(I64, 1)) if by_lane else None,
                 (frame.first_lane if tangent else frame.own_lane) if by_lane else None,
                 column_stride=column if tangent else None,
-                scattered=[lower.b.mul(own, column) for own in frame.segment] if apart else (),
+                begins=lower.begins([(frame.segment, column)]) if apart else None,
             )
             memory = Memory(storage, shape)
             values.append(lower.elements(memory) if prod(shape) <= IN_REGISTERS else memory)
@@ -200,31 +202,24 @@ class Layout:
     def _results(self, lower: Lowering, frame: _Frame) -> list[Memory]:
         """Return the memory of each result, where each lane writes its own part."""
         b = lower.b
-        is_first, nowhere = constant(BOOL, 0), constant(I64, 0)
-        for turn in frame.turn:
-            is_first = b.or_(is_first, b.icmp_signed("==", turn, constant(I64, 0)))
+        nowhere, zero = constant(I64, 0), lower.e.number(frame.turn, 0)
+        is_first = lower.e.any_lane(b.icmp_signed("==", frame.turn, zero))
         memories = []
         for pointer, shape, moved in zip(frame.taken, self.outputs, self.moved, strict=True):
+            unit = constant(I64, self.columns if moved else 1)
+            own, *strides = lower.row_major((0, *shape.shape), unit)
+            parts = [(frame.segment, own)]
             if moved:
-                of_pass, *rest = lower.row_major((0, *shape.shape), constant(I64, self.columns))
-                stride, strides = b.mul(frame.passes, of_pass), tuple(rest)
-                begins = [
-                    b.add(b.mul(segment, stride), b.mul(turn, of_pass))
-                    for segment, turn in zip(frame.segment, frame.turn, strict=True)
-                ]
-            else:
-                stride, *rest = lower.row_major((0, *shape.shape))
-                strides = tuple(rest)
-                begins = [b.mul(segment, stride) for segment in frame.segment]
+                parts = [(frame.segment, b.mul(frame.passes, own)), (frame.turn, own)]
             is_wanted = b.icmp_unsigned("!=", b.ptrtoint(pointer, I64), nowhere)
             storage = Storage(
                 pointer,
                 type_of(shape.dtype),
-                strides,
-                stride,
+                tuple(strides),
+                own,
                 None,
                 column_stride=constant(I64, 1) if moved else None,
-                scattered=begins,
+                begins=lower.begins(parts),
                 writable=True,
                 guard=is_wanted if moved else b.and_(is_first, is_wanted),
             )

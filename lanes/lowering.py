@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from functools import reduce
 from itertools import product
-from math import prod
+from math import gcd, prod
 from typing import Any
 
 import jax
@@ -19,7 +19,8 @@ from jax.extend.core import Jaxpr, JaxprEqn, Literal
 from llvmlite import ir
 
 from lanes.dependence import CALLS, called
-from lanes.rules import BOOL, ELEMENTWISE, Emitter, constant, converted, type_of
+from lanes.machine import register_bytes
+from lanes.rules import BOOL, ELEMENTWISE, Emitter, constant, converted, mangled, type_of
 from lanes.values import (
     Deferred,
     Element,
@@ -268,10 +269,10 @@ class Lowering:
 
     def _load_column(self, storage: Storage, index: Index, column: int | None) -> ir.Value:
         if any(map(is_vector, index)):
-            if storage.scattered:
+            if storage.begins:
                 raise UnsupportedError("an index of each lane's own where lanes lie apart")
             return self._gathered(storage, index, column)
-        if storage.scattered:
+        if storage.begins:
             return self._collected(storage, index, 1)[0]
         place = self._place(storage, index, column)
         return self._read_at(storage, place, wide=storage.lane_stride is not None)
@@ -279,7 +280,7 @@ class Lowering:
     def _collected(self, storage: Storage, index: Index, count: int) -> list[ir.Value]:
         """Read so many numbers that lie side by side in each lane's part."""
         place, width = self._place(storage, index, None), self.e.width
-        lanes = [self.b.gep(storage.pointer, [self._sum(own, place)]) for own in storage.scattered]
+        lanes = self._parts(storage, place)
         found: list[ir.Value] = []
         whole = count // width * width if storage.kind != BOOL else 0
         for begin in range(0, whole, width):
@@ -350,7 +351,7 @@ class Lowering:
         place = constant(I64, 0)
         for i, stride in zip(index, storage.strides, strict=True):
             place = self._sum(place, self._product(self.as_index(i), stride))
-        if storage.first_lane is not None and not storage.scattered:
+        if storage.first_lane is not None and not storage.begins:
             assert storage.lane_stride is not None
             place = self._sum(place, self._product(storage.first_lane, storage.lane_stride))
         if column and storage.column_stride is not None:
@@ -410,10 +411,10 @@ class Lowering:
         """Write an array, or one row of it, if the memory's guard says so."""
         storage, first = memory.storage, constant(I64, 0)
         guard, own = storage.guard, storage.strides if number is None else storage.strides[1:]
-        if storage.scattered and number is not None:
+        if storage.begins and number is not None:
             first = self._product(number, storage.strides[0])
         with nullcontext() if guard is None else self.b.if_then(guard):
-            if storage.scattered and not isinstance(rows, np.ndarray) and self._is_long(rows.shape):
+            if storage.begins and not isinstance(rows, np.ndarray) and self._is_long(rows.shape):
 
                 def row(index: Index) -> None:
                     part = array_of(
@@ -428,7 +429,7 @@ class Lowering:
                 self.for_each(rows.shape[:1], row)
                 return
             given = self.elements(rows)
-            if storage.scattered:
+            if storage.begins:
                 self._scatter(storage, first, given)
                 return
             for place in np.ndindex(given.shape):
@@ -447,17 +448,95 @@ class Lowering:
         if storage.kind == BOOL:
             parts = [self.b.zext(p, self.e.vector(stored)) for p in map(self.e.splat, parts)]
         vectors = [self.e.splat(part) for part in parts]
-        lanes = [self.b.gep(storage.pointer, [self._sum(own, first)]) for own in storage.scattered]
-        begin = 0
+        lanes, begin = self._parts(storage, first), 0
         while begin < len(vectors):
             count = 1 << (min(width, len(vectors) - begin).bit_length() - 1)
-            turned = self._transposed(vectors[begin : begin + count])
-            for number, lane in enumerate(lanes):
-                row = self._some_lanes(turned[number % count], number - number % count, count)
-                pointer = self.b.gep(lane, [constant(I64, begin)])
-                pointer = self.b.bitcast(pointer, row.type.as_pointer())
-                self.b.store(row, pointer).align = _bytes(stored)
+            self._lay(vectors[begin : begin + count], lanes, constant(I64, begin))
             begin += count
+
+    def begins(self, parts: Sequence[tuple[ir.Value, ir.Value]]) -> ir.Value:
+        """Return where each lane's part begins: numbers of each lane, times steps, summed up."""
+        begin = reduce(self.b.add, (self.b.mul(n, self.e.splat(step)) for n, step in parts))
+        pointer = self._allocate(I64, self.e.width)
+        self.b.store(begin, self.b.bitcast(pointer, begin.type.as_pointer())).align = 8
+        return pointer
+
+    def _parts(self, storage: Storage, place: ir.Value) -> list[ir.Value]:
+        """Return where in each lane's part a place lies."""
+        return self._in_lanes(self.b.gep(storage.pointer, [place]), storage.begins)
+
+    def _in_lanes(self, pointer: ir.Value, begins: ir.Value | None) -> list[ir.Value]:
+        places = (self.b.gep(begins, [constant(I64, lane)]) for lane in range(self.e.width))
+        return [self.b.gep(pointer, [self.b.load(place)]) for place in places]
+
+    def _lay(self, vectors: list[ir.Value], lanes: Sequence[ir.Value], place: ir.Value) -> None:
+        """Write numbers, a power of two of them, side by side in each lane's part."""
+        count, turned = len(vectors), self._transposed(vectors)
+        for number, lane in enumerate(lanes):
+            row = self._some_lanes(turned[number % count], number - number % count, count)
+            pointer = self.b.bitcast(self.b.gep(lane, [place]), row.type.as_pointer())
+            self.b.store(row, pointer).align = _bytes(base(row.type))
+
+    def rows_of(self, memory: Memory) -> Memory | None:
+        """Return memory for some rows of an output, to be laid at once; None for one at a time.
+
+        Short rows of lanes that lie apart would be written number by number.
+        """
+        storage, shape = memory.storage, memory.shape[1:]
+        columns = 1 if storage.column_stride is None else self.columns
+        stored, size = storage.pointer.type.pointee, prod(shape) * columns
+        together = self._side_by_side(stored)
+        rows = together // gcd(size, together)
+        if storage.begins is None or rows == 1 or size > 2 * together:
+            return None
+        width = self.e.width
+        own = replace(
+            storage,
+            pointer=self._allocate(stored, rows * size * width),
+            strides=self.row_major((rows, *shape), constant(I64, columns * width)),
+            lane_stride=constant(I64, 1),
+            column_stride=storage.column_stride and constant(I64, width),
+            begins=None,
+        )
+        return Memory(own, (rows, *shape))
+
+    def lay_rows(self, memory: Memory, rows: Memory, first: ir.Value, count: ir.Value) -> None:
+        """Write so many rows that were collected where a first one belongs."""
+        storage, collected = memory.storage, rows.storage
+        size = constant(I64, collected.strides[0].constant // self.e.width)
+        into = self.b.gep(storage.pointer, [self._product(first, storage.strides[0])])
+        given = [into, storage.begins, collected.pointer, self._product(count, size)]
+        with nullcontext() if storage.guard is None else self.b.if_then(storage.guard):
+            self.b.call(self._laying(into.type), given)
+
+    def _laying(self, kind: ir.Type) -> ir.Function:
+        """Return the function that writes so many vectors side by side in each lane's part."""
+        stored, types = kind.pointee, [kind, I64.as_pointer(), kind, I64]
+        function = self.e.declared(f"lay.{mangled(stored)}", ir.FunctionType(ir.VoidType(), types))
+        if not function.is_declaration:
+            return function
+        function.linkage = "internal"
+        function.attributes.add("noinline")
+        into, begins, rows, count = function.args
+        outside, self.e.b = self.b, ir.IRBuilder(function.append_basic_block())
+        lanes = self._in_lanes(into, begins)
+        vectors = self.b.bitcast(rows, self.e.vector(stored).as_pointer())
+
+        def lay(place: ir.Value, number: int) -> None:
+            each = (self.b.add(place, constant(I64, i)) for i in range(number))
+            self._lay([self.b.load(self.b.gep(vectors, [i])) for i in each], lanes, place)
+
+        together = self._side_by_side(stored)
+        whole = self.b.and_(count, constant(I64, -together))
+        self._count(constant(I64, 0), whole, together, lambda place: lay(place, together))
+        self._count(whole, count, 1, lambda place: lay(place, 1))
+        self.b.ret_void()
+        self.e.b = outside
+        return function
+
+    def _side_by_side(self, stored: ir.Type) -> int:
+        """Return how many numbers of one lane are written at once."""
+        return min(self.e.width, register_bytes() // _bytes(stored))
 
     def _some_lanes(self, row: ir.Value, first: int, count: int) -> ir.Value:
         """Return neighbouring lanes of a vector; one lane as a number."""
@@ -547,22 +626,34 @@ class Lowering:
 
     def for_each(self, shape: Sequence[int], body: Callable[[Index], None]) -> None:
         """Write a loop over all indices of an array."""
+
+        def at(number: ir.Value) -> None:
+            index: list[ir.Value] = []
+            for length in reversed(shape):
+                index.insert(0, self.b.urem(number, constant(I64, length)))
+                number = self.b.udiv(number, constant(I64, length))
+            body(index)
+
+        self._count(constant(I64, 0), constant(I64, prod(shape)), 1, at)
+
+    def _count(
+        self, begin: ir.Value, end: ir.Value, step: int, body: Callable[[ir.Value], None]
+    ) -> None:
+        """Write a loop over numbers from one to before another."""
         b = self.b
         before = b.block
-        inside, after = (b.function.append_basic_block(name) for name in ("each", "after"))
-        b.branch(inside)
-        b.position_at_end(inside)
+        head, inside, after = (
+            b.function.append_basic_block(name) for name in ("count", "each", "after")
+        )
+        b.branch(head)
+        b.position_at_end(head)
         number = b.phi(I64)
-        number.add_incoming(constant(I64, 0), before)
-        index: list[ir.Value] = []
-        rest = number
-        for length in reversed(shape):
-            index.insert(0, b.urem(rest, constant(I64, length)))
-            rest = b.udiv(rest, constant(I64, length))
-        body(index)
-        following = b.add(number, constant(I64, 1))
-        number.add_incoming(following, b.block)
-        b.cbranch(b.icmp_signed("<", following, constant(I64, prod(shape))), inside, after)
+        number.add_incoming(begin, before)
+        b.cbranch(b.icmp_signed("<", number, end), inside, after)
+        b.position_at_end(inside)
+        body(number)
+        number.add_incoming(b.add(number, constant(I64, step)), b.block)
+        b.branch(head)
         b.position_at_end(after)
 
     def start_within(self, start: ir.Value, length: int, size: int) -> ir.Value:
@@ -766,7 +857,7 @@ def _dynamic_slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Val
     ]
     if isinstance(value, np.ndarray) and not all(isinstance(s, ir.Constant) for s in starts):
         value = lower.readable(value)
-    if isinstance(value, Memory) and value.storage.scattered and prod(sizes[:-1]) == 1:
+    if isinstance(value, Memory) and value.storage.begins and prod(sizes[:-1]) == 1:
         return array_of(lower._collected(value.storage, starts, sizes[-1]), sizes)
     found = [
         lower.at(

@@ -62,9 +62,9 @@ class Storage:
     """Number of the block's first lane."""
     column_stride: ir.Value | None = None
     """Numbers from one column to the next; None where it is no tangent."""
-    scattered: Sequence[ir.Value] = ()
-    """Where the numbers of each lane of the block begin, of an output or an argument whose lanes
-    lie apart. Empty where the lanes of an element lie beside each other."""
+    begins: ir.Value | None = None
+    """To where the numbers of each lane of the block begin, of an output or an argument whose lanes
+    lie apart. None where the lanes of an element lie beside each other."""
     writable: bool = False
     guard: ir.Value | None = None
     """When it is written to; None for always."""
