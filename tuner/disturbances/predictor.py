@@ -40,7 +40,7 @@ from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_from_jacobian, with_secants
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
-from tuner.objective.tunable import tunable_of
+from tuner.objective.tunable import Tunable
 from tuner.recordings.flight import Flight
 from tuner.vehicle.model import with_terms_computed
 
@@ -268,7 +268,7 @@ class Predictor:
         noise = np.stack([np.broadcast_to(factors[name], shape) for name in widths])
         noise = noise.repeat(list(widths.values()), axis=0)
         model = with_terms_computed(objective.model, self.computed)
-        tunable = tunable_of(model, objective.space)
+        tunable = Tunable(model, objective.space)
         return Expected(tunable, *map(jnp.asarray, (point.coefficients, strengths, noise)))
 
     def among(self, flights: NDArray[np.intp]) -> Predictor:

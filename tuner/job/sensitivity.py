@@ -19,6 +19,7 @@ from tuner.evaluate.held_out import comparison_of
 from tuner.findings.findings import Code, Finding
 from tuner.job.results import write_knowledge, write_next_flight
 from tuner.objective.alternatives import alternatives_of
+from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.options import ExaminationOptions
@@ -88,7 +89,7 @@ def _match(objective: Objective, vector: NDArray[np.float64]) -> _Match:
     """Return a problem whose noise is scaled to the residuals where these are larger."""
     point, start = objective.start(vector), beginning(objective, vector[None])
     unscaled = plain_criterion(objective, objective.samples)
-    sums = objective.sums_of(start.points, unscaled, derivatives=False)
+    sums = sums_at(objective, start.points, unscaled, derivatives=False)
     residual = root_mean_squares(objective, sums)
     scale = misfit({name: of_starts[0] for name, of_starts in residual.items()})
     criterion = plain_criterion(objective, objective.samples, scale)

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.engine import Report, current
-from tuner.objective.criterion import Criterion, Point, SegmentData, SegmentSums
-from tuner.objective.normal import Objective
+from tuner.objective.criterion import Criterion, Point, SegmentSums
+from tuner.objective.normal import Objective, some_segments
 from tuner.objective.residuals import residuals, robust
 
 CHUNK = 16
@@ -67,19 +67,16 @@ def _evaluated(
 ) -> Batch:
     """Return what some vectors give: all segments of all vectors fly side by side."""
     (objective, point, criterion), vectors = task[0](), task[1]
-    simulator, count = objective.simulator, len(vectors)
-    segments = objective.segments.count
-    data: SegmentData = jax.tree.map(
-        lambda leaf: np.tile(leaf, count), objective.data(point.offsets, criterion)
-    )
-    horizon, together = int(criterion.horizon), count * segments
-    flown = simulator.fly(data, objective.tunable, np.repeat(vectors, segments, axis=0), horizon)
-    reading = simulator.reading(data, horizon)
-    loss, squares = np.zeros(together), {}
-    for name, measured in data.segments.measured.items():
-        scale = np.asarray(data.scale[name])
-        by_axis = np.zeros((together, np.shape(measured.weight)[1]))
-        for block in residuals(flown, data.segments, name, reading):
+    count, segments = len(vectors), objective.segments.count
+    together = np.tile(np.arange(segments), count)
+    objective, criterion = some_segments(objective, criterion, together)
+    point = Point(np.repeat(vectors, segments, axis=0), point.offsets)
+    flown, reading = objective.fly(point, criterion), objective.reading(point, criterion)
+    loss, squares = np.zeros(len(together)), {}
+    for name, measured in objective.segments.measured.items():
+        scale = np.asarray(criterion.scale[name])[objective.flight]
+        by_axis = np.zeros((len(together), np.shape(measured.weight)[1]))
+        for block in residuals(flown, objective.segments, name, reading):
             scaled = block.errors / scale[block.segments, None, None]
             loss[block.segments] += 0.5 * robust(scaled, float(criterion.huber)).sum(axis=(1, 2))
             by_axis[block.segments] += np.einsum("fnk,fnk->fk", block.errors, block.errors)
@@ -87,32 +84,29 @@ def _evaluated(
     return Batch(loss.reshape(count, segments), squares, flown.crash_time.reshape(count, segments))
 
 
-_Problem = Callable[[], tuple[Objective, Criterion, bool]]
-
-
 def sums_at(
     objective: Objective, points: Point, criterion: Criterion, *, derivatives: bool = True
 ) -> SegmentSums:
-    """Return every segment's contribution at S points, as `Objective.sums_of` does.
+    """Return every segment's contribution at S points; all leaves have S first.
 
     The engine in force computes them, a task each; one alone stays here.
     """
-    if len(points.coefficients) == 1:
-        return objective.sums_of(points, criterion, derivatives=derivatives)
-    engine = current()
-    problem = engine.share((objective, criterion, derivatives))
     alone = [
-        Point(coefficients[None], offsets[None])
+        Point(coefficients, offsets)
         for coefficients, offsets in zip(points.coefficients, points.offsets, strict=True)
     ]
-    parts = engine.map(_sums, [(problem, point) for point in alone])
-    joined: SegmentSums = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    if len(alone) == 1:
+        parts = [objective.sums(alone[0], criterion, derivatives=derivatives)]
+    else:
+        engine = current()
+        problem = engine.share((objective, criterion, derivatives))
+        parts = engine.map(_sums, [(problem, point) for point in alone])
+    joined: SegmentSums = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
     return joined
 
 
-def _sums(task: tuple[_Problem, Point], _report: Report) -> SegmentSums:
-    problem, point = task
-    objective, criterion, derivatives = problem()
-    flown = objective.sums_of(point, criterion, derivatives=derivatives)
-    sums: SegmentSums = jax.tree.map(np.asarray, flown)
-    return sums
+def _sums(
+    task: tuple[Callable[[], tuple[Objective, Criterion, bool]], Point], _report: Report
+) -> SegmentSums:
+    (objective, criterion, derivatives), point = task[0](), task[1]
+    return objective.sums(point, criterion, derivatives=derivatives)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from tuner.objective.segments import OFFSETS, Segments
+from tuner.objective.segments import OFFSETS
 from tuner.vehicle import REGISTRY, recording_offsets
 
 Either: TypeAlias = Any
@@ -132,13 +132,3 @@ class Jacobian(eqx.Module):
             residuals={name: self.residuals[name] for name in names},
             columns={name: self.columns[name] for name in names},
         )
-
-
-class SegmentData(eqx.Module):
-    """Recordings and the part of a point and a criterion that concerns them, segment by segment."""
-
-    segments: Segments
-    offsets: Float[Either, "*starts offsets F"]
-    scale: dict[str, Float[Either, " F"]]
-    reference_offset: Float[Either, "clocks F"]
-    states: Float[Either, "L F"] | None

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit
@@ -69,17 +72,33 @@ class Space:
         """Return the scaled coordinates of search vectors (*S, K)."""
         return np.asarray(self.lower + self.width * self.share(vector))
 
-    def at(self, vector: ArrayLike) -> NDArray[np.float64]:
-        """Return the parameters' values at search vectors (*S, K)."""
+    def at(self, vector: Any) -> Any:
+        """Return the parameters' values at search vectors (*S, K), which may be traced."""
+        if isinstance(vector, jax.core.Tracer):
+            scaled = self.lower + self.width * jax.nn.sigmoid(vector / self.stretch)
+            return jnp.where(self.is_log, jnp.exp(jnp.where(self.is_log, scaled, 0.0)), scaled)
         scaled = self.scaled(vector)
         return np.where(self.is_log, np.exp(np.where(self.is_log, scaled, 0.0)), scaled)
 
-    def numbers(self, vector: ArrayLike) -> dict[str, float]:
-        """Return every free coefficient's value, tied ones too."""
+    def values(self, vector: Any) -> dict[str, Any]:
+        """Return every free coefficient's value (*S,), tied ones too; as of `at`."""
         values = self.at(vector)
         return {
-            name: float(value * ratio)
-            for value, parameter in zip(values, self.parameters, strict=True)
+            name: values[..., column] * ratio
+            for column, parameter in enumerate(self.parameters)
+            for name, ratio in parameter.ratios.items()
+        }
+
+    def numbers(self, vector: ArrayLike) -> dict[str, float]:
+        """Return every free coefficient's value at a search vector (K,), tied ones too."""
+        return {name: float(value) for name, value in self.values(vector).items()}
+
+    def slopes(self, vector: ArrayLike) -> dict[str, NDArray[np.float64]]:
+        """Return every free coefficient's derivatives (K,) by a search vector, tied ones too."""
+        slope = np.where(self.is_log, self.at(vector), 1.0) * self.slope(np.asarray(vector))
+        return {
+            name: np.where(np.arange(len(self)) == column, ratio * slope, 0.0)
+            for column, parameter in enumerate(self.parameters)
             for name, ratio in parameter.ratios.items()
         }
 

@@ -15,8 +15,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-import equinox as eqx
-import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -28,6 +26,7 @@ from tuner.objective.alternatives import alternatives_of
 from tuner.objective.balance import Balance, balance_of
 from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Point, SegmentSums
+from tuner.objective.normal import some_segments
 from tuner.objective.tunable import Tunable
 from tuner.search.fitted import Fitted
 from tuner.search.least_squares import LeastSquares
@@ -244,15 +243,7 @@ def _fitted_to(
     ``begin`` (K,) is another place to begin, ``settled`` (K,) what stays as it is there.
     """
     objective = fitted.objective
-    some = eqx.tree_at(
-        lambda o: o.segments,
-        objective,
-        jax.tree.map(lambda leaf: np.asarray(leaf)[..., inside], objective.segments),
-    )
-    states = fitted.criterion.states
-    criterion = replace(
-        fitted.criterion, states=None if states is None else np.asarray(states)[:, inside]
-    )
+    some, criterion = some_segments(objective, fitted.criterion, inside)
     held = np.isin(objective.space.names, list(set(fitted.held.values())))
     if settled is not None:
         held |= settled

@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 
 from tuner.core.numerics import scaled_solve
 from tuner.objective.criterion import Criterion, Jacobian, Point, units_of
-from tuner.objective.flight_batches import portion, portions
 from tuner.objective.information import (
     BLOCK,
     FisherInformation,
     information_from_jacobian,
     with_secants,
 )
-from tuner.objective.normal import Objective
+from tuner.objective.normal import Objective, portions
 from tuner.objective.space import Space
 from tuner.uncertainty.overdispersion import Stretches
 from tuner.vehicle import REGISTRY
@@ -199,8 +198,8 @@ def linear_at(
         Conditions to have columns for, behind those of the coefficients: N for each of them.
     """
     parts, loss = [], 0.0
-    for flights in portions(replace(objective, memory=objective.memory // 2), point, criterion):
-        batch = portion(objective, point, criterion, flights)
+    half = replace(objective, memory=objective.memory // 2)
+    for flights, batch in portions(half, point, criterion):
         jacobian = with_secants(
             batch[0].jacobian(*batch[1:]),
             batch[0].space,

@@ -14,9 +14,8 @@ from tuner.disturbances.information import with_hidden, with_strengths
 from tuner.disturbances.predictor import Predictor
 from tuner.objective.alternatives import LACK
 from tuner.objective.criterion import Criterion, Jacobian, Point
-from tuner.objective.flight_batches import portion, portions
 from tuner.objective.information import FisherInformation, information_from_jacobian
-from tuner.objective.normal import Objective
+from tuner.objective.normal import Objective, portion, portions
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty, at_rest, references, uncertainty_at
@@ -117,8 +116,7 @@ def examine(
     if predictor is not None:
         slopes = predictor.slopes(objective, Point(point.coefficients, predictor.feed.offsets))
     residuals: list[Residual] = []
-    for flights in portions(objective, point, criterion):
-        batch = portion(objective, point, criterion, flights)
+    for flights, batch in portions(objective, point, criterion):
         jacobian = batch[0].jacobian(*batch[1:])
         flight_names = [names[number] for number in flights]
         others = {

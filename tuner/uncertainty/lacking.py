@@ -33,12 +33,10 @@ from tuner.equation_error.measured import FEWEST, Measured, measured
 from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, answers
 from tuner.equation_error.unexplained import Law, Pair, unexplained
 from tuner.findings.findings import Code, Finding
-from tuner.objective.criterion import units_of
 from tuner.objective.flight import MOTION, SETPOINTS, SPEEDS, TURNED, environment_of
 from tuner.objective.flown import Flown, fly
 from tuner.objective.normal import Objective
 from tuner.objective.recorded_inputs import zero_order_hold
-from tuner.objective.segments import OFFSETS
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty
@@ -115,11 +113,7 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         return None
     vector = np.asarray(point.coefficients)
     model = objective.tunable.at(jnp.asarray(vector))
-    units = units_of(objective.conditions)
-    conditions = {
-        name: np.asarray(point.offsets)[len(OFFSETS) + row] * units[row]
-        for row, name in enumerate(objective.conditions)
-    }
+    conditions = objective.conditions_at(point)
     environment = environment_of(model, segments, conditions)
     driven = [not flight.tells_speeds for flight in flights]
     commands = {

@@ -25,7 +25,7 @@ from tuner.disturbances.observer import Expected, Feed, first_errors
 from tuner.disturbances.recorded import Sampled
 from tuner.objective.segments import Segments
 from tuner.objective.space import space_of
-from tuner.objective.tunable import tunable_of
+from tuner.objective.tunable import Tunable
 from tuner.vehicle.model import model_of, schedule_of
 
 TICKS = 6
@@ -78,7 +78,7 @@ def hovering() -> tuple[ekf.Schedule, Feed, Expected]:
     return (
         schedule,
         feed,
-        Expected(tunable_of(model, space), space.initial, USUAL[:, None] + 1.0, np.ones((wide, 1))),
+        Expected(Tunable(model, space), space.initial, USUAL[:, None] + 1.0, np.ones((wide, 1))),
     )
 
 

@@ -116,12 +116,7 @@ def with_data(
 
 def fly_at(objective: Objective, point: Point) -> Mapping[str, np.ndarray]:
     """Return channel -> (samples, c, F)."""
-    flown = objective.simulator.fly(
-        objective.data(point.offsets, criterion_of(objective)),
-        objective.tunable,
-        np.asarray(point.coefficients),
-        objective.samples,
-    )
+    flown = objective.fly(point, criterion_of(objective))
     return {name: np.moveaxis(series, 0, -1) for name, series in flown.channels.items()}
 
 

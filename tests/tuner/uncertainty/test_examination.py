@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.objective.flight_batches import portions
-from tuner.objective.normal import Objective
+from tuner.objective.normal import Objective, portions
 from tuner.uncertainty.examination import Examination, examine, knowledge_of
 from tuner.uncertainty.local_sensitivity import shortest_half
 from tuner.uncertainty.records import Knowledge, write_files
@@ -43,7 +42,7 @@ def test_flights_that_do_not_fit_the_memory_take_turns(
 ) -> None:
     small = replace(objective, memory=1)
     fitted = making.fitted_of(small, making.truth(small))
-    assert [list(p) for p in portions(small, fitted.point, fitted.criterion)] == [[0], [1]]
+    assert [list(p) for p, _ in portions(small, fitted.point, fitted.criterion)] == [[0], [1]]
     turns = examine(fitted)
     assert turns.residuals[0].flight != turns.residuals[-1].flight
     assert [r.flight for r in turns.residuals] == [r.flight for r in examination.residuals]

@@ -12,7 +12,7 @@ from tuner.config.job import CoefficientSettings
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import find_config
 from tuner.objective.space import space_of
-from tuner.objective.tunable import tunable_of
+from tuner.objective.tunable import Tunable
 from tuner.vehicle import (
     COEFFICIENTS,
     REGISTRY,
@@ -138,7 +138,7 @@ def test_a_freed_effect_starts_at_its_neutral_value_and_appears_in_the_model(veh
     assert float(space.numbers(space.initial)["fuselage_drag"]) == 0.0
     model = model_of(vehicle, ControllerFile())
     assert "fuselage_drag" not in coefficients_in(model)
-    moved = tunable_of(model, space).at(space.initial + 1.0)
+    moved = Tunable(model, space).at(space.initial + 1.0)
     assert float(coefficients_in(moved)["fuselage_drag"]) == pytest.approx(0.02, rel=0.01)
 
 
