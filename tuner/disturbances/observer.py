@@ -37,7 +37,7 @@ from tuner.disturbances.recorded import Sampled
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.flight import beginning_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
-from tuner.objective.tunable import Tunable
+from tuner.objective.space import Tunable
 from tuner.vehicle.model import Model
 
 CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")

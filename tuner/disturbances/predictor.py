@@ -40,7 +40,7 @@ from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_from_jacobian, with_secants
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
-from tuner.objective.tunable import Tunable
+from tuner.objective.space import Tunable
 from tuner.recordings.flight import Flight
 from tuner.vehicle.model import with_terms_computed
 

@@ -33,6 +33,7 @@ from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.flight import MOTION, SPEEDS, TURNED
 from tuner.objective.flown import Flown, fly
+from tuner.objective.initial_conditions import recent_command
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
@@ -45,7 +46,6 @@ from tuner.objective.segments import (
     window_segments,
 )
 from tuner.objective.space import Space
-from tuner.objective.start import recent_command
 from tuner.objective.windows import Window, windows_of
 from tuner.options import RecordingOptions
 from tuner.recordings.flight import Array

@@ -35,7 +35,7 @@ from sim_jax.constants import GRAVITY
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Inverse
 from tuner.inertial.signals import Lags, Stretch, blocks_of, low_passed, rotor_speeds, smoothed
-from tuner.objective.explained import levers
+from tuner.objective.rotor_signals import levers
 from tuner.recordings.flight import Array
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
 from tuner.vehicle.model import model_of

@@ -21,7 +21,7 @@ from tuner.findings.findings import remedy, sentence
 from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
-from tuner.objective.motor_order import order_findings
+from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.loader import InertialFlight
 from tuner.vehicle import VehicleFile
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuner.inertial.signals import Lags, Stretch, rotor_speeds, smoothed
-from tuner.objective.explained import levers
+from tuner.objective.rotor_signals import levers
 from tuner.recordings.flight import Array
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
 from tuner.vehicle.model import model_of

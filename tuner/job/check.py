@@ -13,10 +13,8 @@ from sim_jax.constants import GRAVITY
 from sim_jax.control.mixer import ROTORS
 from tuner.core.numerics import symmetric_eigen, unit_diagonal
 from tuner.findings.findings import Code, Finding
-from tuner.objective.explained import Source, squared_speed
-from tuner.objective.inlets import INLETS, bypassed_by
-from tuner.objective.motor_order import order_findings
-from tuner.objective.recorded_inputs import sparse
+from tuner.objective.inlets import INLETS, bypassed_by, sparse
+from tuner.objective.rotor_signals import Source, order_findings, squared_speed
 from tuner.objective.setpoints import setpoint_findings
 from tuner.recordings.flight import Array, Flight
 from tuner.search.problem import Job

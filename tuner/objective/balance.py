@@ -40,7 +40,7 @@ from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.objective.criterion import Point
 from tuner.objective.flown import fly
 from tuner.objective.normal import Objective
-from tuner.objective.tunable import Tunable
+from tuner.objective.space import Tunable
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import states_at
 

@@ -245,31 +245,19 @@ def laid_out(segments: Segments) -> Any:
 
 
 def _tables(inlet: Inlet) -> Inlet:
-    """Return how an inlet's leaves are laid out: those of more than one axis are tables in time."""
+    """Return how an inlet's leaves are laid out: those of more than one axis are tables in time.
+
+    Tables of one length share a name that does not tell the length.
+    """
+    names: dict[int, str] = {}
 
     def of(leaf: Any) -> Argument:
         shape = np.shape(leaf)[:-1]
         if shape:
-            shape = (f"rows {shape[0]}", *shape[1:])
+            shape = (names.setdefault(shape[0], f"rows {len(names)}"), *shape[1:])
         return Argument(shape, np.result_type(leaf), lanes=True)
 
-    laid = jax.tree.map(of, inlet)
-    # tables of one length share a name that does not tell the length
-    lengths = {
-        argument.shape[0]: None
-        for argument in jax.tree.leaves(laid, is_leaf=lambda a: isinstance(a, Argument))
-        if argument.shape
-    }
-    names = {length: f"rows {number}" for number, length in enumerate(lengths)}
-
-    def named(argument: Argument) -> Argument:
-        if not argument.shape:
-            return argument
-        return Argument(
-            (names[argument.shape[0]], *argument.shape[1:]), argument.dtype, argument.lanes
-        )
-
-    tables: Inlet = jax.tree.map(named, laid, is_leaf=lambda a: isinstance(a, Argument))
+    tables: Inlet = jax.tree.map(of, inlet)
     return tables
 
 

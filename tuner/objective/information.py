@@ -231,7 +231,6 @@ def information_at(
     criterion: Criterion,
     *,
     offsets_fitted: NDArray[np.bool_] | None = None,
-    block: float = BLOCK,
 ) -> FisherInformation:
     """Return the information at a point, where the Jacobian is evaluated.
 
@@ -241,12 +240,10 @@ def information_at(
         The problem, and where it is examined.
     offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
-    block
-        Length of the stretches of time that are summed up, s.
     """
     jacobian = objective.jacobian(point, criterion)
     return information_from_jacobian(
-        objective, point, criterion, jacobian, offsets_fitted=offsets_fitted, block=block
+        objective, point, criterion, jacobian, offsets_fitted=offsets_fitted
     )
 
 
@@ -258,17 +255,18 @@ def information_from_jacobian(
     *,
     offsets_fitted: NDArray[np.bool_] | None = None,
     otherwise: Mapping[str, Mapping[str, Array]] = MappingProxyType({}),
-    block: float = BLOCK,
 ) -> FisherInformation:
     """Return the information of a Jacobian; see `information_at`.
 
     ``otherwise``: what might be simulated differently -> channel -> (n, k, F) residuals then.
     """
-    count, segments = len(objective.space), objective.segments.count
+    space, flight, segments = objective.space, objective.flight, objective.segments.count
     channels = tuple(jacobian.residuals)
-    blocks = _block_count(objective, criterion, block)
+    scales = np.stack([np.asarray(criterion.scale[channel])[flight] for channel in channels])
+    seconds = float(criterion.horizon) / float(objective.schedule.log_rate)
+    blocks = max(int(seconds / BLOCK), 1)
     states = 0 if criterion.states is None else len(criterion.states)
-    size = count + point.offsets.shape[0] + states
+    size = len(space) + point.offsets.shape[0] + states
     information = np.zeros((len(channels), segments, blocks, size, size))
     score = np.zeros((len(channels), segments, blocks, size))
     spread = np.ones((len(channels), segments))
@@ -278,14 +276,11 @@ def information_from_jacobian(
         residuals = np.asarray(jacobian.residuals[channel])
         weight = np.asarray(objective.segments.measured[channel].weight)
         time = np.asarray(objective.segments.measured[channel].time)
-        scale = np.asarray(criterion.scale[channel])[np.asarray(objective.segments.flight)]
-        for segment in range(segments):
-            rows = (
-                np.moveaxis(columns[..., segment], 0, -1) / scale[segment]
-            )  # as it lies in memory
-            error = residuals[..., segment] / scale[segment]
+        for segment, scale in enumerate(scales[number]):
+            rows = np.moveaxis(columns[..., segment], 0, -1) / scale  # as it lies in memory
+            error = residuals[..., segment] / scale
             robust = huber_weights(error, float(criterion.huber))
-            stretch = np.minimum((time[:, segment] / block).astype(int), blocks - 1)
+            stretch = np.minimum((time[:, segment] / BLOCK).astype(int), blocks - 1)
             for index in range(blocks):
                 inside = stretch == index
                 own = rows[inside].reshape(-1, size)
@@ -293,100 +288,74 @@ def information_from_jacobian(
                 information[number, segment, index] = weighted @ own
                 score[number, segment, index] = weighted @ error[inside].ravel()
             for name, others in otherwise.items():
-                change = others[channel][..., segment] / scale[segment] - error
+                change = others[channel][..., segment] / scale - error
                 changes[name][segment] += (robust * change).ravel() @ rows.reshape(-1, size)
             compared = (weight[..., segment] > 0) & np.any(rows != 0, axis=-1)
             if compared.any():
                 spread[number, segment] = np.mean((robust * error**2)[compared])
-    flight = np.asarray(objective.segments.flight)
-    scales = np.stack([np.asarray(criterion.scale[channel])[flight] for channel in channels])
-    sums = _Sums(channels, information, score, spread, scales, changes)
+    to_scaled = np.ones(size)
+    to_scaled[: len(space)] = 1.0 / space.slope(np.asarray(point.coefficients))
+    information = information * to_scaled[:, None] * to_scaled
     fitted = np.asarray(point.offsets) != 0.0 if offsets_fitted is None else offsets_fitted
-    return _without_nuisances(
-        objective,
-        point,
-        criterion,
-        sums,
-        offsets_fitted=fitted,
-        crashed=np.isfinite(np.asarray(jacobian.crash_time)),
-    )
-
-
-@dataclass(frozen=True)
-class _Sums:
-    """Information and score, nuisance parameters included, in the search's coordinates."""
-
-    channels: tuple[str, ...]
-    blocks: Array
-    score: Array
-    spread: Array
-    scale: Array
-    changes: Mapping[str, Array]
-
-
-def _block_count(objective: Objective, criterion: Criterion, block: float) -> int:
-    seconds = float(criterion.horizon) / float(objective.schedule.log_rate)
-    return max(int(seconds / block), 1)
-
-
-def _without_nuisances(
-    objective: Objective,
-    point: Point,
-    criterion: Criterion,
-    sums: _Sums,
-    *,
-    offsets_fitted: NDArray[np.bool_],
-    crashed: NDArray[np.bool_],
-) -> FisherInformation:
-    """Change to scaled coordinates; eliminate the segments' starts, then the flights' offsets."""
-    space, segments = objective.space, objective.segments.count
-    count, kinds = len(space), len(offsets_fitted)
-    slope = space.slope(np.asarray(point.coefficients))
-    stretch = np.concatenate([1.0 / slope, np.ones(sums.score.shape[-1] - count)])
-    blocks = sums.blocks * stretch[:, None] * stretch
-    score = sums.score * stretch
-    flight = np.asarray(objective.segments.flight)
-    eliminate = np.zeros((segments, count, len(stretch)))
-    nuisance_prior, nuisance_pull = np.zeros((count, count)), np.zeros(count)
-    offsets, states = np.asarray(point.offsets), criterion.states
-    for number in range(int(flight.max()) + 1):
-        segments_of = np.flatnonzero(flight == number)
-        first, whole = {}, np.zeros((count + kinds, count + kinds))
-        for segment in segments_of:
-            first[segment] = _without_start(blocks[:, segment].sum(axis=(0, 1)), count + kinds)
-            whole += _information_along(blocks[:, segment].sum(axis=(0, 1)), first[segment])
-        projection = _projection(whole, offsets_fitted[:, number], count)
-        second = np.hstack([np.eye(count), projection])
-        nuisance_prior += projection @ projection.T / OFFSET_SD**2
-        nuisance_pull += projection @ offsets[:, number] / OFFSET_SD**2
-        for segment in segments_of:
-            eliminate[segment] = second @ first[segment]
-            follow = second @ first[segment][:, count + kinds :]
-            nuisance_prior += follow @ follow.T
-            if states is not None:
-                nuisance_pull += follow @ np.asarray(states)[:, segment]
-    reduced = np.einsum("lap,clbpq,ldq->clbad", eliminate, blocks, eliminate, optimize=True)
+    along, prior, pull = _along(objective, point, criterion, information, fitted)
     return FisherInformation(
-        channels=sums.channels,
+        channels=channels,
         flight=flight,
-        blocks=reduced,
-        score=np.einsum("lap,clbp->clba", eliminate, score),
-        spread=sums.spread,
-        nuisance_prior=nuisance_prior,
+        blocks=np.einsum("lap,clbpq,ldq->clbad", along, information, along, optimize=True),
+        score=np.einsum("lap,clbp->clba", along, score * to_scaled),
+        spread=spread,
+        nuisance_prior=prior,
         prior=np.diag(float(criterion.prior) ** 2 / space.prior_sd**2),
-        crashed=crashed,
+        crashed=np.isfinite(np.asarray(jacobian.crash_time)),
         begins=objective.segments.begins,
-        scale=sums.scale,
+        scale=scales,
         changes={
-            name: np.einsum("lap,lp->la", eliminate, change * stretch)
-            for name, change in sums.changes.items()
+            name: np.einsum("lap,lp->la", along, change * to_scaled)
+            for name, change in changes.items()
         },
         ground=None
         if space.joint_rows is None
         else float(criterion.prior) ** 2 * space.joint_rows.T @ space.joint_rows,
         pull=_pull(space, point, criterion),
-        nuisance_pull=nuisance_pull,
+        nuisance_pull=pull,
     )
+
+
+def _along(
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    information: Array,
+    offsets_fitted: NDArray[np.bool_],
+) -> tuple[Array, Array, Array]:
+    """Return how all parameters follow the coefficients: (F, K, Q), starts and offsets at best.
+
+    Given the information (C, F, B, Q, Q) in the scaled coordinates. With it, what the priors of
+    starts and offsets then contribute to the information (K, K), and to the slope (K,).
+    """
+    whole = information.sum(axis=(0, 2))
+    count, (kinds, flights), states = len(objective.space), point.offsets.shape, criterion.states
+    kept = count + kinds
+    along = np.zeros((len(whole), count, whole.shape[-1]))
+    prior, pull = np.zeros((count, count)), np.zeros(count)
+    for number in range(flights):
+        segments = np.flatnonzero(objective.flight == number)
+        first = {segment: _without_start(whole[segment], kept) for segment in segments}
+        together = sum(
+            (_information_along(whole[segment], first[segment]) for segment in segments),
+            np.zeros((kept, kept)),
+        )
+        projection = _projection(together, offsets_fitted[:, number], count)
+        second = np.hstack([np.eye(count), projection])
+        prior += projection @ projection.T / OFFSET_SD**2
+        pull += projection @ np.asarray(point.offsets)[:, number] / OFFSET_SD**2
+        for segment in segments:
+            along[segment] = second @ first[segment]
+            follow = along[segment][:, kept:]
+            prior += follow @ follow.T
+            if states is not None:
+                pull += follow @ np.asarray(states)[:, segment]
+    return along, prior, pull
 
 
 def _pull(space: Space, point: Point, criterion: Criterion) -> Array:

@@ -31,8 +31,7 @@ from tuner.objective.flown import Flown, fly
 from tuner.objective.initial_conditions import eliminated
 from tuner.objective.residuals import Reading, gauss_newton, residuals, robust
 from tuner.objective.segments import OFFSETS, Segments
-from tuner.objective.space import Space
-from tuner.objective.tunable import Tunable
+from tuner.objective.space import Space, Tunable
 from tuner.vehicle.model import Model
 
 Array = NDArray[np.float64]

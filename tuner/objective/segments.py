@@ -19,10 +19,15 @@ from sim_jax.state import Start
 from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
 from tuner.objective.battery import log_voltage_of
-from tuner.objective.initial_conditions import freedom_of, freedom_of_spin
+from tuner.objective.initial_conditions import (
+    freedom_of,
+    freedom_of_spin,
+    recent_command,
+    rests,
+    start_of,
+)
 from tuner.objective.inlets import INLETS, inlet_of
 from tuner.objective.noise import repeats
-from tuner.objective.start import recent_command, rests, start_of
 from tuner.objective.wander import wander_of
 from tuner.objective.windows import Window, windows_of
 from tuner.recordings.flight import Flight, Series
@@ -114,8 +119,8 @@ def segments_of(
     flights: Sequence[Flight],
     *,
     noise: Mapping[str, float],
-    weights: Mapping[str, Mapping[str, float]] | None = None,
-    schedule: Schedule | None = None,
+    schedule: Schedule,
+    weights: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
     free_starts: bool = False,
 ) -> Segments:
     """Lay whole flights side by side for the ``reference`` inlet.
@@ -126,10 +131,10 @@ def segments_of(
         F flights with a recorded or named reference.
     noise
         Channel -> standard deviation in its unit (attitude: rad). Channels not named are left out.
-    weights
-        Flight name -> channel -> factor on the residuals.
     schedule
         On whose control ticks the battery's voltage is laid out.
+    weights
+        Flight name -> channel -> factor on the residuals.
     free_starts
         Whether what a spin does not forget is free at its start: see `freedom_of_spin`.
 
@@ -138,7 +143,6 @@ def segments_of(
     RecordingError
         A flight holds no reference.
     """
-    schedule = Schedule() if schedule is None else schedule
     silent = INLETS["reference"].silences
     noise = {channel: sigma for channel, sigma in noise.items() if channel not in silent}
     for flight in flights:
@@ -178,7 +182,7 @@ def window_segments(
     schedule: Schedule,
     lag: float,
     noise: Mapping[str, float],
-    weights: Mapping[str, Mapping[str, float]] | None = None,
+    weights: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
     stride: float | None = None,
     free_starts: bool = True,
     input_late: Mapping[str, float] = MappingProxyType({}),
@@ -238,8 +242,7 @@ def window_segments(
         if channel in POSE or any(channel not in INLETS[name].silences for name in inlets)
     }
     weights = {
-        flight.name: dict((weights or {}).get(flight.name, {}))
-        | dict.fromkeys(INLETS[name].silences, 0.0)
+        flight.name: dict(weights.get(flight.name, {})) | dict.fromkeys(INLETS[name].silences, 0.0)
         for flight, name in zip(flights, inlets, strict=True)
     }
     return Segments(
@@ -271,12 +274,9 @@ def on_time(flight: Flight, signals: Sequence[str], late: float) -> Flight:
 def _all_measured(
     flights: Sequence[Flight],
     noise: Mapping[str, float],
-    weights: Mapping[str, Mapping[str, float]] | None,
+    weights: Mapping[str, Mapping[str, float]],
 ) -> dict[str, Measured]:
-    return {
-        channel: _measured(flights, channel, sigma, weights or {})
-        for channel, sigma in noise.items()
-    }
+    return {name: _measured(flights, name, sigma, weights) for name, sigma in noise.items()}
 
 
 def _measured(
@@ -285,37 +285,28 @@ def _measured(
     sigma: float,
     weights: Mapping[str, Mapping[str, float]],
 ) -> Measured:
-    recorded = []
-    for flight in flights:
-        series = flight.series.get(channel)
-        inside = np.zeros(0, bool) if series is None else _inside(flight, series.time)
-        width = 4 if channel in ("attitude", "rotor_speed", "command") else 3
-        time = np.zeros(0) if series is None else series.time[inside]
-        values = np.zeros((0, width)) if series is None else series.values[inside]
-        recorded.append((time, values))
-    length = max(len(time) for time, _ in recorded)
-    times, tables, scales = [], [], []
-    for flight, (time, values) in zip(flights, recorded, strict=True):
-        padding = length - len(time)
-        factor = weights.get(flight.name, {}).get(channel, 1.0)
-        finite = np.isfinite(values)
-        scale = finite * (factor / sigma)
+    """Return a channel of all flights, in their time, behind the end zero; level, an attitude."""
+    width = 4 if channel in ("attitude", "rotor_speed", "command") else 3
+    first = 1 if channel == "attitude" else 0
+    recorded = [_during(flight, flight.series.get(channel), width) for flight in flights]
+    shape = max(len(series.time) for series in recorded), len(flights)
+    time, values = np.zeros(shape), np.zeros((shape[0], width, shape[1]))
+    weight = np.zeros((shape[0], width - first, shape[1]))
+    values[:, :first] = 1.0
+    for number, (flight, series) in enumerate(zip(flights, recorded, strict=True)):
+        finite, length = np.isfinite(series.values), len(series.time)
+        scale = finite * (weights.get(flight.name, {}).get(channel, 1.0) / sigma)
         if channel == "command":
-            scale = scale / np.sqrt(repeats(values))
-        times.append(np.pad(time, (0, padding)))
-        filled = np.where(finite, values, 0.0)
-        filled = np.pad(filled, ((0, padding), (0, 0)))
-        if channel == "attitude":
-            scale = scale[:, 1:]
-            filled[len(time) :, 0] = 1.0
-        tables.append(filled)
-        scales.append(np.pad(scale, ((0, padding), (0, 0))))
-    return Measured(
-        time=np.stack(times, axis=-1),
-        values=np.stack(tables, axis=-1),
-        weight=np.stack(scales, axis=-1),
-    )
+            scale = scale / np.sqrt(repeats(series.values))
+        time[:length, number] = series.time
+        values[:length, :, number] = np.where(finite, series.values, 0.0)
+        weight[:length, :, number] = scale[:, first:]
+    return Measured(time, values, weight)
 
 
-def _inside(flight: Flight, time: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return np.asarray((time >= 0.0) & (time <= flight.time[-1]))
+def _during(flight: Flight, series: Series | None, width: int) -> Series:
+    """Return what was recorded during the mission; no rows where nothing was."""
+    if series is None:
+        return Series(np.zeros(0), np.zeros((0, width)))
+    inside = (series.time >= 0.0) & (series.time <= flight.time[-1])
+    return Series(series.time[inside], series.values[inside])

@@ -30,7 +30,7 @@ from sim_jax.rotation import Quaternion
 from sim_jax.vector import Vec3
 from tuner.findings.findings import Code, Finding
 from tuner.objective.flown import CODE
-from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
+from tuner.objective.inlets import linear_interpolation, zero_order_hold
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.model import controller_of

@@ -17,10 +17,14 @@ from tuner.core.disk import exists
 from tuner.core.errors import InputError, RecordingError, did_you_mean
 from tuner.core.yaml_section import build
 from tuner.findings.findings import Code, Finding
-from tuner.objective.allocation import with_commands
 from tuner.objective.inlets import INLETS, window_seconds
-from tuner.objective.motor_order import columns_of_rotors, flight_in_rotor_order, in_rotor_order
-from tuner.objective.speed_unit import with_speeds_in_si
+from tuner.objective.rotor_signals import (
+    columns_of_rotors,
+    flight_in_rotor_order,
+    in_rotor_order,
+    with_commands,
+    with_speeds_in_si,
+)
 from tuner.objective.trajectory import with_named_reference
 from tuner.objective.windows import require_windows
 from tuner.recordings.defects import is_stale

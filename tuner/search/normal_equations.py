@@ -1,7 +1,7 @@
 """The normal equations of a whole fit: its loss as a quadratic about a point.
 
 Each of F segments contributes a loss, a gradient and a Gauss-Newton Hessian from which its own
-start has been eliminated (`tuner.objective.simulator`); they are summed over the segments and the
+start has been eliminated (`tuner.objective.normal`); they are summed over the segments and the
 priors added. The residuals themselves, some hundred thousand, are never laid in one array.
 """
 

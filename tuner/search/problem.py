@@ -13,12 +13,12 @@ from tuner.config.job import ErrorOf, InletName
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.equation_error.estimate import Estimate
 from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
+from tuner.objective.initial_conditions import begins_gently
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Segments, on_time, segments_of, window_segments
 from tuner.objective.space import Space, space_of
-from tuner.objective.start import begins_gently
 from tuner.recordings.flight import Flight
 from tuner.search.job_flights import Recording
 from tuner.vehicle import conditions

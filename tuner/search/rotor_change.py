@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tuner.findings.findings import Code, Finding
-from tuner.objective.explained import Source, squared_speed
+from tuner.objective.rotor_signals import Source, squared_speed
 from tuner.recordings.flight import Array, Flight
 from tuner.recordings.states import filtered, states_at
 from tuner.search.job_flights import Recording

@@ -27,7 +27,7 @@ from tuner.objective.balance import Balance, balance_of
 from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Point, SegmentSums
 from tuner.objective.normal import some_segments
-from tuner.objective.tunable import Tunable
+from tuner.objective.space import Tunable
 from tuner.search.fitted import Fitted
 from tuner.search.least_squares import LeastSquares
 from tuner.search.normal_equations import normal_equations

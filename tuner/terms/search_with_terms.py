@@ -13,9 +13,9 @@ from tuner.core.spans import span
 from tuner.evaluate.held_out import point_estimates
 from tuner.findings.findings import Finding
 from tuner.objective.battery import require_voltage
+from tuner.objective.initial_conditions import rests
 from tuner.objective.inlets import INLETS
 from tuner.objective.space import extended
-from tuner.objective.start import rests
 from tuner.recordings.flight import Flight
 from tuner.search.estimation import OnProgress, search
 from tuner.search.fitted import Fitted

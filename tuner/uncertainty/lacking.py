@@ -35,8 +35,8 @@ from tuner.equation_error.unexplained import Law, Pair, unexplained
 from tuner.findings.findings import Code, Finding
 from tuner.objective.flight import MOTION, SETPOINTS, SPEEDS, TURNED, environment_of
 from tuner.objective.flown import Flown, fly
+from tuner.objective.inlets import zero_order_hold
 from tuner.objective.normal import Objective
-from tuner.objective.recorded_inputs import zero_order_hold
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty

@@ -24,8 +24,7 @@ from tuner.disturbances.disturbances import COUNT, USUAL
 from tuner.disturbances.observer import Expected, Feed, first_errors
 from tuner.disturbances.recorded import Sampled
 from tuner.objective.segments import Segments
-from tuner.objective.space import space_of
-from tuner.objective.tunable import Tunable
+from tuner.objective.space import Tunable, space_of
 from tuner.vehicle.model import model_of, schedule_of
 
 TICKS = 6

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tuner.evaluate.predict import input_lag, with_inputs_on_time
 from tuner.findings.findings import Code
-from tuner.objective.motor_order import order_findings
+from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
 from tuner.search.job_flights import Recording

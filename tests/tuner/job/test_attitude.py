@@ -10,7 +10,7 @@ from tuner.config import JobFile, Options, settle
 from tuner.config.job import FlightSettings, Search
 from tuner.findings.findings import Code, one_line
 from tuner.objective.inlets import TURNING
-from tuner.objective.motor_order import MotorOrder
+from tuner.objective.rotor_signals import MotorOrder
 from tuner.recordings.flight import Series
 from tuner.search import job_flights as recordings
 from tuner.search.estimation import search

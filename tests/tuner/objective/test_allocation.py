@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.core.shipped import configs_folder
-from tuner.objective.allocation import commands_of, with_commands
-from tuner.objective.explained import levers, squared_speed
+from tuner.objective.rotor_signals import commands_of, levers, squared_speed, with_commands
 from tuner.recordings.flight import Series
 from tuner.recordings.notes import NoteCode
 from tuner.vehicle import read_vehicle

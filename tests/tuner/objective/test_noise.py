@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sim_jax.schedule import Schedule
 from tuner.objective.noise import repeats, white_noise
 from tuner.objective.segments import segments_of
 from tuner.recordings.flight import Series
@@ -50,7 +51,7 @@ def test_a_steady_command_that_was_rounded_says_what_one_reading_says(flight):
         at_rest = replace(
             flight, series={**flight.series, "command": replace(series, values=values)}
         )
-        segments = segments_of([at_rest], noise={"command": 1e-3})
+        segments = segments_of([at_rest], noise={"command": 1e-3}, schedule=Schedule())
         weights.append(np.asarray(segments.measured["command"].weight)[..., 0])
     told = [(weight**2).sum(axis=0) * 1e-6 for weight in weights]
     assert told[0] == pytest.approx(np.ones(4))

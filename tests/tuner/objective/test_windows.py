@@ -9,8 +9,7 @@ from sim_jax.inlet import ActuatorInlet
 from sim_jax.schedule import Schedule
 from tuner.core.errors import RecordingError
 from tuner.objective.initial_conditions import ROWS
-from tuner.objective.inlets import INLETS
-from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
+from tuner.objective.inlets import INLETS, linear_interpolation, zero_order_hold
 from tuner.objective.segments import window_segments
 from tuner.objective.windows import windows_of
 from tuner.recordings.flight import Series

@@ -16,8 +16,7 @@ from tests.tuner.recordings import ways
 from tuner.config import Options, settle
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.findings.findings import one_line
-from tuner.objective.explained import levers
-from tuner.objective.motor_order import order_findings
+from tuner.objective.rotor_signals import levers, order_findings
 from tuner.recordings import Flight, load_flight
 from tuner.recordings.flight import Series
 from tuner.recordings.inspector import suggested_map

@@ -11,8 +11,7 @@ from tuner.config import JobFile
 from tuner.config.job import CoefficientSettings
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import find_config
-from tuner.objective.space import space_of
-from tuner.objective.tunable import Tunable
+from tuner.objective.space import Tunable, space_of
 from tuner.vehicle import (
     COEFFICIENTS,
     REGISTRY,
