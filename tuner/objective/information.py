@@ -314,7 +314,7 @@ def information_from_jacobian(
             for name, change in changes.items()
         },
         ground=None
-        if space.joint_rows is None
+        if space.joint_prior is None
         else float(criterion.prior) ** 2 * space.joint_rows.T @ space.joint_rows,
         pull=_pull(space, point, criterion),
         nuisance_pull=pull,
@@ -362,8 +362,7 @@ def _pull(space: Space, point: Point, criterion: Criterion) -> Array:
     """Return the slope (K,) of the loss of the priors and of ground measurements."""
     scaled = np.asarray(space.scaled(point.coefficients))
     slope = (scaled - space.prior_mean) / space.prior_sd**2
-    if space.joint_rows is not None and space.joint_offset is not None:
-        slope = slope + space.joint_rows.T @ (space.joint_rows @ scaled + space.joint_offset)
+    slope = slope + space.joint_rows.T @ (space.joint_rows @ scaled + space.joint_offset)
     return np.asarray(float(criterion.prior) ** 2 * slope)
 
 

@@ -47,8 +47,7 @@ class Space:
         self.prior_mean = np.array([p.prior_mean for p in self.parameters])
         self.prior_sd = np.array([p.prior_sd for p in self.parameters])
         self.joint_prior = joint_prior
-        self.joint_rows: NDArray[np.float64] | None = None
-        self.joint_offset: NDArray[np.float64] | None = None
+        self.joint_rows, self.joint_offset = np.zeros((0, len(self))), np.zeros(0)
         if joint_prior is not None:
             self.joint_rows, self.joint_offset = joint_prior.rows(self.parameters, self.fixed)
 
@@ -67,7 +66,10 @@ class Space:
 
     def vector_of(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the search vector (K,) of coefficient values, clipped just inside the bounds."""
-        scaled = np.array([p.scaled(values[p.name]) for p in self.parameters])
+        return self.vector_at(np.array([p.scaled(values[p.name]) for p in self.parameters]))
+
+    def vector_at(self, scaled: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the search vector (*S, K) at scaled coordinates, just inside the bounds."""
         return self.at_share((scaled - self.lower) / self.width)
 
     def scaled(self, vector: ArrayLike) -> NDArray[np.float64]:
@@ -109,7 +111,7 @@ class Space:
         return np.asarray(expit(np.asarray(vector) / self.stretch))
 
     def at_share(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the search vector (K,) that lies so far between the bounds, just inside them."""
+        """Return the search vector (*S, K) so far between the bounds, just inside them."""
         inside = np.clip(share, 1e-6, 1 - 1e-6)
         return np.asarray(np.log(inside / (1 - inside)) * self.stretch)
 

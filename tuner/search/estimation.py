@@ -346,7 +346,7 @@ def starting_vectors(job: Job) -> NDArray[np.float64]:
     reach = np.array([_reach(p, settings.spread) for p in space.parameters]) / width
     drawn = generator.uniform(-1.0, 1.0, (settings.starts - 1, len(space)))
     shares = np.clip(centre + drawn * reach, INSIDE, 1.0 - INSIDE)
-    return np.stack([first, *(space.at_share(share) for share in shares)])
+    return np.vstack([first, space.at_share(shares)])
 
 
 def _reach(parameter: Parameter, spread: float) -> float:

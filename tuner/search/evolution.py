@@ -83,7 +83,7 @@ class CmaEs(Optimiser):
             drawn = state.strategy.ask()
             shares = np.repeat(space.share(centre)[None], len(drawn), axis=0)
             shares[:, _moves(problem)] = drawn
-            vectors = np.stack([space.at_share(share) for share in shares])
+            vectors = space.at_share(shares)
             losses, position_rmse = state.loss(vectors)
             state.strategy.tell(drawn, list(losses))
         best = int(np.argmin(losses))
@@ -125,12 +125,11 @@ def _loss(
 
     def loss(vectors: Array) -> tuple[Array, Array]:
         batch = evaluate(objective, vectors, point, criterion)
-        scaled = np.stack([space.scaled(vector) for vector in vectors])
+        scaled = space.scaled(vectors)
         pull = (scaled - space.prior_mean) / space.prior_sd * float(criterion.prior)
         total = np.asarray(batch.loss).sum(axis=-1) + 0.5 * (pull**2).sum(axis=-1)
-        if space.joint_rows is not None and space.joint_offset is not None:
-            joint_pull = (scaled @ space.joint_rows.T + space.joint_offset) * float(criterion.prior)
-            total = total + 0.5 * (joint_pull**2).sum(axis=-1)
+        joint_pull = (scaled @ space.joint_rows.T + space.joint_offset) * float(criterion.prior)
+        total = total + 0.5 * (joint_pull**2).sum(axis=-1)
         squares = np.asarray(batch.squares.get("position", np.full((len(vectors), 1, 1), np.nan)))
         placed = float(np.sum(counts.get("position", np.nan))) or np.nan
         rmse = sigma * np.sqrt(3.0 * squares.sum(axis=(1, 2)) / placed)

@@ -69,12 +69,11 @@ def normal_equations(
     hessian = np.zeros((count + kinds * flights,) * 2)
     curved = np.asarray(sums.hessian)
     hessian[:count, :count] = curved[:count, :count].sum(axis=-1) + np.diag(pulled**2)
-    if space.joint_rows is not None and space.joint_offset is not None:
-        joint_pull = (space.joint_rows @ space.scaled(vector) + space.joint_offset) * prior
-        joint_slope = space.joint_rows * slope * prior
-        loss += 0.5 * float(np.sum(joint_pull**2))
-        gradient[:count] += joint_slope.T @ joint_pull
-        hessian[:count, :count] += joint_slope.T @ joint_slope
+    joint_pull = (space.joint_rows @ space.scaled(vector) + space.joint_offset) * prior
+    joint_slope = space.joint_rows * slope * prior
+    loss += 0.5 * float(np.sum(joint_pull**2))
+    gradient[:count] += joint_slope.T @ joint_pull
+    hessian[:count, :count] += joint_slope.T @ joint_slope
     across = (curved[:count, count:] @ owner).reshape(count, -1)
     hessian[:count, count:], hessian[count:, :count] = across, across.T
     # a flight's offsets meet only each other

@@ -194,7 +194,8 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
         The fitted coefficients and where the fit ended.
     """
     uncertainty = examination.uncertainty
-    units = _units(space, point)
+    # the change of each parameter, in its unit, for one of its scaled coordinate
+    units = np.where(space.is_log, space.at(point.coefficients), 1.0)
     count = len(uncertainty.names)
     information = examination.information.data[:count, :count]
     return Knowledge(
@@ -209,17 +210,6 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
         correlation=uncertainty.covariance.correlation.tolist(),
         covariance=(uncertainty.covariance.matrix * np.outer(units, units)).tolist(),
         information=(information / np.outer(units, units)).tolist(),
-    )
-
-
-def _units(space: Space, point: Point) -> Array:
-    """Return (K,) the change of each parameter, in its unit, for one of its scaled coordinate."""
-    scaled = space.scaled(point.coefficients)
-    return np.array(
-        [
-            space.from_scaled(i, x) if parameter.scale == "log" else 1.0
-            for i, (parameter, x) in enumerate(zip(space.parameters, scaled, strict=True))
-        ]
     )
 
 

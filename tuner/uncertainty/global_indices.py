@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.objective.space import Space
 from tuner.uncertainty.records import (
     GlobalSensitivity,
     Method,
@@ -71,8 +70,7 @@ def global_sensitivity(
     }
     count = samples or SAMPLES[method]
     points = _samples(problem, method, count, seed)
-    vectors = np.stack([_vector(space, row) for row in points])
-    batch = evaluate(objective, vectors, point, criterion)
+    batch = evaluate(objective, space.vector_at(points), point, criterion)
     crashed = np.isfinite(np.asarray(batch.crash_time))
     outputs, values = _outputs(objective, batch.squares, crashed, flights)
     indices = []
@@ -97,14 +95,6 @@ def _samples(problem: dict[str, Any], method: Method, count: int, seed: int) -> 
 
     power = 2 ** int(np.ceil(np.log2(max(count, 2))))
     return np.asarray(sobol.sample(problem, power, calc_second_order=False, seed=seed))
-
-
-def _vector(space: Space, scaled: Array) -> Array:
-    values = {
-        name: space.from_scaled(index, float(x))
-        for index, (name, x) in enumerate(zip(space.names, scaled, strict=True))
-    }
-    return space.vector_of(values)
 
 
 def _outputs(

@@ -36,7 +36,7 @@ def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[s
     """
     space = fitted.objective.space
     prior, rows, offset = space.joint_prior, space.joint_rows, space.joint_offset
-    if prior is None or rows is None or offset is None:
+    if prior is None:
         return {}
     end = space.scaled(fitted.point.coefficients)
     flights_only = total - rows.T @ rows

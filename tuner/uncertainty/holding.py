@@ -85,7 +85,7 @@ def with_undetermined_held(
             "others are fitted again."
         )
         rest = hold(job, fitted, stand_ins, on_progress, stages=LAST if predicts else LAST_TWO)
-        if _rises(fitted, rest) > NOTHING if predicts else _misses(fitted, rest):
+        if not _rise(fitted, rest) < (1.0 + NOTHING if predicts else MUCH):
             on_message(
                 f"With {listed(names)} at the initial value the flights are met worse: all keep "
                 "their values."
@@ -126,22 +126,13 @@ def _idle_terms(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> tuple[str
     )
 
 
-def _rises(fitted: Fitted, other: Fitted) -> float:
-    """Return the share by which a fit's loss is higher where another one has led."""
+def _rise(fitted: Fitted, other: Fitted) -> float:
+    """Return how many times as large a fit's loss, by its own noise, is where another has led."""
     before, after = (
         float(np.sum(fitted.objective.sums(f.point, fitted.criterion, derivatives=False).loss))
         for f in (fitted, other)
     )
-    return after / before - 1.0
-
-
-def _misses(fitted: Fitted, other: Fitted) -> bool:
-    """Return whether another fit meets the flights much worse, each by the noise of this one."""
-    here, there = (
-        float(np.sum(fitted.objective.sums(p, fitted.criterion, derivatives=False).loss))
-        for p in (fitted.point, other.point)
-    )
-    return not there < MUCH * here
+    return after / before
 
 
 def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:

@@ -140,32 +140,19 @@ def local_sensitivity(
     )
 
 
-def _steps(
-    objective: Objective, vector: Array, reference: Array
-) -> tuple[tuple[Array, Array], Array]:
+def _steps(objective: Objective, vector: Array, reference: Array) -> tuple[list[Array], Array]:
     """Return the vectors (K, K) for +10 % and −10 %, and the size (K,) of one hundred percent."""
     space = objective.space
-    scaled = space.scaled(vector)
-    centre = [space.from_scaled(i, x) for i, x in enumerate(scaled)]
-    full = np.array(
-        [
-            abs(value) if parameter.scale == "log" else size
-            for value, parameter, size in zip(centre, space.parameters, reference, strict=True)
-        ]
-    )
+    centre = space.at(vector)
+    full = np.where(space.is_log, np.abs(centre), reference)
     vectors = []
     for sign in (1.0, -1.0):
-        rows = []
-        for index, parameter in enumerate(space.parameters):
-            value = np.clip(
-                centre[index] + sign * LARGE_STEP * full[index], parameter.lower, parameter.upper
-            )
-            row = vector.copy()
-            values = dict(zip(space.names, centre, strict=True)) | {parameter.name: float(value)}
-            row[index] = space.vector_of(values)[index]
-            rows.append(row)
-        vectors.append(np.stack(rows))
-    return (vectors[0], vectors[1]), full
+        values = {
+            p.name: float(np.clip(value, p.lower, p.upper))
+            for p, value in zip(space.parameters, centre + sign * LARGE_STEP * full, strict=True)
+        }
+        vectors.append(np.where(np.eye(len(space), dtype=bool), space.vector_of(values), vector))
+    return vectors, full
 
 
 class _Outputs:

@@ -65,7 +65,10 @@ def profile_likelihood(
     along = (
         uncertainty.covariance.data_only[:, index] / uncertainty.covariance.data_only[index, index]
     )
-    starts = np.stack([_start(objective, centre, along, index, x) for x in grid])
+    # the others follow as the quadratic approximation says
+    scaled = centre + np.outer(grid - centre[index], along)
+    scaled[:, index] = grid
+    starts = space.vector_at(scaled)
     chi = _refitted(objective, full_problem.point, criterion, starts, index)
     values = [space.from_scaled(index, float(x)) for x in grid]
     # as the standard errors do, the likelihood allows for residuals that are not white noise
@@ -79,17 +82,6 @@ def profile_likelihood(
         quadratic=quadratic.tolist(),
         interval=_crossings(np.array(values), rise),
     )
-
-
-def _start(objective: Objective, centre: Array, along: Array, index: int, value: float) -> Array:
-    """Return the search vector (K,) where the others follow as the quadratic approximation says."""
-    space = objective.space
-    scaled = centre + along * (value - centre[index])
-    scaled[index] = value
-    limits = [(p.scaled(p.lower), p.scaled(p.upper)) for p in space.parameters]
-    inside = [float(np.clip(x, *limit)) for x, limit in zip(scaled, limits, strict=True)]
-    pairs = enumerate(zip(space.names, inside, strict=True))
-    return space.vector_of({name: space.from_scaled(i, x) for i, (name, x) in pairs})
 
 
 def _refitted(

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tuner.core.disk import write_text
 from tuner.core.errors import ConfigError, RecordingError
@@ -26,88 +26,50 @@ from tuner.search.polish import polished
 from tuner.search.problem import Job
 from tuner.vehicle import with_values
 
-T = TypeVar("T")
-R = TypeVar("R")
 
+class Draw(NamedTuple):
+    """The flights that a fit is made to again.
 
-@dataclass(frozen=True)
-class Whole:
-    """What all refits start from: the job, and the fit to all of its flights."""
-
-    job: Job
-    fitted: Fitted
-
-
-def check_flights(job: Job, option: str, what: str) -> None:
-    """Refuse a job that has a single flight.
-
-    Raises
-    ------
-    RecordingError
-        There are fewer than two flights to fit.
-    """
-    if len(job.fitted) < 2:
-        raise RecordingError(option, what, "give two or more")
-
-
-def refitted(whole: Whole, counts: ArrayLike, title: str, report: Report) -> Fitted:
-    """Return the fit polished again, each flight counted so many times.
-
-    A flight that counts for nothing keeps its place with weights of zero, so that nothing compiles
-    again.
-
-    Parameters
+    Attributes
     ----------
-    whole
-        The fit to begin at.
-    counts
-        (F,) how often each fitted flight counts.
     title
         What stands before the stages' names in messages.
-    report
-        Gets every iteration.
+    counts
+        (F,) how often each fitted flight counts. One that counts for nothing keeps its place, with
+        weights of zero.
+    left_out
+        The flight that the fit is then to predict.
     """
-    job, fitted = whole.job, whole.fitted
-    held = set(fitted.held.values())
-    return polished(
-        job,
-        replace(fitted, objective=_counted(fitted.objective, np.asarray(counts, float))),
-        free=Free(np.array([name not in held for name in job.space.names]), free_offsets(job)),
-        title=title,
-        on_progress=lambda progress: report(progress.iterations[-1].model_dump()),
-    )
+
+    title: str
+    counts: NDArray[np.float64]
+    left_out: str | None = None
 
 
-def _counted(objective: Objective, counts: NDArray[np.float64]) -> Objective:
-    """Return an objective to which each flight contributes so many times."""
-    others = np.asarray(counts > 0.0)[np.asarray(objective.segments.flight)]
-    changed: Objective = eqx.tree_at(
-        lambda o: [measured.weight for measured in o.segments.measured.values()],
-        objective,
-        [measured.weight * others for measured in objective.segments.measured.values()],
-    )
-    if counts.max() <= 1.0:
-        return changed
-    return replace(changed, multiplicity=np.asarray(counts))
+class Refit(NamedTuple):
+    """Coefficient -> value, and the RMSE of the flight that was left out.
+
+    That is None where none is to be predicted, or the inertia is no rigid body's.
+    """
+
+    coefficients: dict[str, float]
+    rmse: AxesRmse | None
 
 
-def in_engine(
-    function: Callable[[tuple[Callable[[], Whole], T], Report], R],
+def refits(
     job: Job,
     fitted: Fitted,
-    tasks: Sequence[T],
+    draws: Sequence[Draw],
     on_iteration: Callable[[Iteration], None],
-) -> list[R]:
-    """Have the engine in force compute refits.
+) -> list[Refit]:
+    """Have the engine in force polish a fit again, for each draw of its flights.
 
     Parameters
     ----------
-    function
-        Of a module; takes what gives the `Whole`, and a task. Reports iterations.
     job, fitted
         What all refits start from.
-    tasks
-        What each refit is.
+    draws
+        What each is to.
     on_iteration
         Gets the iterations; of refits side by side, the last of each stage.
     """
@@ -120,12 +82,45 @@ def in_engine(
         elif before is not None and before.stage != last[number].stage:
             on_iteration(before)
 
-    whole = engine.share(Whole(job, fitted))
-    found = engine.map(function, [(whole, task) for task in tasks], heard)
+    whole = engine.share((job, fitted))
+    found = engine.map(_refit, [(whole, draw) for draw in draws], heard)
     if engine.at_once > 1:
         for iteration in last.values():
             on_iteration(iteration)
     return found
+
+
+def _refit(task: tuple[Callable[[], tuple[Job, Fitted]], Draw], report: Report) -> Refit:
+    """Return one refit."""
+    (job, fitted), draw = task[0](), task[1]
+    held = set(fitted.held.values())
+    end = polished(
+        job,
+        replace(fitted, objective=_counted(fitted.objective, draw.counts)),
+        free=Free(np.array([name not in held for name in job.space.names]), free_offsets(job)),
+        title=draw.title,
+        on_progress=lambda progress: report(progress.iterations[-1].model_dump()),
+    )
+    values = best_values(job, end)
+    if draw.left_out is None:
+        return Refit(values, None)
+    comparison = comparison_of(job, fitted)
+    try:
+        flown = comparison.fly(with_values(job.settings.vehicle, values))
+    except ConfigError:
+        return Refit(values, None)
+    return Refit(values, flown[draw.left_out].rmse)
+
+
+def _counted(objective: Objective, counts: NDArray[np.float64]) -> Objective:
+    """Return an objective to which each flight contributes so many times."""
+    some = (counts > 0.0)[objective.flight]
+    changed: Objective = eqx.tree_at(
+        lambda o: [measured.weight for measured in o.segments.measured.values()],
+        objective,
+        [measured.weight * some for measured in objective.segments.measured.values()],
+    )
+    return changed if counts.max() <= 1.0 else replace(changed, multiplicity=counts)
 
 
 def coefficients_of(refits: Sequence[Mapping[str, float]]) -> dict[str, NDArray[np.float64]]:
@@ -136,16 +131,8 @@ def coefficients_of(refits: Sequence[Mapping[str, float]]) -> dict[str, NDArray[
 BOOTSTRAP_FILE = "bootstrap.csv"
 
 
-@dataclass(frozen=True)
-class _Draw:
-    """How often each fitted flight was drawn, and the number of the draw."""
-
-    number: int
-    counts: tuple[int, ...]
-
-
 def bootstrap(
-    job: Job, fitted: Fitted, refits: int, folder: Path, on_iteration: Callable[[Iteration], None]
+    job: Job, fitted: Fitted, count: int, folder: Path, on_iteration: Callable[[Iteration], None]
 ) -> dict[str, float]:
     """Refit to flights drawn with replacement, write the table, and return the standard errors.
 
@@ -155,8 +142,8 @@ def bootstrap(
     ----------
     job, fitted
         The fit to all flights.
-    refits
-        How many.
+    count
+        How many refits.
     folder
         Gets ``bootstrap.csv``: a row a refit, how often each flight was drawn and what came out.
     on_iteration
@@ -172,34 +159,22 @@ def bootstrap(
     RecordingError
         There are fewer than two flights to fit.
     """
-    check_flights(job, "--bootstrap", "draws from a single flight")
-    flights = [flight.name for flight in job.fitted]
-    draws = _draws(len(flights), refits, job.settings.job.search.seed)
-    values = in_engine(_refit, job, fitted, draws, on_iteration)
-    by_name = coefficients_of(values)
+    names = [flight.name for flight in job.fitted]
+    if len(names) < 2:
+        raise RecordingError("--bootstrap", "draws from a single flight", "give two or more")
+    random = np.random.default_rng(job.settings.job.search.seed)
+    drawn = random.integers(len(names), size=(count, len(names)))
+    counts = [np.bincount(row, minlength=len(names)) for row in drawn]
+    draws = [Draw(f"draw {n}", row.astype(float)) for n, row in enumerate(counts, 1)]
+    found = [refit.coefficients for refit in refits(job, fitted, draws, on_iteration)]
+    by_name = coefficients_of(found)
     rows = (
-        [draw.number, *draw.counts, *found.values()]
-        for draw, found in zip(draws, values, strict=True)
+        [number, *row.tolist(), *values.values()]
+        for number, (row, values) in enumerate(zip(counts, found, strict=True), 1)
     )
-    header = ("refit", *(f"drawn_{name}" for name in flights), *by_name)
+    header = ("refit", *(f"drawn_{name}" for name in names), *by_name)
     write_text(folder / BOOTSTRAP_FILE, csv_text(header, rows))
     return {name: float(np.std(column, ddof=1)) for name, column in by_name.items()}
-
-
-def _draws(flights: int, refits: int, seed: int) -> list[_Draw]:
-    """Return refits, each of as many flights drawn with replacement."""
-    random = np.random.default_rng(seed)
-    drawn = random.integers(flights, size=(refits, flights))
-    return [
-        _Draw(number + 1, tuple(np.bincount(row, minlength=flights).tolist()))
-        for number, row in enumerate(drawn)
-    ]
-
-
-def _refit(task: tuple[Callable[[], Whole], _Draw], report: Report) -> dict[str, float]:
-    """Return the coefficients of one refit."""
-    whole, draw = task[0](), task[1]
-    return best_values(whole.job, refitted(whole, draw.counts, f"draw {draw.number}", report))
 
 
 CROSS_VALIDATION_FILE = "cross_validation.csv"
@@ -236,26 +211,15 @@ def cross_validate(
     RecordingError
         There are fewer than two flights to fit.
     """
-    check_flights(job, "--cross-validate", "leaves no flight to fit")
-    folds = in_engine(_fold, job, fitted, range(len(job.fitted)), on_iteration)
+    names = [flight.name for flight in job.fitted]
+    if len(names) < 2:
+        raise RecordingError("--cross-validate", "leaves no flight to fit", "give two or more")
+    others = 1.0 - np.eye(len(names))
+    draws = [Draw(f"without {n}", row, n) for n, row in zip(names, others, strict=True)]
+    found = zip(names, refits(job, fitted, draws, on_iteration), strict=True)
+    folds = tuple(Fold(name, *refit) for name, refit in found)
     write_cross_validation(folds, folder)
-    return tuple(folds)
-
-
-def _fold(task: tuple[Callable[[], Whole], int], report: Report) -> Fold:
-    """Return the fold without one flight."""
-    whole, number = task[0](), task[1]
-    job, fitted = whole.job, whole.fitted
-    flight = job.fitted[number]
-    counts = np.ones(len(job.fitted))
-    counts[number] = 0.0
-    values = best_values(job, refitted(whole, counts, f"without {flight.name}", report))
-    comparison = comparison_of(job, fitted)
-    try:
-        rmse = comparison.fly(with_values(job.settings.vehicle, values))[flight.name].rmse
-    except ConfigError:
-        rmse = None
-    return Fold(flight.name, values, rmse)
+    return folds
 
 
 def jackknife_errors(folds: Sequence[Fold]) -> dict[str, float]:
