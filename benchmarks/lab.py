@@ -41,8 +41,7 @@ from tuner.search.problem import Job
 from tuner.terms.refit_with_disturbances import examined
 from tuner.terms.search_with_terms import search_with_terms
 from tuner.terms.selection_state import Selected
-from tuner.terms.shown import terms_shown
-from tuner.uncertainty.estimates import Estimate, Uncertainty
+from tuner.uncertainty.estimates import Estimate, Uncertainty, terms_shown
 from tuner.uncertainty.lacking import lack_found
 from tuner.vehicle import COEFFICIENTS, values_of
 

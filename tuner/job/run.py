@@ -59,8 +59,7 @@ from tuner.terms.balanced_inertia import with_inputs_balanced
 from tuner.terms.refit_with_disturbances import Examined, examined
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.terms.selection_state import Selected
-from tuner.terms.shown import terms_shown
-from tuner.uncertainty.estimates import finer_than_steps
+from tuner.uncertainty.estimates import finer_than_steps, terms_shown
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import ground_conflicts, sources_of
 from tuner.uncertainty.lacking import lack_found

@@ -18,7 +18,6 @@ from tuner.design.ranking import Arena
 from tuner.evaluate.held_out import comparison_of
 from tuner.findings.findings import Code, Finding
 from tuner.job.results import write_knowledge, write_next_flight
-from tuner.objective.alternatives import alternatives_of
 from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
@@ -35,6 +34,7 @@ from tuner.search.weights import misfit, root_mean_squares
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.global_indices import global_sensitivity
+from tuner.uncertainty.lacking import alternatives_of
 from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.records import Knowledge, Profiles
 from tuner.vehicle import check_names, initial_values

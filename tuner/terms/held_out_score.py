@@ -73,7 +73,7 @@ def vector_after(space: Space, vector: Array, change: NDArray[np.float64]) -> ND
     """Return the search vector (K,) after a change of the scaled coordinates, inside the bounds."""
     far = LONGEST_STEP * space.prior_sd
     scaled = space.scaled(vector) + np.clip(change, -far, far)
-    return np.asarray(space.at_share((scaled - space.lower) / space.width))
+    return space.vector_at(scaled)
 
 
 def offsets_fitted(fitted: Fitted) -> NDArray[np.bool_]:

@@ -25,6 +25,7 @@ from tuner.objective.information import (
     with_secants,
 )
 from tuner.objective.normal import Objective, portions
+from tuner.objective.residuals import robust
 from tuner.objective.space import Space
 from tuner.uncertainty.overdispersion import Stretches
 from tuner.vehicle import REGISTRY
@@ -35,8 +36,6 @@ Columns = NDArray[np.intp]
 
 SECTIONS = 3
 """Into how many sections in time flights are cut, where sections are left out."""
-COLUMNS = 16
-"""Parameters to differentiate by at a time, whatever the number in the model: one program."""
 RIDGE = 1e-12
 """Added to a Hessian of unit diagonal: what it lets move is what nothing determines."""
 
@@ -351,10 +350,8 @@ def _stretches(
 
 def _loss_of(objective: Objective, criterion: Criterion, jacobian: Jacobian) -> float:
     """Return half the robust sum of squares, as the search counts it."""
-    flight, limit, total = np.asarray(objective.segments.flight), float(criterion.huber), 0.0
-    for channel, residuals in jacobian.residuals.items():
-        size = np.abs(np.asarray(residuals) / np.asarray(criterion.scale[channel])[flight])
-        with np.errstate(invalid="ignore"):
-            squares = np.where(size > limit, 2.0 * limit * size - limit**2, size**2)
-        total += 0.5 * float(squares.sum())
-    return total
+    limit = float(criterion.huber)
+    return sum(
+        0.5 * float(robust(of / np.asarray(criterion.scale[name])[objective.flight], limit).sum())
+        for name, of in jacobian.residuals.items()
+    )

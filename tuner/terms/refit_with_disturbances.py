@@ -15,7 +15,6 @@ from tuner.disturbances.predictor import Predictor
 from tuner.disturbances.recorded import FLIGHT_CONTROLLER
 from tuner.disturbances.refit import STEPS, with_least_innovations
 from tuner.findings.findings import Code, Finding
-from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Point
 from tuner.search.estimation import free_offsets
 from tuner.search.explanation import Explanation
@@ -31,7 +30,7 @@ from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine, full_problem_of
 from tuner.uncertainty.holding import with_undetermined_held
-from tuner.uncertainty.lacking import lack_of
+from tuner.uncertainty.lacking import alternatives_of, lack_of
 
 CONTRADICTS = 4.0
 """Standard errors by which no coefficient may move. Those of least squares are known from some ten

@@ -106,8 +106,7 @@ def search_with_terms(
 
     Where most flights are far off, terms are tried before the base model is polished, and before
     CMA-ES looks for another beginning. Arguments and errors are those of `search`; between the two,
-    ``on_estimates`` gets where it ended, unless it has stopped because the model is far off, and
-    ``before_selection`` is called.
+    ``on_estimates`` gets where it ended, unless it has stopped because the model is far off.
     """
 
     def searched(*, resume: bool, provisional: bool) -> Selected:

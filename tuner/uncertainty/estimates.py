@@ -12,7 +12,6 @@ from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to 
 
 from tuner.core.numerics import Z95, Inverse, scaled_inverse, symmetric_eigen
 from tuner.findings.findings import Code, Finding
-from tuner.objective.alternatives import DRAWS, LACK, READINGS, STEP
 from tuner.objective.criterion import Point
 from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.space import Space
@@ -21,11 +20,19 @@ from tuner.uncertainty.covariance import Covariance, covariance_of
 from tuner.uncertainty.overdispersion import IndependentErrors, flights_apart
 from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict, judge
-from tuner.vehicle import COEFFICIENTS, scale_group
+from tuner.vehicle import COEFFICIENTS, scale_group, term_groups
 from tuner.vehicle.coefficient import Parameter
 
 Array = NDArray[np.float64]
 
+STEP = "step"
+"""Simulated otherwise: half the physics step, controllers and log at their own rates."""
+READINGS = "readings"
+"""The battery's voltmeter read again, `DRAWS` times."""
+LACK = "lack"
+"""With what pushes the flights along and is none of the model."""
+DRAWS = 6
+"""How many times: an error that is told by so many is told to a third."""
 AT_BOUND = 2e-3
 """Distance from a bound, as a share of the range, within which a fit has ended at it."""
 DELAYS = ("actuator_latency",)
@@ -315,6 +322,39 @@ def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
         return ()
     numbers = {"seconds": STEPS_MATTER}
     return (Finding(Code.FINER_THAN_STEPS, "warning", ", ".join(names), numbers),)
+
+
+TERMS_SHOWN = (
+    "thrust_exponent",
+    "motor_lag",
+    "rate_gain",
+    "autopilot_tilt",
+    "gyro_scale",
+    "tachometer_lag",
+)
+"""Groups of terms of which is said what they mean."""
+
+
+def terms_shown(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ...]:
+    """Return what terms that were found say that a lab can act on."""
+    findings = []
+    for group in TERMS_SHOWN:
+        known = {
+            name: estimate
+            for name in term_groups()[group]
+            if (estimate := uncertainty.estimates.get(name)) and name not in fitted.held
+        }
+        if any(_differs(name, *estimate.ci95) for name, estimate in known.items()):
+            numbers = {name: estimate.value for name, estimate in known.items()}
+            numbers |= {f"{name}_error": estimate.std_error for name, estimate in known.items()}
+            findings.append(Finding(Code.TERM_SHOWS, "warning", group, numbers, tuple(known)))
+    return tuple(findings)
+
+
+def _differs(name: str, low: float, high: float) -> bool:
+    """Return whether an interval of a term's coefficient does not hold its neutral value."""
+    neutral = COEFFICIENTS[name].neutral
+    return neutral is not None and not low <= neutral <= high
 
 
 SIMULATORS_STEP = 1.0 / 4000.0

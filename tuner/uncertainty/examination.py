@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from tuner.core.numerics import Z95, scaled_solve
 from tuner.disturbances.information import with_hidden, with_strengths
 from tuner.disturbances.predictor import Predictor
-from tuner.objective.alternatives import LACK
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_from_jacobian
 from tuner.objective.normal import Objective, portion, portions
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
-from tuner.uncertainty.estimates import Uncertainty, at_rest, references, uncertainty_at
+from tuner.uncertainty.estimates import LACK, Uncertainty, at_rest, references, uncertainty_at
 from tuner.uncertainty.lacking import Lack
 from tuner.uncertainty.local_sensitivity import LocalSensitivity, local_sensitivity
 from tuner.uncertainty.records import (

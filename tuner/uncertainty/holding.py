@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from tuner.core.numerics import scaled_solve
 from tuner.core.phrases import listed
-from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Point
 from tuner.search.estimation import free_offsets
 from tuner.search.fitted import Fitted
@@ -32,7 +31,7 @@ from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
-from tuner.uncertainty.lacking import lack_of
+from tuner.uncertainty.lacking import alternatives_of, lack_of
 from tuner.uncertainty.verdict import IDENTIFIABLE_ERROR, ReasonCode
 from tuner.vehicle import COEFFICIENTS
 

@@ -1,9 +1,9 @@
-"""What a fit's flights hold that its model does not, as another model that may be simulated.
+"""The same problem simulated differently: finer, fed otherwise, or with what its model lacks.
 
-The laws that `tuner.equation_error.unexplained` finds push the simulated flights, each along its
-recording, and a rate controller that answers otherwise than its file
-(`tuner.equation_error.rate_controller`) flies them so: by how much coefficients then have to move
-is how far the model's lack may have moved them, and a part of their standard errors.
+By how much coefficients then have to move is a part of their standard errors. What flights hold
+that the model does not: the laws that `tuner.equation_error.unexplained` finds push the simulated
+flights, each along its recording, and a rate controller that answers otherwise than its file
+(`tuner.equation_error.rate_controller`) flies them so.
 """
 
 from __future__ import annotations
@@ -33,13 +33,16 @@ from tuner.equation_error.measured import FEWEST, Measured, measured
 from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, answers
 from tuner.equation_error.unexplained import Law, Pair, unexplained
 from tuner.findings.findings import Code, Finding
+from tuner.objective.battery import log_voltage_of, read_again
+from tuner.objective.criterion import Point
 from tuner.objective.flight import MOTION, SETPOINTS, SPEEDS, TURNED, environment_of
 from tuner.objective.flown import Flown, fly
 from tuner.objective.inlets import zero_order_hold
 from tuner.objective.normal import Objective
+from tuner.objective.windows import Window
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.search.fitted import Fitted
-from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.estimates import DRAWS, READINGS, STEP, Uncertainty
 from tuner.vehicle.model import Model
 
 MATTERS = 0.5
@@ -169,6 +172,52 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
             pushes[axis, :, number] = np.interp(ticks, one.time, column)
     force, moment = (Vec3(*map(jnp.asarray, rows)) for rows in (pushes[:3], pushes[3:]))
     return Lack(found.laws, Disturbance(force=force, moment=moment, rate=rate), heard, found.late)
+
+
+def alternatives_of(
+    objective: Objective, point: Point, flights: Sequence[Flight] = ()
+) -> dict[str, Objective]:
+    """Return what might be simulated differently -> the problem so simulated.
+
+    Physics runs in the same steps where a recording is fed in step by step: it is laid out for
+    those.
+
+    Parameters
+    ----------
+    objective, point
+        The fit.
+    flights
+        Those that are flown whole in it, to have their voltmeters read again where the fit has a
+        battery; none for a fit in which that is not asked.
+    """
+    if not isinstance(objective.segments.inlet, ReferenceInlet):
+        return {}
+    schedule = objective.schedule
+    finer = replace(schedule, physics_rate=2 * schedule.physics_rate)
+    return {STEP: replace(objective, schedule=finer), **_read_again(objective, point, flights)}
+
+
+def _read_again(
+    objective: Objective, point: Point, flights: Sequence[Flight]
+) -> dict[str, Objective]:
+    """Return the problem with other readings of the voltmeters, if they matter to a fit."""
+    segments = objective.segments
+    vehicle = objective.tunable.at(np.asarray(point.coefficients)).vehicle
+    matters = bool(float(vehicle.effects.get("battery_exponent", 0.0)))
+    if not flights or segments.log_voltage is None or not matters:
+        return {}
+    windows = [Window(flight, 0.0) for flight in flights]
+    as_read = log_voltage_of(flights, windows, objective.schedule)
+    assert as_read is not None, "the segments hold what was read"
+    random, others = np.random.default_rng(0), {}
+    for number in range(DRAWS):
+        again = log_voltage_of(read_again(flights, random), windows, objective.schedule)
+        assert again is not None, "there is a voltmeter"
+        volts = segments.log_voltage + (again - as_read)
+        others[f"{READINGS} {number}"] = replace(
+            objective, segments=replace(segments, log_voltage=volts)
+        )
+    return others
 
 
 def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ...]:

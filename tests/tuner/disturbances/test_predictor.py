@@ -37,14 +37,15 @@ from tuner.disturbances.predictor import (
     unscaled,
 )
 from tuner.disturbances.refit import _equations, with_least_innovations
-from tuner.objective.alternatives import STEP, alternatives_of
 from tuner.objective.criterion import Point
 from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.information import information_at, information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.uncertainty.covariance import covariance_of
+from tuner.uncertainty.estimates import STEP
 from tuner.uncertainty.examination import examine
+from tuner.uncertainty.lacking import alternatives_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

@@ -17,7 +17,6 @@ from tests.tuner.uncertainty.making import (
     with_data,
 )
 from tuner.core.errors import RecordingError
-from tuner.objective.alternatives import DRAWS, STEP, alternatives_of
 from tuner.objective.battery import (
     IDLE,
     _resistance,
@@ -31,6 +30,8 @@ from tuner.objective.criterion import Point
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.search.normal_equations import normal_equations
+from tuner.uncertainty.estimates import DRAWS, STEP
+from tuner.uncertainty.lacking import alternatives_of
 
 NOISE = 0.02
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tuner.objective.alternatives import DRAWS, READINGS
 from tuner.objective.information import FisherInformation
-from tuner.uncertainty.estimates import left_out, noise_alone, parts_of, quoted
+from tuner.uncertainty.estimates import DRAWS, READINGS, left_out, noise_alone, parts_of, quoted
 from tuner.uncertainty.overdispersion import allowed_for
 
 COUNT, FLIGHTS, LENGTH = 3, 4, 80
