@@ -89,9 +89,7 @@ class Reading:
         return self.columns + (0 if self.coefficients is None else len(self.offsets))
 
 
-def residuals(
-    flown: Flown, segments: Segments, name: str, reading: Reading, *, block: int = BLOCK
-) -> Iterator[Block]:
+def residuals(flown: Flown, segments: Segments, name: str, reading: Reading) -> Iterator[Block]:
     """Return one channel's residuals up to the horizon, some stamps at a time."""
     measured = segments.measured[name]
     time, values, weight = (
@@ -103,11 +101,11 @@ def residuals(
     order = np.argsort(~used, axis=1, kind="stable")[:, :most]
     log, moved_log = _Series(flown.channels[name]), flown.columns[name]
     columns = None if moved_log is None else _Series(moved_log, by_pass=True)
-    together = max(block // max(most, 1), 1)
+    together = max(BLOCK // max(most, 1), 1)
     for first in range(0, len(time), together):
         some = slice(first, first + together)
-        for begin in range(0, most, block):
-            stamps = order[some, begin : begin + block]
+        for begin in range(0, most, BLOCK):
+            stamps = order[some, begin : begin + BLOCK]
             real = np.take_along_axis(used[some], stamps, axis=1)
 
             def at(rows: NDArray[Any], stamps: NDArray[np.intp] = stamps) -> NDArray[Any]:

@@ -465,13 +465,13 @@ NAMED = 0.3
 """Move of a coefficient, relative to the largest, from which it takes part in a direction."""
 ALIKE = 0.1
 """Deviation of a direction's moves from those of a common factor below which it is one."""
+WORST = 3
+"""Directions that are reported."""
 UNDETERMINED = 1.0
 """Standard error along a direction above which the flights do not determine it at all."""
 
 
-def weakest(
-    covariance: Array, reference: Array, names: Sequence[str], *, count: int = 3
-) -> tuple[Direction, ...]:
+def weakest(covariance: Array, reference: Array, names: Sequence[str]) -> tuple[Direction, ...]:
     """Return the worst-determined combinations, worst first.
 
     Parameters
@@ -482,12 +482,10 @@ def weakest(
         (K,) scaled coordinates' change that counts as one hundred percent.
     names
         K coefficients.
-    count
-        How many at most.
     """
     values, vectors = symmetric_eigen(covariance / np.outer(reference, reference))
     directions = []
-    for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:count]:
+    for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:WORST]:
         largest = vector[np.argmax(np.abs(vector))]
         moves = dict(zip(names, (vector / largest).tolist(), strict=True))
         error = float(abs(largest) * np.sqrt(max(value, 0.0)))

@@ -75,7 +75,6 @@ class Examination:
 def examine(
     fitted: Fitted,
     *,
-    names: Sequence[str] | None = None,
     otherwise: Mapping[str, Objective] = MappingProxyType({}),
     in_doubt: Mapping[str, float] = MappingProxyType({}),
     lack: Lack | None = None,
@@ -90,8 +89,6 @@ def examine(
     ----------
     fitted
         A search's result.
-    names
-        Of the fitted flights in the order of the objective; those of ``fitted.scales`` by default.
     otherwise
         What might be simulated differently -> the problem so simulated, for the parts of errors.
     in_doubt
@@ -104,7 +101,7 @@ def examine(
     at_minimum
         Whether a search led to the point: how far it is from the minimum is then part of the error.
     """
-    names = tuple(fitted.scales) if names is None else tuple(names)
+    names = tuple(fitted.scales)
     full_problem = full_problem_of(fitted.objective, fitted.point)
     objective, point, criterion = full_problem.objective, full_problem.point, fitted.criterion
     if lack is not None:

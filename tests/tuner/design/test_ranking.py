@@ -47,12 +47,13 @@ def fitted() -> Fitted:
     criterion = eqx.tree_at(
         lambda s: (s.scale, s.reference_offset), exact_fit.criterion, (rough, np.zeros((2, 1)))
     )
-    return replace(exact_fit, criterion=criterion)
+    scales = {"swing": exact_fit.scales[making.FLIGHTS[0]]}
+    return replace(exact_fit, criterion=criterion, scales=scales)
 
 
 @pytest.fixture(scope="module")
 def examination(fitted: Fitted) -> Examination:
-    return examine(fitted, names=("swing",))
+    return examine(fitted)
 
 
 def ranked(examination: Examination, fitted: Fitted) -> Proposals:
@@ -73,7 +74,7 @@ def proposals(examination: Examination, fitted: Fitted) -> Proposals:
 def test_candidates_are_flown_by_the_program_of_the_examination(
     fitted: Fitted, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    examination = examine(fitted, names=("swing",))
+    examination = examine(fitted)
 
     def build(*_: object) -> None:
         raise AssertionError("a program was built for the candidates")

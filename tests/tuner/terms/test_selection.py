@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.tuner.terms.making import BASE, job_with, unfitted_with
-from tests.tuner.uncertainty.making import FLIGHTS
 from tuner.config import JobFile
 from tuner.objective.criterion import units_of
 from tuner.report.result_texts import selection_in_words
@@ -83,7 +82,7 @@ def test_what_a_term_that_was_missed_would_change_widens_the_intervals_that_hold
     row = next(row for row in result.rows if row.group == "fuselage_drag")
     assert not row.kept
     assert set(BASE_IN_ORDER) <= set(result.in_doubt)
-    examination = examine(result.fitted, names=FLIGHTS, in_doubt=result.in_doubt)
+    examination = examine(result.fitted, in_doubt=result.in_doubt)
     truth = result.job.space.numbers(result.job.space.initial)
     for name in BASE_IN_ORDER:
         low, high = examination.uncertainty.estimates[name].ci95

@@ -3,7 +3,7 @@
 import pytest
 
 from tests.tuner.terms.making import BASE, job_with
-from tests.tuner.uncertainty.making import FLIGHTS, problem
+from tests.tuner.uncertainty.making import problem
 from tuner.terms import search_with_terms
 from tuner.terms.search_with_terms import with_terms_selected
 from tuner.uncertainty.examination import examine
@@ -38,7 +38,7 @@ def selected(monkeypatch, groups=GROUPS, **given):
 def test_they_are_found_where_they_flew_and_their_intervals_hold_the_truth(monkeypatch, setpoints):
     result = selected(monkeypatch, effects=TRUTH, setpoints=setpoints)
     assert {row.group for row in result.rows if row.kept} == set(GROUPS)
-    known = examine(result.fitted, names=FLIGHTS, in_doubt=result.in_doubt).uncertainty.estimates
+    known = examine(result.fitted, in_doubt=result.in_doubt).uncertainty.estimates
     base = result.job.space.numbers(result.job.space.initial)
     for name in (*BASE, *TRUTH):
         low, high = known[name].ci95
@@ -62,7 +62,7 @@ def test_a_lag_is_found_where_it_flew_and_biases_no_motor(monkeypatch, name, val
     effects = {name: value} if value else {}
     result = selected(monkeypatch, {"lag": (name,)}, effects=effects, base=base)
     assert [row.kept for row in result.rows] == [value > 0.0]
-    known = examine(result.fitted, names=FLIGHTS, in_doubt=result.in_doubt).uncertainty.estimates
+    known = examine(result.fitted, in_doubt=result.in_doubt).uncertainty.estimates
     space = problem(base).space
     for coefficient, true in (space.numbers(space.initial) | effects).items():
         low, high = known[coefficient].ci95
