@@ -109,8 +109,8 @@ def starts() -> str:
     )
     settings = replace(settings, job=settings.job.model_copy(update={"search": plan}))
     job, fitted, seconds = solved(settings)
-    losses = np.array([outcome.loss for outcome in fitted.outcomes[1:]])
-    reached = int((losses < 1.01 * losses.min()).sum())
+    losses = np.array([outcome.loss for outcome in fitted.outcomes[1:]], float)
+    reached = int((losses < 1.01 * np.nanmin(losses)).sum())
     return f"{reached} of {STARTS} reach the same minimum: {worst(job, fitted)}; {seconds:.0f} s"
 
 

@@ -12,14 +12,14 @@ from pydantic import JsonValue
 
 from tuner.core.disk import exists, file_name, whole_file
 from tuner.core.errors import InputError
-from tuner.core.files import FiniteOrNone, Part, ResultFile, read_arrays
+from tuner.core.files import Part, ResultFile, read_arrays
 from tuner.design.proposals import Proposals
 from tuner.evaluate.records import Table
 from tuner.findings.findings import Finding
 from tuner.ground.bench_json import BenchRecord
 from tuner.recordings.flight import Array
 from tuner.result import ExportRecord, ExportRecords, Run, RunResult, read_run
-from tuner.search.iteration import Iteration
+from tuner.search.iteration import Iteration, Outcome
 from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles
 
 if TYPE_CHECKING:
@@ -124,22 +124,13 @@ FORCE_POINTS = 400
 """Points of a force's curve, of which a flight has dozens."""
 
 
-class Start(Part):
-    """Where one start came from and ended; coefficients in their units."""
-
-    origin: str
-    loss: FiniteOrNone
-    start: dict[str, float]
-    end: dict[str, float]
-
-
 class SearchRecord(ResultFile):
     """The content of ``search.json``."""
 
     FILE = "search.json"
 
     iterations: list[Iteration]
-    starts: list[Start]
+    starts: list[Outcome]
 
 
 class Recording(Part):
@@ -166,19 +157,8 @@ class About(ResultFile):
 
 def write_search(folder: Path, fitted: Fitted) -> None:
     """Write ``search.json`` of a finished search."""
-    numbers = fitted.objective.space.numbers
-    SearchRecord(
-        iterations=list(fitted.iterations),
-        starts=[
-            Start(
-                origin=outcome.origin,
-                loss=outcome.loss,
-                start=numbers(outcome.start),
-                end=numbers(outcome.vector),
-            )
-            for outcome in fitted.outcomes
-        ],
-    ).write(folder)
+    iterations, starts = list(fitted.iterations), list(fitted.outcomes)
+    SearchRecord(iterations=iterations, starts=starts).write(folder)
 
 
 def write_traces(folder: Path, simulations: Mapping[str, Mapping[str, FlightErrors]]) -> None:

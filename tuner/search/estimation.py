@@ -22,8 +22,8 @@ from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.findings import findings_at, unmatched
-from tuner.search.fitted import Fitted, Outcome, by_flight
-from tuner.search.iteration import Iteration
+from tuner.search.fitted import Fitted, by_flight
+from tuner.search.iteration import Iteration, Outcome
 from tuner.search.loop import Loop, with_loop
 from tuner.search.optimiser import Free
 from tuner.search.problem import Job
@@ -178,7 +178,7 @@ def search(
 
 def _doubt(job: Job, fitted: Fitted) -> Finding | None:
     """Return why the end of least squares is doubtful, if it is."""
-    losses = np.array([outcome.loss for outcome in fitted.outcomes])
+    losses = np.array([np.inf if end.loss is None else end.loss for end in fitted.outcomes])
     if len(losses) > 2 and (losses < (1.0 + AGREE) * losses.min()).sum() < 2:
         return Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": len(losses)})
     lost = unmatched(fitted.scales)
@@ -259,10 +259,15 @@ class _Attempt:
         point = point_of(progress.points, best)
         objective = with_loop(job.objective, progress.loop)
         criterion = criterion_of(stage, progress.scales, np.asarray(point.offsets), progress.states)
-        vectors = np.asarray(progress.points.coefficients)
+        ends = zip(starts, progress.points.coefficients, progress.losses, strict=True)
         outcomes = tuple(
-            Outcome(vectors[i], starts[i], float(progress.losses[i]), _origin(i))
-            for i in range(len(starts))
+            Outcome(
+                origin="random" if number else "vehicle file",
+                loss=float(loss),
+                start=job.space.numbers(start),
+                end=job.space.numbers(end),
+            )
+            for number, (start, end, loss) in enumerate(ends)
         )
         fitted = Fitted(
             objective=objective,
@@ -321,10 +326,6 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     if job.objective.segments.windowed and job.objective.segments.freedom is None:
         free[: len(OFFSETS)] = False  # a recorded start has the recording's clock and bias
     return free
-
-
-def _origin(number: int) -> str:
-    return "vehicle file" if number == 0 else "random"
 
 
 def parameters_of(job: Job, progress: Progress) -> Mapping[str, float]:

@@ -12,32 +12,10 @@ from tuner.findings.findings import Finding
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.recordings.flight import Flight
-from tuner.search.iteration import Iteration
+from tuner.search.iteration import Iteration, Outcome
 
 COLOURED = 1.2
 """Residuals over measurement noise from which something else than noise must be in them."""
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """Where one start ended.
-
-    Attributes
-    ----------
-    vector
-        (K,) search vector at the end.
-    start
-        (K,) search vector at the beginning.
-    loss
-        At the end, on whole flights, in the final weights.
-    origin
-        ``vehicle file``, ``random`` or ``cma``.
-    """
-
-    vector: NDArray[np.float64]
-    start: NDArray[np.float64]
-    loss: float
-    origin: str
 
 
 @dataclass(frozen=True)

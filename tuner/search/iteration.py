@@ -1,4 +1,4 @@
-"""One step of a search, as the terminal shows it and as checkpoint and ``search.json`` keep it."""
+"""What is told of a search: its steps, where its starts ended, and what it estimates."""
 
 from __future__ import annotations
 
@@ -35,6 +35,25 @@ class Iteration(Part):
     accepted: bool
     horizon: float
     damping: FiniteOrNone = None
+
+
+class Outcome(Part):
+    """Where one start of a search ended.
+
+    Attributes
+    ----------
+    origin
+        ``vehicle file`` or ``random``.
+    loss
+        At the end, on whole flights, in the final weights.
+    start, end
+        Coefficient -> value at the beginning and at the end, in its unit.
+    """
+
+    origin: str
+    loss: FiniteOrNone
+    start: dict[str, float]
+    end: dict[str, float]
 
 
 class PointEstimate(Part):

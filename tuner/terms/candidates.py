@@ -153,15 +153,6 @@ def with_free(
     """
     objective, point = with_terms(fitted.objective, fitted.point, names, job.settings.job)
     objective, point = with_conditions(objective, point, around)
-    added = np.asarray(point.coefficients)[len(job.space) :]
-    outcomes = tuple(
-        replace(
-            outcome,
-            vector=np.concatenate([outcome.vector, added]),
-            start=np.concatenate([outcome.start, added]),
-        )
-        for outcome in fitted.outcomes
-    )
     return (
         replace(
             job,
@@ -170,7 +161,7 @@ def with_free(
                 job.objective, space=objective.space, conditions=objective.conditions
             ),
         ),
-        replace(fitted, objective=objective, point=point, outcomes=outcomes),
+        replace(fitted, objective=objective, point=point),
     )
 
 
@@ -202,7 +193,6 @@ def with_groups(
     there = replace(
         fitted,
         objective=with_loop(grown.objective, loop_of(fitted.objective)),
-        outcomes=grown.outcomes,
         point=Point(
             np.asarray([vector[name] for name in job.space.names]),
             offsets_of(fitted, grown.objective),

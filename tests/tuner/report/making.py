@@ -14,7 +14,7 @@ from tuner.evaluate.forces import Forces
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, SignalErrors
 from tuner.report import write_traces
-from tuner.report.contents import SearchRecord, Start
+from tuner.report.contents import SearchRecord
 from tuner.result import (
     CoefficientResult,
     EffectiveResult,
@@ -26,7 +26,7 @@ from tuner.result import (
     SearchResult,
     Status,
 )
-from tuner.search.iteration import Iteration
+from tuner.search.iteration import Iteration, Outcome
 from tuner.uncertainty.records import (
     CoefficientKnowledge,
     EffectOverTime,
@@ -71,9 +71,9 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
             for n in range(4)
         ],
         starts=[
-            Start(origin="vehicle file", loss=0.5, start=values, end=values),
-            Start(origin="random", loss=3.0, start=values, end=values),
-            Start(origin="random", loss=None, start=values, end=values),
+            Outcome(origin="vehicle file", loss=0.5, start=values, end=values),
+            Outcome(origin="random", loss=3.0, start=values, end=values),
+            Outcome(origin="random", loss=None, start=values, end=values),
         ],
     ).write(folder)
     knowledge = _knowledge(vehicle, free, undetermined)

@@ -14,7 +14,7 @@ from tuner.objective.space import space_of
 from tuner.search import estimation as module
 from tuner.search.estimation import starting_vectors
 from tuner.search.findings import end_findings, unmatched, voltage_taken
-from tuner.search.fitted import Outcome
+from tuner.search.iteration import Outcome
 from tuner.search.loop import USUAL
 from tuner.search.stages import left, plan
 from tuner.uncertainty.estimates import finer_than_steps
@@ -74,8 +74,7 @@ def test_flights_that_stay_far_off_ask_for_a_second_opinion(fitted, updated):
 
 
 def ends(*losses):
-    nowhere = np.zeros(len(FREE))
-    return tuple(Outcome(nowhere, nowhere, loss, "random") for loss in losses)
+    return tuple(Outcome(origin="random", loss=loss, start={}, end={}) for loss in losses)
 
 
 def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
