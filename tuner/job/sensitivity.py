@@ -28,9 +28,9 @@ from tuner.search.findings import UNMATCHED, loop_findings
 from tuner.search.fitted import Fitted, by_flight
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.search.loop import GAIN, loop_of, with_loop
+from tuner.search.normal_equations import misfit, root_mean_squares
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import beginning, plain_criterion
-from tuner.search.weights import misfit, root_mean_squares
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.global_indices import global_sensitivity

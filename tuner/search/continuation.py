@@ -23,11 +23,10 @@ from tuner.search.evolution import CmaEs
 from tuner.search.iteration import Iteration
 from tuner.search.least_squares import LeastSquares, starts_asked_for
 from tuner.search.loop import FROM_START, GAIN, with_loop
-from tuner.search.normal_equations import normal_equations
+from tuner.search.normal_equations import misfit, normal_equations, root_mean_squares, strays
 from tuner.search.optimiser import OPTIMISERS, Free, Iterate, StageProblem
 from tuner.search.progress import Progress, criterion_of, point_of
 from tuner.search.stages import Stage
-from tuner.search.weights import misfit, root_mean_squares, strays
 
 __all__ = ["CmaEs", "LeastSquares", "grow"]  # the optimisers of every schedule
 

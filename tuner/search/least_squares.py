@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from tuner.objective.criterion import Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import Step, advance, begin
+from tuner.search.normal_equations import NEAR, root_mean_squares
 from tuner.search.optimiser import Iterate, Optimiser, StageProblem
 from tuner.search.stages import WEIGHED
-from tuner.search.weights import NEAR, root_mean_squares
 
 FAR = 5.0
 """Standard deviations beyond which no start is believed to lie."""

@@ -1,8 +1,9 @@
-"""The normal equations of a whole fit: its loss as a quadratic about a point.
+"""What the segments' sums say of a whole fit: its loss as a quadratic, and how flights are met.
 
 Each of F segments contributes a loss, a gradient and a Gauss-Newton Hessian from which its own
 start has been eliminated (`tuner.objective.normal`); they are summed over the segments and the
-priors added. The residuals themselves, some hundred thousand, are never laid in one array.
+priors added. The residuals themselves, some hundred thousand, are never laid in one array. How much
+each channel of each flight weighs follows from what the model leaves unexplained of it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tuner.objective.criterion import OFFSET_SD, Criterion, Point, SegmentSums
+from tuner.objective.normal import Objective
 from tuner.objective.space import Space
 
 Array = NDArray[np.float64]
@@ -83,3 +85,44 @@ def normal_equations(
     own_diagonal = np.arange(count, len(hessian))
     hessian[own_diagonal, own_diagonal] += 1.0 / OFFSET_SD**2
     return NormalEquations(loss / compared, gradient / compared, hessian / compared)
+
+
+NEAR = 3.0
+"""Multiple of the noise up to which a flight counts as met, by its worst channel."""
+STRAY = 3.0
+"""A flight that is met this many times worse than the median one counts less."""
+
+
+def root_mean_squares(objective: Objective, sums: SegmentSums) -> dict[str, NDArray[np.float64]]:
+    """Return channel -> (S, N) root mean square residual in σ of each flight, NaN without any.
+
+    ``objective`` says which segment belongs to which flight; the segments' sums have S first.
+    """
+    owner, residual = np.eye(objective.flights)[np.asarray(objective.segments.flight)], {}
+    for name, squares in sums.squares.items():
+        counts = np.asarray(sums.counts[name]) @ owner
+        mean = np.asarray(squares) @ owner / np.maximum(counts, 1.0)
+        residual[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
+    return residual
+
+
+def strays(
+    residual: dict[str, NDArray[np.float64]], noise_inflation: float
+) -> dict[str, NDArray[np.float64]]:
+    """Weigh a flight down that is met far worse than the others, so that it cannot poison them."""
+    table = np.stack(list(residual.values())) / noise_inflation
+    with np.errstate(all="ignore"):
+        per_flight = np.nan_to_num(np.nanmedian(table, axis=0), nan=1.0)
+    typical = max(float(np.median(per_flight)), 1.0)
+    stray = per_flight > STRAY * typical
+    return {
+        name: np.where(stray & np.isfinite(values), np.maximum(values / noise_inflation, 1.0), 1.0)
+        for name, values in residual.items()
+    }
+
+
+def misfit(residual: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+    """Return how much larger than noise each channel's residuals are on each flight, at least 1."""
+    return {
+        name: np.maximum(np.nan_to_num(values, nan=1.0), 1.0) for name, values in residual.items()
+    }
