@@ -334,6 +334,8 @@ class _Compiled:
         code = object_code(layout.written(closed, self.width))
         spent = time.perf_counter() - began
         jax.monitoring.record_event_duration_secs(BUILT, spent, fun_name=program.name)
+        # tens of megabytes that a kernel has no use for
+        program.__dict__.pop("_traced", None)
         return structure, outputs, moved, code
 
     def _to_keep(self) -> bytes:

@@ -32,21 +32,15 @@ def resident() -> int:
 
 
 def give_back(most: int) -> None:
-    """Give back what is free if the process holds more than ``most``, then what jax has compiled.
+    """Give back what jax has compiled, and what is free, if the process holds more than ``most``.
 
     It takes a second: a process that stays large does not try after every test.
     """
     global grown  # noqa: PLW0603 (of this process)
     if "jax" not in sys.modules or resident() <= max(most, grown):
         return
-    _collect()
-    if resident() > min(most, MOST_MEMORY):
-        sys.modules["jax"].clear_caches()
-        _collect()
-    grown = resident() + GROWTH
-
-
-def _collect() -> None:
+    sys.modules["jax"].clear_caches()
     gc.collect()
     with suppress(OSError, AttributeError, TypeError):  # where the C library is not glibc
         ctypes.CDLL(None).malloc_trim(0)
+    grown = resident() + GROWTH

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import logging
 import os
@@ -366,6 +367,20 @@ def test_a_folder_that_cannot_be_written_is_no_reason_to_fail(tmp_path):
         assert object_code(TEXT)
     finally:
         keep_code_in(None)
+
+
+def test_a_kernel_keeps_nothing_of_what_it_was_made_from():
+    """What jax traces of a flight is tens of megabytes, and programs stay for their kernels."""
+
+    def equations():
+        jax.clear_caches()
+        gc.collect()
+        return sum(type(known).__name__ == "JaxprEqn" for known in gc.get_objects())
+
+    before = equations()
+    program = Program(filtered, ARGUMENTS)
+    assert program.is_kernel
+    assert equations() == before
 
 
 def test_where_jax_computes_in_single_precision_a_kernel_does_too():
