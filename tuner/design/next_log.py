@@ -23,7 +23,7 @@ from tuner.core.numerics import errors_of
 from tuner.design.proposals import LogProposal
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_at
-from tuner.objective.inlets import INLETS, STEADY_TORQUE, TURNING
+from tuner.objective.inlets import INLETS, STEADY_TORQUE
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured
 from tuner.recordings.flight import Series
@@ -31,7 +31,7 @@ from tuner.search.fitted import Fitted
 from tuner.search.job_flights import Recording
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import plain_criterion
-from tuner.vehicle import VehicleFile
+from tuner.vehicle import COEFFICIENTS, VehicleFile
 
 Array = NDArray[np.float64]
 
@@ -206,7 +206,8 @@ def _fed(job: Job, fitted: Fitted) -> list[LogProposal]:
     fed = job_of(
         job.settings, [replace(r, inlet="actuator") for r in job.recordings if not r.holdout]
     )
-    names = [n for n in fed.space.names if n in TURNING and n not in STEADY_TORQUE]
+    turning = {name for name, row in COEFFICIENTS.items() if row.part == "turning"}
+    names = [n for n in fed.space.names if n in turning and n not in STEADY_TORQUE]
     values = fed.space.numbers(fed.space.initial)
     best = job.space.numbers(fitted.point.coefficients)
     vector = fed.space.vector_of(values | {name: best[name] for name in best if name in values})

@@ -26,7 +26,7 @@ def hidden(names: Sequence[str]) -> NDArray[np.bool_]:
     And how high the markers sit: a loop holds its height to the millimetre, whereas a filter
     begins at the height of the first sample.
     """
-    return np.isin(names, (*INLETS["body_rate"].bypasses, "marker_offset_z"))
+    return np.isin(names, [*INLETS["body_rate"].bypasses, "marker_offset_z"])
 
 
 def with_hidden(

@@ -32,7 +32,8 @@ from sim_jax.vector import Vec3
 from tuner.config.job import InletName
 from tuner.recordings.flight import SIGNALS, Array, Flight, Series
 from tuner.recordings.interpolation import body_rate_from, without_gaps
-from tuner.vehicle import term_groups
+from tuner.vehicle import COEFFICIENTS, term_groups
+from tuner.vehicle.coefficient import LoopPart
 
 MISSED = 1.5
 """Periods of a loop between two samples beyond which its output was not recorded in full."""
@@ -114,8 +115,8 @@ class RecordedInlet(ABC):
     closed_loop: ClassVar[bool] = False
     """Whether the position controller is simulated: it keeps a whole flight to its path, and the
     recording's clock is the reference's rather than the flight controller's."""
-    bypasses: ClassVar[tuple[str, ...]] = ()
-    """Coefficients of the stages upstream, of which the simulation then says nothing."""
+    replaces: ClassVar[tuple[LoopPart, ...]] = ()
+    """Parts of the loop in whose place signals are fed in."""
     frees: ClassVar[tuple[str, ...]] = ()
     """Coefficients that are free besides the usual ones: what no loop takes out by itself."""
     terms: ClassVar[tuple[str, ...]] = ()
@@ -130,10 +131,15 @@ class RecordedInlet(ABC):
         del flight
         return () if self.closed_loop else self.needs
 
+    @property
+    def bypasses(self) -> frozenset[str]:
+        """The coefficients of these parts, of which the simulation then says nothing."""
+        return frozenset(n for n, row in COEFFICIENTS.items() if row.part in self.replaces)
+
     def bypassed(self, flight: Flight) -> frozenset[str]:
         """Return the coefficients of which the simulation of a flight says nothing."""
         del flight
-        return frozenset(self.bypasses)
+        return self.bypasses
 
     def can_be_fed(self, flight: Flight) -> bool:
         """Return whether a flight holds every column of what the inlet needs."""
@@ -185,37 +191,6 @@ class RecordedInlet(ABC):
         return [np.asarray(table[:, column]) for column in range(table.shape[1])]
 
 
-OF_MOTORS = (
-    "actuator_latency",
-    "input_scaling",
-    "zero_position_armed",
-    "input_offset",
-    "quadratic",
-    "time_constant_up",
-    "time_constant_down",
-    "time_constant_slope",
-    "time_constant_second",
-    "battery_exponent",
-)
-"""Coefficients between a motor command and a rotor's speed."""
-TURNING = (
-    "inertia_xx",
-    "inertia_yy",
-    "inertia_zz",
-    "moment_constant",
-    "rolling_moment_coefficient",
-    "flapping_moment_coefficient",
-    "rotor_inertia",
-    *(f"angular_drag_{axis}" for axis in "xyz"),
-    *(f"torque_trim_{axis}" for axis in "xyz"),
-)
-"""Coefficients that turn the vehicle, and do nothing else."""
-OF_RATE_CONTROL = (
-    "gyro_cutoff",
-    "rate_gain_roll_pitch",
-    "rate_gain_yaw",
-)
-"""Coefficients between a rate set-point and a motor command alone."""
 STEADY_TORQUE = ("torque_trim_x", "torque_trim_y", "torque_trim_z")
 """Rotors differ and the mass is never quite in the middle: recorded inputs hold a steady torque
 that turns nothing, and that a simulation which is fed with them has to know of."""
@@ -270,7 +245,7 @@ class RecordedBodyRate(RecordedInlet):
     name = "body_rate"
     feeds = BodyRateInlet
     needs = ("rate_setpoint", "thrust_setpoint")
-    bypasses = ("estimate_latency",)
+    replaces = ("estimate",)
     ignores = ("trim",)
     starts_recorded = False
     window = 1.0
@@ -293,7 +268,7 @@ class RecordedCommand(RecordedInlet):
     feeds = ActuatorInlet
     needs = ("command",)
     silences = ("command", "acceleration")
-    bypasses = ("estimate_latency", *OF_RATE_CONTROL)
+    replaces = ("estimate", "rate control")
     frees = STEADY_TORQUE
     terms = AIR
     ignores = ("rate_integral",)
@@ -320,7 +295,7 @@ class RecordedRotorSpeed(RecordedInlet):
     feeds = RotorSpeedInlet
     needs = ("rotor_speed",)
     silences = ("command", "rotor_speed", "acceleration")
-    bypasses = ("estimate_latency", *OF_RATE_CONTROL, *OF_MOTORS, "tachometer_lag")
+    replaces = ("estimate", "rate control", "motors", "tachometer")
     frees = STEADY_TORQUE
     terms = AIR
     ignores = ("rotor_speed", "rate_integral")
@@ -365,7 +340,7 @@ class RecordedAttitude(RecordedInlet):
     feeds = AttitudeInlet
     needs = ("attitude",)
     silences = ("attitude", "body_rate", "command", "rotor_speed")
-    bypasses = ("estimate_latency", *OF_RATE_CONTROL, *TURNING, "tachometer_lag")
+    replaces = ("estimate", "rate control", "turning", "tachometer")
     ignores = ("attitude", "body_rate", "rate_integral", "trim")
     starts_recorded = False
     window = 1.0
@@ -392,7 +367,7 @@ class RecordedAttitude(RecordedInlet):
 
     def bypassed(self, flight: Flight) -> frozenset[str]:
         """Return what turns the vehicle, and the motors where rotor speeds are fed in."""
-        return frozenset(self.bypasses) | self.drive(flight).bypassed(flight)
+        return self.bypasses | self.drive(flight).bypassed(flight)
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> AttitudeInlet:
         """Lay attitudes and body rates out step by step, beside what turns the rotors."""

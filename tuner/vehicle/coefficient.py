@@ -17,6 +17,9 @@ EFFECTS = "effects"
 _PYTREE_NODES = {"": "body", "inertia": "body"}
 
 
+LoopPart = Literal["", "estimate", "rate control", "motors", "tachometer", "turning"]
+
+
 @dataclass(frozen=True)
 class Written:
     """An export target holds the coefficient.
@@ -70,6 +73,9 @@ class Coefficient:
     place
         Section and key in the vehicle file, for the scopes ``vehicle`` and ``setup``. The sections
         are those of `tuner.vehicle.vehicle`; a coefficient in ``effects`` needs no other entry.
+    part
+        The part of the loop in which alone it acts, if any: where recorded signals take its place,
+        a simulation says nothing of the coefficient.
     scale
         Whether the search moves the logarithm or the number.
     bounds
@@ -126,6 +132,7 @@ class Coefficient:
     source: str
     scope: Scope = "vehicle"
     place: Place = ("", "")
+    part: LoopPart = ""
     scale: Scale = "log"
     bounds: float | tuple[float, float] = (float("-inf"), float("inf"))
     prior_sd: float = 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from tuner.vehicle.coefficient import EFFECTS, Coefficient, NotCarried
+from tuner.vehicle.coefficient import EFFECTS, Coefficient, LoopPart, NotCarried
 
 _OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
 _OUTSIDE = {"sdf": _OF_SETUP, "px4": _OF_SETUP}
@@ -32,11 +32,18 @@ _marker = partial(
 
 
 def _factor(
-    name: str, meaning: str, source: str, *, group: str, bounds: float, prior_sd: float
+    name: str,
+    meaning: str,
+    source: str,
+    *,
+    group: str,
+    bounds: float,
+    prior_sd: float,
+    part: LoopPart = "",
 ) -> Coefficient:
     """Return the row of a factor of the set-up that is one where all is as it is said to be."""
     more = _setup(name, "", meaning, source, place=(EFFECTS, name), bounds=bounds, neutral=1.0)
-    return replace(more, prior_sd=prior_sd, step=0.5 * prior_sd, group=group)
+    return replace(more, prior_sd=prior_sd, step=0.5 * prior_sd, group=group, part=part)
 
 
 SURROUNDING_ROWS = (
@@ -47,6 +54,7 @@ SURROUNDING_ROWS = (
         "age of the state that the controllers see",
         "motion capture, network and estimator of the laboratory",
         place=("setup", "estimate_latency"),
+        part="estimate",
         scale="linear",
         bounds=(0.0, 0.1),
         prior_sd=0.02,
@@ -61,6 +69,7 @@ SURROUNDING_ROWS = (
         "from a motor command to its effect",
         "output driver and speed controller",
         place=("setup", "actuator_latency"),
+        part="motors",
         scale="linear",
         bounds=(0.0, 0.04),
         prior_sd=0.005,
@@ -76,6 +85,7 @@ SURROUNDING_ROWS = (
         "low-pass filter of the gyro",
         "PX4 IMU_GYRO_CUTOFF",
         place=("setup", "gyro_cutoff"),
+        part="rate control",
         bounds=4.0,
         prior_sd=0.5,
         fallback=("filters", "gyro_cutoff"),
@@ -124,6 +134,7 @@ SURROUNDING_ROWS = (
             f"P, I and D of the rate controller about {words} over those of its file",
             f"PX4 {parameter}; parameters that are not those of the flight",
             group="rate_gain",
+            part="rate control",
             bounds=2.0,
             prior_sd=0.1,
         )
@@ -146,6 +157,7 @@ SURROUNDING_ROWS = (
         step=0.002,
         neutral=0.0,
         group="tachometer_lag",
+        part="tachometer",
         exported_as=_OUTSIDE,
     ),
     # what a recording may get wrong by a constant

@@ -9,7 +9,6 @@ from tests.tuner.job.test_windows import stage_for
 from tuner.config import JobFile, Options, settle
 from tuner.config.job import FlightSettings, Search
 from tuner.findings.findings import Code, one_line
-from tuner.objective.inlets import TURNING
 from tuner.objective.rotor_signals import MotorOrder
 from tuner.recordings.flight import Series
 from tuner.search import job_flights as recordings
@@ -17,7 +16,7 @@ from tuner.search.estimation import search
 from tuner.search.inlet_choice import choose_inlet
 from tuner.search.job_flights import read_usable, recordings_of
 from tuner.search.problem import job_of
-from tuner.vehicle import ControllerFile, values_of, with_values
+from tuner.vehicle import COEFFICIENTS, ControllerFile, values_of, with_values
 
 EXPONENT = 0.8
 FULL = 16.6
@@ -127,7 +126,7 @@ def test_thrust_drag_and_battery_come_back_from_a_sparse_log(sparse, updated, fu
     job = job_of(settings, recordings_of(settings, [sparse]))
     assert job.inlets == ("attitude",)
     assert job.space.names == FREE  # inertia does nothing here, and nobody fits it
-    assert not set(job.space.free) & set(TURNING)
+    assert "turning" not in {COEFFICIENTS[name].part for name in job.space.free}
     assert "acceleration" in job.objective.segments.measured
     fitted = search(job, tmp_path, resume=False, on_progress=lambda *_: None)
     found = job.space.numbers(fitted.point.coefficients)
