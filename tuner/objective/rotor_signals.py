@@ -69,38 +69,37 @@ def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> Explained
     """Return what a recorded signal of the rotors explains; None if too little was recorded."""
     if not flight.has(source) or "body_rate" not in flight.series:
         return None
-    clock = common_clock(flight.series, source, (0.0, flight.duration))
-    if clock is None:
+    read = _turning(flight.series, vehicle, source, (0.0, flight.duration))
+    if read is None:
         return None
-    turning, torque = turning_and_torque(flight.series, vehicle, source, clock)
-    most = max(1, round(LATEST / float(clock[1] - clock[0])))
-    delays = (_correlation(turning, torque, delay) for delay in range(-1, most + 1))
-    best = max(delays, key=lambda correlation: correlation[0] + correlation[1])
+    step, turning, squares = read
+    torque = _smoothed(squares) @ levers(vehicle)
+    delays = range(-1, max(1, round(LATEST / step)) + 1)
+    correlations = (_correlation(turning, torque, delay) for delay in delays)
+    best = max(correlations, key=lambda correlation: correlation[0] + correlation[1])
     rates = flight.series[source].rate, flight.series["body_rate"].rate
     return Explained(source, (best[0], best[1], best[2]), *rates)
 
 
-def common_clock(
-    series: Mapping[str, Series], source: Source, span: tuple[float, float]
-) -> Array | None:
-    """Return a uniform clock at the gyro's rate over what both signals cover of a span in s."""
+def _turning(
+    series: Mapping[str, Series], vehicle: VehicleFile, source: Source, span: tuple[float, float]
+) -> tuple[float, Array, Array] | None:
+    """Return the s from sample to sample, and two signals over what both cover of a span in s.
+
+    Angular acceleration (n, 3) in rad/s², and squared rotor speeds (n, rotors), (rad/s)², at the
+    gyro's rate; None if too little was recorded.
+    """
     gyro, rotors = series["body_rate"], series[source]
     rate = min(FASTEST, gyro.rate)
     begin = max(span[0], gyro.time[0], rotors.time[0])
     end = min(span[1], gyro.time[-1], rotors.time[-1])
     count = int((end - begin) * rate)
-    return begin + np.arange(count) / rate if count >= FEWEST else None
-
-
-def turning_and_torque(
-    series: Mapping[str, Series], vehicle: VehicleFile, source: Source, clock: Array
-) -> tuple[Array, Array]:
-    """Return angular acceleration (n, 3) in rad/s² and torque (n, 3) over motor_constant."""
-    gyro, rotors = series["body_rate"], series[source]
-    rates = smoothed(linear_interpolation(gyro, clock))
-    turning = np.gradient(rates, clock, axis=0)
-    squares = squared_speed(vehicle, source, linear_interpolation(rotors, clock))
-    return turning, smoothed(squares) @ levers(vehicle)
+    if count < FEWEST:
+        return None
+    clock = begin + np.arange(count) / rate
+    step = float(clock[1] - clock[0])
+    turning = np.gradient(_smoothed(linear_interpolation(gyro, clock)), step, axis=0)
+    return step, turning, squared_speed(vehicle, source, linear_interpolation(rotors, clock))
 
 
 def squared_speed(vehicle: VehicleFile, source: Source, values: Array) -> Array:
@@ -123,7 +122,7 @@ def levers(vehicle: VehicleFile) -> Array:
     return np.array(rows)
 
 
-def smoothed(values: Array) -> Array:
+def _smoothed(values: Array) -> Array:
     """Return (n, k) values averaged over `SMOOTHED` samples."""
     kernel = np.ones(SMOOTHED) / SMOOTHED
     return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
@@ -195,12 +194,10 @@ def motor_order(
     span
         s of the flight.
     """
-    clock = common_clock(series, source, span)
-    if clock is None or len(vehicle.rotors) != 4:
+    read = _turning(series, vehicle, source, span)
+    if read is None or len(vehicle.rotors) != 4:
         return None
-    step = float(clock[1] - clock[0])
-    turning = np.gradient(smoothed(linear_interpolation(series["body_rate"], clock)), step, axis=0)
-    squares = squared_speed(vehicle, source, linear_interpolation(series[source], clock))
+    step, turning, squares = read
     if 0.5 / step < 4.0 * SLOW:
         return None
     turning = _without_slow(turning, step)
@@ -304,7 +301,7 @@ def _lagged(squares: Array, step: float, lag: float) -> Array:
     decay = np.exp(-step / lag)
     response = (1.0 - decay) * decay ** np.arange(math.ceil(SETTLED * lag / step))
     late = [np.convolve(column - column[0], response)[: len(squares)] for column in squares.T]
-    return smoothed(squares[0] + np.stack(late, axis=-1))
+    return _smoothed(squares[0] + np.stack(late, axis=-1))
 
 
 WRENCH = ("commanded_thrust", "commanded_torque")
