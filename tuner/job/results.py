@@ -125,7 +125,7 @@ def _loss_at_start(job: Job, fitted: Fitted) -> float:
     """Return the loss with the initial coefficients, as the fit's last stage counts it."""
     objective, criterion = fitted.objective, fitted.criterion
     start = objective.start(job.space.initial)
-    flight = np.asarray(objective.segments.flight)
+    flight = objective.flight
     sums = objective.sums(start, criterion, derivatives=False)
     loss, _, _ = normal_equations(objective.space, flight, start, criterion, sums)
     return float(loss)

@@ -212,7 +212,7 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
     here: SegmentSums = jax.tree.map(lambda leaf: np.asarray(leaf)[best], sums)
     point = point_of(problem.points, best)
     loss, gradient, hessian = normal_equations(
-        objective.space, objective.segments.flight, point, problem.criterion, here
+        objective.space, objective.flight, point, problem.criterion, here
     )
     moves = np.flatnonzero(np.concatenate([free.coefficients, free.offsets.ravel()]))
     inverse = scaled_inverse(hessian[np.ix_(moves, moves)], RIDGE)

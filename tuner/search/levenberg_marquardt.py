@@ -128,7 +128,7 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
         (K + offsets·N,) one for what may move, zero for what stays; changes only at `begin`.
     """
     moves = np.flatnonzero(free)
-    flight, starts = np.asarray(objective.segments.flight), range(len(before.loss))
+    flight, starts = objective.flight, range(len(before.loss))
 
     def quadratics(sums: SegmentSums) -> list[NormalEquations]:
         return [

@@ -98,7 +98,7 @@ def root_mean_squares(objective: Objective, sums: SegmentSums) -> dict[str, NDAr
 
     ``objective`` says which segment belongs to which flight; the segments' sums have S first.
     """
-    owner, residual = np.eye(objective.flights)[np.asarray(objective.segments.flight)], {}
+    owner, residual = np.eye(objective.flights)[objective.flight], {}
     for name, squares in sums.squares.items():
         counts = np.asarray(sums.counts[name]) @ owner
         mean = np.asarray(squares) @ owner / np.maximum(counts, 1.0)

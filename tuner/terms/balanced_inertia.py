@@ -157,7 +157,7 @@ def balance_of(objective: Objective, point: Point, flights: Sequence[Flight]) ->
     """
     step = max(1, objective.schedule.log_rate // FASTEST)
     rate, samples = objective.schedule.log_rate / step, -(-objective.samples // step)
-    segments, flight = objective.segments, np.asarray(objective.segments.flight)
+    segments, flight = objective.segments, objective.flight
     time = segments.begins[:, None] + np.arange(samples) / rate
     columns: dict[str, NDArray[np.float64]] = {
         name: np.full((samples, size, segments.count), np.nan)

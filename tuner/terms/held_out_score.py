@@ -41,7 +41,7 @@ def predicted_losses(
         Channel -> (N,) factor on the standard deviations.
     """
     objective, criterion = fitted.objective, replace(fitted.criterion, scale=dict(scale))
-    space, flight = objective.space, np.asarray(objective.segments.flight)
+    space, flight = objective.space, objective.flight
     movable, losses = offsets_fitted(fitted), []
     alone = objective.flights == 1
     for number in range(objective.flights):

@@ -267,7 +267,7 @@ def whiteness(
     """Return the autocorrelation of the residuals of every channel of every flight."""
     results = []
     seconds = float(criterion.horizon) / float(objective.schedule.log_rate)
-    segment_flight = np.asarray(objective.segments.flight)
+    segment_flight = objective.flight
     for number, name in enumerate(flights):
         segments = np.flatnonzero(segment_flight == number)  # windows follow each other
         for channel, measured in objective.segments.measured.items():

@@ -104,7 +104,7 @@ def _outputs(
 
     A simulation that crashed on a flight counts as no better than the worst that flew it.
     """
-    flight = np.asarray(objective.segments.flight)
+    flight = objective.flight
     names, columns = [], []
     for number, name in enumerate(flights):
         segments = np.flatnonzero(flight == number)

@@ -223,7 +223,7 @@ def _moved(fitted: Fitted, vector: NDArray[np.float64], free: Free) -> Point:
     objective, point = fitted.objective, fitted.point
     sums = objective.sums(point, fitted.criterion)
     hessian = normal_equations(
-        objective.space, objective.segments.flight, point, fitted.criterion, sums
+        objective.space, objective.flight, point, fitted.criterion, sums
     ).hessian
     change = np.zeros(len(hessian))
     change[: len(vector)] = vector - point.coefficients

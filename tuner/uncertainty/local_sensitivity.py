@@ -159,7 +159,7 @@ class _Outputs:
     """The outputs that hold data, and the standard deviations of their noise in their units."""
 
     def __init__(self, objective: Objective, flights: Sequence[str]) -> None:
-        self._flight = np.asarray(objective.segments.flight)
+        self._flight = objective.flight
         self._weight = {
             name: np.asarray(measured.weight)
             for name, measured in objective.segments.measured.items()
@@ -198,7 +198,7 @@ def _over_time(
     objective: Objective, jacobian: Jacobian, criterion: Criterion, moved: Array, flight: int
 ) -> tuple[Array, Array]:
     """Return the middles (B,) of a flight's stretches in s and the effects in them (K, B)."""
-    segments = np.flatnonzero(np.asarray(objective.segments.flight) == flight)
+    segments = np.flatnonzero(objective.flight == flight)
     begins, measured = objective.segments.begins, objective.segments.measured
     squares, counts = np.zeros((len(moved), BINS)), np.zeros(BINS)
     end = max(
