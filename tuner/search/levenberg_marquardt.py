@@ -11,8 +11,8 @@ kinks, where controllers' and motors' steps pass each other, of which a parabola
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -39,8 +39,7 @@ RIDGE = 1e-13
 """Added to the Hessian's diagonal, relative to its largest element: a singular one has a factor."""
 
 
-@dataclass(frozen=True)
-class Step:
+class Step(NamedTuple):
     """Where the solver stands after a step; with S starts, every array has S first.
 
     Attributes
@@ -49,12 +48,6 @@ class Step:
         The best point so far.
     tried
         The point to be tried next.
-    sums
-        The segments' sums at the point that was tried, gradient and Hessian included; None before.
-    best
-        Those at the best point.
-    loss
-        (S,) at the best point, per compared value.
     accepted
         (S,) whether the tried point was better.
     damping
@@ -64,23 +57,33 @@ class Step:
     predicted_reduction
         (S,) share of the loss at the best point by which its minimum would be lower, were the
         residuals linear: ½ gᵀH⁻¹g over the loss. Free of units and of damping.
-    quadratics
-        Of each start at its best point; empty before.
+    quadratic
+        About the best point; None before the first step.
+    best
+        The segments' sums there, gradient and Hessian included.
+    sums
+        Those at the point that was tried.
     ahead
-        The segments' sums at the point to be tried next, where that was flown already.
+        Those at the point to be tried next, where that was flown already.
     """
 
     point: Point
     tried: Point
-    sums: SegmentSums | None
-    best: SegmentSums | None
-    loss: Array
     accepted: NDArray[np.bool_]
     damping: Array
     still: NDArray[np.bool_]
     predicted_reduction: Array
-    quadratics: tuple[NormalEquations, ...] = ()
+    quadratic: NormalEquations | None = None
+    best: SegmentSums | None = None
+    sums: SegmentSums | None = None
     ahead: SegmentSums | None = None
+
+    @property
+    def loss(self) -> Array:
+        """(S,) at the best point, per compared value."""
+        if self.quadratic is None:
+            return np.full(len(self.damping), np.inf)
+        return np.asarray(self.quadratic.loss)
 
 
 def begin(points: Point, damping: Array | None = None, sums: SegmentSums | None = None) -> Step:
@@ -100,9 +103,6 @@ def begin(points: Point, damping: Array | None = None, sums: SegmentSums | None 
     return Step(
         point=points,
         tried=points,
-        sums=None,
-        best=None,
-        loss=np.full(starts, np.inf),
         accepted=np.ones(starts, bool),
         damping=np.ones(starts) if damping is None else np.asarray(damping, float),
         still=np.zeros(starts, bool),
@@ -128,74 +128,52 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
         (K + offsets·N,) one for what may move, zero for what stays; changes only at `begin`.
     """
     moves = np.flatnonzero(free)
-    flight, starts = objective.flight, range(len(before.loss))
+    each = [_of(before, start) for start in range(len(before.damping))]
 
     def quadratics(sums: SegmentSums) -> list[NormalEquations]:
         return [
             normal_equations(
-                objective.space, flight, _of(before.tried, start), criterion, _of(sums, start)
+                objective.space, objective.flight, one.tried, criterion, _of(sums, start)
             )
-            for start in starts
+            for start, one in enumerate(each)
         ]
 
-    sums, tried = before.ahead, None
+    sums, here = before.ahead, None
     unknown = 0 if criterion.states is None else len(criterion.states)
-    if before.quadratics and CHEAP * unknown <= len(objective.space):
+    if before.quadratic is not None and CHEAP * unknown <= len(objective.space):
         plain = sums_at(objective, before.tried, criterion, derivatives=False)
         found = quadratics(plain)
-        if not any(_tried(before, start, found[start].loss, moves)[0] for start in starts):
-            sums, tried = plain, found
+        if not any(_tried(one, at.loss, moves)[0] for one, at in zip(each, found, strict=True)):
+            sums, here = plain, found
     if sums is None:
         sums = sums_at(objective, before.tried, criterion)
-    tried = tried or quadratics(sums)
+    here = here or quadratics(sums)
     longest = FACTOR if objective.segments.windowed else FACTOR**3
-    steps = [_stepped(before, start, tried[start], moves, longest) for start in starts]
-    accepted = np.array([step.accepted for step in steps])
-    best = before.best
-
-    def kept(new: Any, old: Any) -> Any:
-        return np.where(accepted.reshape(-1, *[1] * (np.ndim(new) - 1)), new, old)
-
-    return Step(
-        point=jax.tree.map(kept, before.tried, before.point),
-        tried=jax.tree.map(lambda *leaves: np.stack(leaves), *[step.tried for step in steps]),
-        sums=sums,
-        best=sums if best is None else jax.tree.map(kept, sums, best),
-        loss=np.array([step.quadratic.loss for step in steps]),
-        accepted=accepted,
-        damping=np.array([step.damping for step in steps]),
-        still=np.array([step.still for step in steps]),
-        predicted_reduction=np.array([step.predicted_reduction for step in steps]),
-        quadratics=tuple(step.quadratic for step in steps),
-    )
-
-
-@dataclass(frozen=True)
-class _Stepped:
-    """What becomes of one start."""
-
-    accepted: bool
-    still: bool
-    damping: float
-    quadratic: NormalEquations
-    tried: Point
-    predicted_reduction: float
+    steps = [
+        _stepped(one, _of(sums, start), here[start], moves, longest)
+        for start, one in enumerate(each)
+    ]
+    step: Step = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
+    return step
 
 
 def _stepped(
-    before: Step, start: int, here: NormalEquations, moves: NDArray[np.intp], longest: float
-) -> _Stepped:
-    """Return what becomes of a start, given the quadratic at the point that was to be tried.
+    before: Step,
+    sums: SegmentSums,
+    here: NormalEquations,
+    moves: NDArray[np.intp],
+    longest: float,
+) -> Step:
+    """Return what becomes of one start, given sums and quadratic at the point to be tried.
 
     ``longest`` is by how much a rejected step is taken to have been too long at most.
     """
-    point, tried = _of(before.point, start), _of(before.tried, start)
-    damping, still, accepted = float(before.damping[start]), False, True
-    if before.quadratics:
-        last = before.quadratics[start]
-        change = (_packed(tried) - _packed(point))[moves]
+    tried, last = before.tried, before.quadratic
+    damping, still, accepted = float(before.damping), False, True
+    if last is not None:
+        change = (_packed(tried) - _packed(before.point))[moves]
         rise = here.loss - last.loss
-        accepted, predicted = _tried(before, start, here.loss, moves)
+        accepted, predicted = _tried(before, here.loss, moves)
         if not accepted:
             slope = -float(last.gradient[moves] @ change)
             too_long = 2.0 * (1.0 + rise / slope) if slope > 0.0 else FACTOR
@@ -205,25 +183,29 @@ def _stepped(
         at_rest = np.abs(change) < STILL * (1.0 + np.abs(_packed(tried)[moves]))
         still = accepted and bool(at_rest.all()) and abs(rise) < STILL * (1.0 + here.loss)
         here = here if accepted else last
-    base = tried if accepted else point
+    point = tried if accepted else before.point
     gradient, hessian = here.gradient[moves], here.hessian[np.ix_(moves, moves)]
-    following = _packed(base)
+    following = _packed(point)
     following[moves] -= _solved(hessian, gradient, damping)
     gain = 0.5 * gradient @ _solved(hessian, gradient, 0.0)
-    return _Stepped(
-        accepted,
-        still,
-        damping,
-        here,
-        _unpacked(following, base),
-        float(gain) / max(here.loss, 1e-300),
+    return Step(
+        point=point,
+        tried=_unpacked(following, point),
+        accepted=np.asarray(accepted),
+        damping=np.asarray(damping),
+        still=np.asarray(still),
+        predicted_reduction=np.asarray(float(gain) / max(here.loss, 1e-300)),
+        quadratic=here,
+        best=sums if accepted else before.best,
+        sums=sums,
     )
 
 
-def _tried(before: Step, start: int, loss: float, moves: NDArray[np.intp]) -> tuple[bool, float]:
-    """Return whether a start's point is accepted with a loss, and the rise that was predicted."""
-    last = before.quadratics[start]
-    change = (_packed(_of(before.tried, start)) - _packed(_of(before.point, start)))[moves]
+def _tried(before: Step, loss: float, moves: NDArray[np.intp]) -> tuple[bool, float]:
+    """Return whether one start's point is accepted with a loss, and the rise that was predicted."""
+    last = before.quadratic
+    assert last is not None, "what was tried has a point to be better than"
+    change = (_packed(before.tried) - _packed(before.point))[moves]
     predicted = last.gradient[moves] @ change
     predicted += 0.5 * change @ last.hessian[np.ix_(moves, moves)] @ change
     return bool(loss - last.loss <= ACCEPTED * predicted), float(predicted)

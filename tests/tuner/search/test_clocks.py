@@ -29,9 +29,7 @@ def stays(monkeypatch, late):
     monkeypatch.setattr(
         continuation, "normal_equations", lambda *_: (100.0, np.zeros(len(hessian)), hessian)
     )
-    objective = SimpleNamespace(
-        space=[None], flights=FLIGHTS, segments=SimpleNamespace(flight=np.arange(FLIGHTS))
-    )
+    objective = SimpleNamespace(space=[None], flights=FLIGHTS, flight=np.arange(FLIGHTS))
     offsets = np.zeros((1, kinds, FLIGHTS))
     offsets[0, POSE] = late
     offsets[0, -1] = 1.0  # a gyro's bias is no clock

@@ -41,8 +41,8 @@ def advanced(monkeypatch):
     )
 
     def steps(points, count, *, free=(1.0, 1.0), damping=None, unknown=0, windowed=False):
-        segments = SimpleNamespace(flight=np.zeros(1, int), windowed=windowed)
-        objective = SimpleNamespace(space=range(2), segments=segments)
+        segments = SimpleNamespace(windowed=windowed)
+        objective = SimpleNamespace(space=range(2), segments=segments, flight=np.zeros(1, int))
         criterion = SimpleNamespace(states=np.zeros((unknown, 1)) if unknown else None)
         found = [begin(Point(np.asarray(points), np.zeros((len(points), 0, 1))), damping)]
         for _ in range(count):
