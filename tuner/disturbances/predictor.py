@@ -57,6 +57,9 @@ SEGMENTS = 8
 NUMBERS = 65
 """Of a state and its disturbances that samples correct, with four commands on their way and those
 that a second lag and the tachometers' hold."""
+STRETCH, SURE = 2.0, 1.5
+"""s of the stretches by which likelihoods are compared, and by how many standard errors one has to
+gain: half as many as those by which the coefficient that gains it differs from neutral."""
 NOISIER = 1.05
 """Innovations of a channel over what they are assumed to be, from which it is noisier than that."""
 
@@ -230,6 +233,20 @@ class Predictor:
     def loss(self) -> float:
         """Half the sum of squares of the whitened innovations, those beyond the gate as at it."""
         return 0.5 * float(sum(np.sum(np.minimum(size, GATE) ** 2) for _, size in self._sizes()))
+
+    def is_likelier_than(self, other: Predictor) -> bool:
+        """Return whether its recordings are surely likelier than another's, which sees the same.
+
+        The gain of all stretches exceeds zero by more than it scatters from stretch to stretch
+        (Vuong, "Likelihood ratio tests for model selection and non-nested hypotheses",
+        Econometrica 57, 1989).
+        """
+        assert self.found is not None
+        assert other.found is not None
+        gain = np.asarray(other.found.loss) - np.asarray(self.found.loss)
+        length = round(STRETCH * float(self.schedule.log_rate))
+        sums = np.add.reduceat(gain, np.arange(0, len(gain), length), axis=0)
+        return bool(sums.sum() > SURE * np.sqrt(sums.size) * sums.std(ddof=1))
 
     @property
     def without_gains(self) -> Predictor:

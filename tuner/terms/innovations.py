@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tuner.disturbances.information import hidden
 from tuner.disturbances.predictor import Predictor
+from tuner.objective.information import begun
 from tuner.objective.space import Space
 from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
@@ -30,7 +31,7 @@ from tuner.terms.candidates import (
 from tuner.terms.doubt import SMALLEST, in_doubt
 from tuner.terms.held_out_score import vector_after
 from tuner.terms.linear import Columns, Linear, linear_of
-from tuner.terms.score import EARNING, surviving
+from tuner.terms.score import EARNING, score, surviving
 from tuner.terms.selection_state import Selected
 from tuner.vehicle import COEFFICIENTS, conditions
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
@@ -44,6 +45,8 @@ REFUSED = (
     SelectionCode.WORSE_AFTER_REFIT,
 )
 """Why least squares may have left out what innovations call for."""
+PERHAPS = 0.05
+"""Chance below which a secant lets a term be tried."""
 
 
 @dataclass(frozen=True)
@@ -140,19 +143,44 @@ class Innovations:
         large = [name for name in kept if size[self._columns(tried[name])].max() > SMALLEST]
         if set(large) == set(within):
             return None
-        return self._with(base, tried, large, self._change(model, tried, large))
+        moved = vector_after(self.space, self.vector, self._change(model, tried, large))
+        return self._with(base, tried, large, moved)
+
+    def with_lags(self) -> Selected | None:
+        """Return the terms with those, too, that begin away from their neutral values, from there.
+
+        No linear approximation judges them, it only tells which are worth a fit. None if none is.
+        """
+        base = self.selected.base
+        model = self._model(self.fitted.objective.space.names)
+        lags = {
+            row.group: row.names
+            for row in self.selected.rows
+            if not row.kept
+            and row.reason in REFUSED
+            and any(name in COEFFICIENTS and COEFFICIENTS[name].begin for name in row.names)
+            and self._chance(model, row.names) < PERHAPS
+        }
+        if base is None or not lags:
+            return None
+        return self._with(base, lags, lags, begun(self.space, self.vector, names_in(lags)))
+
+    def _chance(self, model: Columns, names: Sequence[str]) -> float:
+        """Return the probability of such innovations if a model did not lack a group."""
+        columns = self._columns(names)
+        found = score(self.linear, model, columns, candidates=1, no_gust=True, material=0.0)
+        return found.chance
 
     def _with(
-        self, base: tuple[Job, Fitted], tried: Groups, kept: Collection[str], change: Array
+        self, base: tuple[Job, Fitted], judged: Groups, kept: Collection[str], moved: Array
     ) -> Selected:
-        """Return the selection with some of the groups that were tried."""
+        """Return the selection with some of the groups that were judged, at a vector (P,)."""
         rows = [
-            _judged(row, kept=row.group in kept) if row.group in tried else row
+            _judged(row, kept=row.group in kept) if row.group in judged else row
             for row in self.selected.rows
         ]
         rows.sort(key=lambda row: not row.kept)
         groups = {row.group: row.names for row in rows if row.kept and row.reason in EARNING}
-        moved = vector_after(self.space, np.asarray(self.vector), change)
         vector = dict(zip(self.space.names, moved.tolist(), strict=True))
         said = findings_at(self.selected.job, self.selected.fitted)
         job, fitted = with_groups(base, groups, self.fitted, said=said, vector=vector)

@@ -82,7 +82,8 @@ def with_disturbances(
 
     None where the job does not ask for it, where the residuals hold no more than noise, where
     set-points were not recorded, where flights are too many or too long, where a filter loses them,
-    where nothing would be known better, and where the two fits contradict each other.
+    where nothing would be known better, and where the two fits contradict each other, unless the
+    simulated flights lack a lag that samples call for.
     """
     job, fitted = selected.job, selected.fitted
     asked = job.settings.job.disturbances
@@ -118,6 +119,8 @@ def with_disturbances(
     if not predictor.keeps_track:
         on_message(LACKS)
         return None
+    simulated = seen.selected
+    seen, there, predictor = _with_lags(seen, there, predictor, on_message)
     job = seen.selected.job
     offsets = free_offsets(job)
     again = polished(
@@ -138,22 +141,56 @@ def with_disturbances(
     examination = examine(
         again, otherwise=otherwise, predictor=predictor, in_doubt=seen.in_doubt(), lack=lack
     )
-    if any(is_stand_in(name) and name not in _kept(seen.selected) for name in had):
-        # what stood in for other terms made another model of it, which says nothing of this one
-        fitted = polished(
-            job,
-            again,
-            free=Free(np.ones(len(job.space), bool), offsets),
-            title="simulated",
-            on_progress=partial(on_progress, job),
-        )
-    otherwise = alternatives_of(fitted.objective, fitted.point)
-    before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt, lack=lack)
-    agree = _agree(examination.uncertainty, before.uncertainty)
-    if not agree:
-        on_message("It contradicts the fit of the simulated flights, which is kept.")
-    better = agree and _is_sharper(examination.uncertainty, before.uncertainty)
+    if seen.selected is not simulated:
+        # without a lag that samples surely call for simulated flights tell nothing of the others
+        better = True
+    else:
+        if any(is_stand_in(name) and name not in _kept(seen.selected) for name in had):
+            # what stood in for other terms made another model of it, which says nothing of this one
+            fitted = polished(
+                job,
+                again,
+                free=Free(np.ones(len(job.space), bool), offsets),
+                title="simulated",
+                on_progress=partial(on_progress, job),
+            )
+        otherwise = alternatives_of(fitted.objective, fitted.point)
+        before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt, lack=lack)
+        agree = _agree(examination.uncertainty, before.uncertainty)
+        if not agree:
+            on_message("It contradicts the fit of the simulated flights, which is kept.")
+        better = agree and _is_sharper(examination.uncertainty, before.uncertainty)
     return (seen.selected, again, examination) if better else None
+
+
+def _with_lags(
+    seen: Innovations,
+    there: Fitted,
+    predictor: Predictor,
+    on_message: Callable[[str], None],
+) -> tuple[Innovations, Fitted, Predictor]:
+    """Return the fit with what acts as a latency at its neutral value, if samples call for it.
+
+    There a fit has long made up for it, with other lags and stronger disturbances: what it is worth
+    is seen once all of these have followed. Terms are judged once more beside it.
+    """
+    with_lags = seen.with_lags()
+    if with_lags is None:
+        return seen, there, predictor
+    without, had = predictor.without_gains, _kept(seen.selected)
+    del predictor
+    fitted, beside = _descended(with_lags, with_lags.fitted, without)
+    if not (beside.keeps_track and beside.is_likelier_than(without)):
+        full = full_problem_of(there.objective, there.point)
+        point = Point(full.point.coefficients, without.feed.offsets)
+        return seen, there, without.at(full.objective, point)
+    on_message(_said(seen.selected, with_lags))
+    chosen, selected = Innovations.of(with_lags, fitted, beside).selection(had), with_lags
+    if chosen is not None:
+        on_message(_said(selected, chosen))
+        selected, fitted = chosen, chosen.fitted
+    fitted, beside = _descended(selected, fitted, beside.without_gains)
+    return Innovations.of(selected, fitted, beside), fitted, beside
 
 
 def _kept(selected: Selected) -> list[str]:

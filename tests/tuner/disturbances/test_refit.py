@@ -1,8 +1,13 @@
-"""A descent to least innovations takes steps that are numbers."""
+"""A descent to least innovations takes steps that are numbers; when another is surely better."""
+
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
+import pytest
 
 from tests.tuner.uncertainty.making import problem
+from tuner.disturbances.predictor import Predictor
 from tuner.disturbances.refit import _Equations
 
 
@@ -15,3 +20,31 @@ def test_no_step_is_taken_where_a_filter_has_lost_a_flight():
     assert _Equations(slope * np.nan, np.eye(count), free).step(fit.space, point) is None
     bend = np.where(np.eye(count) > 0.0, np.nan, 0.0)
     assert _Equations(slope, bend, free).step(fit.space, point) is None
+
+
+@pytest.mark.parametrize(
+    ("gain", "only_in", "likelier"),
+    [
+        (0.5, slice(None), True),
+        (-0.5, slice(None), False),
+        (0.0, slice(None), False),
+        (50.0, slice(200), False),
+    ],
+    ids=["everywhere", "less likely", "chance", "in one manoeuvre"],
+)
+def test_recordings_are_surely_likelier_if_most_of_them_are(gain, only_in, likelier):
+    rng = np.random.default_rng(0)
+    before = rng.normal(size=(1800, 3))
+    after = before + rng.normal(size=before.shape)
+    after[only_in, 0] -= gain
+    after[only_in, 1:] -= gain * (only_in == slice(None))
+    one, other = (
+        cast(
+            Any,
+            SimpleNamespace(
+                schedule=SimpleNamespace(log_rate=100), found=SimpleNamespace(loss=loss)
+            ),
+        )
+        for loss in (after, before)
+    )
+    assert Predictor.is_likelier_than(one, other) == likelier

@@ -115,9 +115,9 @@ def chosen(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(innovations, "findings_at", lambda *_: ())
 
     def choose(
-        innovation: Innovations, had: Sequence[str] = (), *, first: bool = False
+        innovation: Innovations, had: Sequence[str] = (), *, first: bool = False, lags: bool = False
     ) -> tuple[Selected, dict[str, Any]] | None:
-        selected = innovation.selection(had, first=first)
+        selected = innovation.with_lags() if lags else innovation.selection(had, first=first)
         return None if selected is None else (selected, found)
 
     return choose
@@ -218,6 +218,38 @@ def test_others_are_judged_as_if_what_stood_in_were_not_there(chosen) -> None:
 )
 def test_of_some_terms_innovations_do_not_judge(chosen, rows) -> None:
     assert chosen(seen(rows, {name: 0.5 for name in rows[0].names[:1] if not rows[0].kept})) is None
+
+
+def test_what_acts_as_another_where_it_is_neutral_is_put_in_where_it_does_not(chosen) -> None:
+    lag, drag = (
+        row("motor_lag", SelectionCode.IMMATERIAL),
+        row("fuselage_drag", SelectionCode.SIGNIFICANT, kept=True),
+    )
+    innovation = seen([lag, drag, INFLOW], {"time_constant_second": 0.1})
+    selected, found = chosen(innovation, lags=True)
+    assert set(found["groups"]) == {"motor_lag", "fuselage_drag"}
+    assert [r.group for r in selected.rows if r.kept] == ["motor_lag", "fuselage_drag"]
+    vector = np.array([found["vector"][name] for name in innovation.space.names])
+    numbers, before = map(innovation.space.numbers, (vector, innovation.vector))
+    assert float(numbers.pop("time_constant_second")) == pytest.approx(0.004)
+    assert numbers == {name: before[name] for name in numbers}
+
+
+@pytest.mark.parametrize(
+    "lag",
+    [
+        row("motor_lag", SelectionCode.SIGNIFICANT, kept=True),
+        row("motor_lag", SelectionCode.NO_INFORMATION),
+        DRAG,
+    ],
+    ids=["is in", "nothing tells it", "acts as nothing else"],
+)
+def test_nothing_else_is_put_in_unjudged(chosen, lag) -> None:
+    assert chosen(seen([lag], {lag.names[0]: 0.1}), lags=True) is None
+
+
+def test_what_chance_explains_is_not_worth_a_fit(chosen) -> None:
+    assert chosen(seen([row("motor_lag", SelectionCode.IMMATERIAL)], {}), lags=True) is None
 
 
 @pytest.mark.parametrize("alike", [True, False])

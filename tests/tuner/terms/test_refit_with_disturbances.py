@@ -152,9 +152,15 @@ def test_no_terms_are_chosen_by_innovations_of_a_filter_that_lost_a_flight(monke
     assert said[-1] == disturbances.LACKS
 
 
-@pytest.mark.parametrize(("group", "titles"), [("angular_drag", 2), ("fuselage_drag", 1)])
-def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, group, titles):
-    """What stood in for other terms made another model of it: it cannot contradict this one."""
+@pytest.mark.parametrize(
+    ("group", "titles", "lag"),
+    [("angular_drag", 2, False), ("fuselage_drag", 1, False), ("angular_drag", 1, True)],
+)
+def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, group, titles, lag):
+    """What stood in for other terms made another model of it: it cannot contradict this one.
+
+    Nor can one without a lag.
+    """
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
     predictor = SimpleNamespace(memory=0, is_lost=False, keeps_track=True, strengths=USUAL)
     predictor.without_gains = predictor
@@ -166,8 +172,13 @@ def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, g
 
     def seen(selected: Selected, *_: Any) -> Any:
         return SimpleNamespace(
-            selected=selected, selection=lambda *_, **__: next(chosen), in_doubt=dict
+            selected=selected,
+            selection=lambda *_, **__: next(chosen),
+            in_doubt=dict,
         )
+
+    def with_lags(found: Any, there: Fitted, own: Any, _: Any) -> Any:
+        return (seen(replace(found.selected)) if lag else found), there, own
 
     def polish(_: Job, fit: Fitted, *, title: str, **__: Any) -> Fitted:
         polished.append(title)
@@ -186,8 +197,52 @@ def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, g
     monkeypatch.setattr(disturbances, "alternatives_of", lambda *_: {})
     monkeypatch.setattr(disturbances, "lack_of", lambda *_: None)
     monkeypatch.setattr(disturbances, "examine", examine)
-    monkeypatch.setattr(disturbances, "_agree", lambda *_: True)
+    monkeypatch.setattr(disturbances, "_with_lags", with_lags)
+    monkeypatch.setattr(disturbances, "_agree", lambda *_: not lag)
     monkeypatch.setattr(disturbances, "_is_sharper", lambda *_: True)
     assert with_disturbances(begin, lambda *_: None, lambda _: None) is not None
     assert polished == ["clocks", "simulated"][:titles]
-    assert (examined[-1] is begin.fitted) == (titles == 1)
+    assert len(examined) == 2 - lag
+    assert (examined[-1] is begin.fitted) == (titles == 1 and not lag)
+
+
+@pytest.mark.parametrize(
+    ("likelier", "tracks", "called_for", "expected"),
+    [
+        (True, True, None, ["motor_lag"]),
+        (True, True, "drag", ["motor_lag", "drag"]),
+        (False, True, None, []),
+        (True, False, None, []),
+    ],
+    ids=["surely likelier", "others come with it", "by chance", "loses track"],
+)
+def test_what_no_derivative_tells_is_judged_by_a_fit_with_it(
+    monkeypatch, likelier, tracks, called_for, expected
+):
+    full = SimpleNamespace(objective=NOBODY, point=SimpleNamespace(coefficients=np.zeros(0)))
+    beside = SimpleNamespace(keeps_track=tracks, is_likelier_than=lambda _: likelier)
+    beside.without_gains = beside
+    without = SimpleNamespace(feed=SimpleNamespace(offsets=np.zeros((5, 1))))
+    without.without_gains = without
+    without.at = lambda *_: "as it was"
+    monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
+    monkeypatch.setattr(disturbances, "_descended", lambda _, there, __: (there, beside))
+    begin = Selected(NOBODY, fitted(2.0 * COLOURED))
+
+    def seen(selected: Selected, *_: Any) -> Any:
+        def grown(group: str | None) -> Selected | None:
+            row = SimpleNamespace(group=group, kept=True)
+            return replace(selected, rows=(*selected.rows, row)) if group else None
+
+        return SimpleNamespace(
+            selected=selected,
+            with_lags=lambda: grown("motor_lag"),
+            selection=lambda _: grown(called_for),
+        )
+
+    monkeypatch.setattr(disturbances.Innovations, "of", seen)
+    found, _, predictor = disturbances._with_lags(
+        seen(begin), begin.fitted, cast(Any, without), lambda _: None
+    )
+    assert [row.group for row in found.selected.rows] == expected
+    assert predictor == (beside if expected else "as it was")
