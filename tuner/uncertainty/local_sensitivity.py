@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.objective.batch import evaluate
+from tuner.objective.batch import Batch, evaluate
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
 from tuner.uncertainty.records import EffectOverTime, OutputSensitivity
@@ -84,60 +84,69 @@ def local_sensitivity(
     flights
         Names by number.
     """
-    space = objective.space
-    vector = np.asarray(point.coefficients)
-    slope = space.slope(vector)
-    outputs = _Outputs(objective, flights)
-    moved = SMALL_STEP * reference / slope
-    change = []
-    for channel, flight, axis in outputs.places:
-        segments = outputs.segments(flight)
-        columns = np.asarray(jacobian.columns[channel])[: len(space)][:, :, axis][..., segments]
-        mean = (columns**2).sum(axis=(1, 2)) / outputs.count(channel, axis, segments)
-        change.append(np.sqrt(mean) * moved * outputs.unit(channel, axis, segments))
+    space, vector = objective.space, np.asarray(point.coefficients)
+    moved = SMALL_STEP * reference / space.slope(vector)
     vectors, values = _steps(objective, vector, reference)
     batch = evaluate(objective, np.concatenate([vector[None], *vectors]), point, criterion)
-    rmse = outputs.rmse({name: np.asarray(s) for name, s in batch.squares.items()})
-    crashes = np.isfinite(np.asarray(batch.crash_time))
-    failed = np.array(
-        [
-            [crashes[s, outputs.segments(f)].any() for _, f, _ in outputs.places]
-            for s in range(len(rmse))
-        ]
+    effects = [
+        _over_time(objective, jacobian, criterion, moved, number) for number in range(len(flights))
+    ]
+    return LocalSensitivity(
+        steps=dict(zip(space.names, values.tolist(), strict=True)),
+        outputs=list(_outputs(objective, jacobian, batch, moved, flights)),
+        effects_over_time=[
+            EffectOverTime(
+                flight=flight,
+                windowed=objective.segments.count > len(flights),
+                time=time.round(3).tolist(),
+                change={n: row.tolist() for n, row in zip(space.names, effect, strict=True)},
+                span={
+                    n: shortest_half(time, row) for n, row in zip(space.names, effect, strict=True)
+                },
+            )
+            for flight, (time, effect) in zip(flights, effects, strict=True)
+        ],
     )
-    rmse = np.where(failed, np.nan, rmse)
-    names, count = space.names, len(space)
+
+
+def _outputs(
+    objective: Objective, jacobian: Jacobian, batch: Batch, moved: Array, flights: Sequence[str]
+) -> Iterator[OutputSensitivity]:
+    """Return the effects on every output that holds data.
+
+    ``moved`` (K,) is the change of the search vector for +1 %, ``batch`` what the vectors of
+    `_steps` give behind that of the point.
+    """
+    names, count = objective.space.names, len(objective.space)
 
     def by_name(column: Array) -> dict[str, Any]:
         return dict(zip(names, column.tolist(), strict=True))
 
-    return LocalSensitivity(
-        steps=by_name(values),
-        outputs=[
-            OutputSensitivity(
-                flight=flights[flight],
-                channel=channel,
-                axis=AXES[channel][0][axis],
-                unit=AXES[channel][1],
-                rmse=float(rmse[0, row]),
-                change=by_name(change[row]),
-                rmse_up=by_name(rmse[1 : 1 + count, row]),
-                rmse_down=by_name(rmse[1 + count :, row]),
-            )
-            for row, (channel, flight, axis) in enumerate(outputs.places)
-        ],
-        effects_over_time=[
-            EffectOverTime(
-                flight=flights[number],
-                windowed=objective.segments.count > len(flights),
-                time=time.round(3).tolist(),
-                change={name: row.tolist() for name, row in zip(names, effect, strict=True)},
-                span={n: shortest_half(time, row) for n, row in zip(names, effect, strict=True)},
-            )
-            for number in range(len(flights))
-            for time, effect in [_over_time(objective, jacobian, criterion, moved, number)]
-        ],
-    )
+    for number, flight in enumerate(flights):
+        segments = np.flatnonzero(objective.flight == number)
+        crashed = np.isfinite(batch.crash_time[:, segments]).any(axis=1)
+        for channel, measured in objective.segments.measured.items():
+            axes, unit, size = AXES[channel]
+            weights = np.moveaxis(np.asarray(measured.weight)[..., segments], 1, 0)
+            for axis, weight in enumerate(weights):
+                compared = int((weight > 0).sum())
+                if not compared:
+                    continue
+                sigma = float(1.0 / weight.max() / size)  # of the noise, in the output's unit
+                columns = np.asarray(jacobian.columns[channel])[:count, :, axis][..., segments]
+                change = np.sqrt((columns**2).sum(axis=(1, 2)) / compared) * moved * sigma
+                squares = batch.squares[channel][:, axis][:, segments].sum(axis=-1)
+                rmse = np.where(crashed, np.nan, np.sqrt(squares / compared) * sigma)
+                yield OutputSensitivity(
+                    flight=flight,
+                    channel=channel,
+                    axis=axes[axis],
+                    unit=unit,
+                    rmse=float(rmse[0]),
+                    change=by_name(change),
+                    rmse_up=by_name(rmse[1 : 1 + count]),
+                    rmse_down=by_name(rmse[1 + count :]),
+                )
 
 
 def _steps(objective: Objective, vector: Array, reference: Array) -> tuple[list[Array], Array]:
@@ -153,45 +162,6 @@ def _steps(objective: Objective, vector: Array, reference: Array) -> tuple[list[
         }
         vectors.append(np.where(np.eye(len(space), dtype=bool), space.vector_of(values), vector))
     return vectors, full
-
-
-class _Outputs:
-    """The outputs that hold data, and the standard deviations of their noise in their units."""
-
-    def __init__(self, objective: Objective, flights: Sequence[str]) -> None:
-        self._flight = objective.flight
-        self._weight = {
-            name: np.asarray(measured.weight)
-            for name, measured in objective.segments.measured.items()
-        }
-        self.places = [
-            (channel, flight, axis)
-            for flight in range(len(flights))
-            for channel, weight in self._weight.items()
-            for axis in range(weight.shape[1])
-            if (weight[:, axis][:, self.segments(flight)] > 0).any()
-        ]
-
-    def segments(self, flight: int) -> NDArray[np.intp]:
-        return np.flatnonzero(self._flight == flight)
-
-    def count(self, channel: str, axis: int, segments: NDArray[np.intp]) -> int:
-        return int((self._weight[channel][:, axis][:, segments] > 0).sum())
-
-    def unit(self, channel: str, axis: int, segments: NDArray[np.intp]) -> float:
-        """Return one standard deviation of the measurement in the output's unit."""
-        weight = self._weight[channel][:, axis][:, segments].max()
-        return float(1.0 / weight / AXES[channel][2])
-
-    def rmse(self, squares: dict[str, Array]) -> Array:
-        """Return (S, R) RMSE in the outputs' units from sums of squares (S, k, F)."""
-        columns = []
-        for channel, flight, axis in self.places:
-            segments = self.segments(flight)
-            mean = squares[channel][:, axis][:, segments].sum(axis=-1)
-            mean = mean / self.count(channel, axis, segments)
-            columns.append(np.sqrt(mean) * self.unit(channel, axis, segments))
-        return np.stack(columns, axis=-1)
 
 
 def _over_time(
