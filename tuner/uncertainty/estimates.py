@@ -21,7 +21,6 @@ from tuner.uncertainty.overdispersion import IndependentErrors, flights_apart
 from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict, judge
 from tuner.vehicle import COEFFICIENTS, scale_group, term_groups
-from tuner.vehicle.coefficient import Parameter
 
 Array = NDArray[np.float64]
 
@@ -128,14 +127,8 @@ def uncertainty_of(
 
 def at_rest(space: Space, point: Point, searched: Collection[str]) -> NDArray[np.bool_]:
     """Return which parameters (K,) no search moves: those not searched, and those at a bound."""
-    scaled = np.asarray(space.scaled(point.coefficients))
-    return np.array(
-        [
-            parameter.name not in searched or _bound(parameter, x) is not None
-            for parameter, x in zip(space.parameters, scaled, strict=True)
-        ],
-        bool,
-    )
+    bounds = zip(space.names, _bounds(space, np.asarray(point.coefficients)), strict=True)
+    return np.array([name not in searched or bound is not None for name, bound in bounds], bool)
 
 
 def uncertainty_at(
@@ -143,7 +136,7 @@ def uncertainty_at(
 ) -> Uncertainty:
     """Return how well the coefficients are known, from the information at a search vector (K,)."""
     scaled = space.scaled(vector)
-    reference = references(space, vector)
+    reference, bounds = references(space, vector), _bounds(space, vector)
     of_residuals = covariance_of(information)
     parts = parts_of(information, of_residuals.error, _lags(space, scaled))
     error = quoted(parts)
@@ -166,7 +159,7 @@ def uncertainty_at(
             correlation=correlation,
             channel=channel,
             flight=flight,
-            bound=_bound(parameter, scaled[index]),
+            bound=bounds[index],
         )
         judgement = judge(
             parameter.name,
@@ -200,8 +193,9 @@ def _estimates(
 ) -> dict[str, Estimate]:
     """Return the estimates of one parameter's coefficients: the first and those tied to it."""
     parameter, (verdict, reason), (scaled, error) = space.parameters[index], judgement, at
+    limits = parameter.scaled(parameter.lower), parameter.scaled(parameter.upper)
     low, high = (
-        space.from_scaled(index, float(np.clip(scaled + side * error, *_limits(parameter))))
+        space.from_scaled(index, float(np.clip(scaled + side * error, *limits)))
         for side in (-Z95, Z95)
     )
     value = space.from_scaled(index, scaled)
@@ -236,24 +230,16 @@ def _lags(space: Space, scaled: Array) -> Array:
 
 def references(space: Space, vector: Array) -> Array:
     """Return the change (K,) of each scaled coordinate that counts as one hundred percent."""
-    scaled = space.scaled(vector)
-    return np.array([_reference(p, x) for p, x in zip(space.parameters, scaled, strict=True)])
+    size = np.maximum(np.abs(space.scaled(vector)), [p.usual for p in space.parameters])
+    return np.where(space.is_log | (size == 0.0), 1.0, size)
 
 
-def _reference(parameter: Parameter, scaled: float) -> float:
-    if parameter.scale == "log":
-        return 1.0
-    return max(abs(scaled), parameter.usual) or 1.0
-
-
-def _limits(parameter: Parameter) -> tuple[float, float]:
-    return parameter.scaled(parameter.lower), parameter.scaled(parameter.upper)
-
-
-def _bound(parameter: Parameter, scaled: float) -> Literal["lower", "upper"] | None:
-    lower, upper = _limits(parameter)
-    share = (scaled - lower) / (upper - lower)
-    return "lower" if share < AT_BOUND else "upper" if share > 1 - AT_BOUND else None
+def _bounds(space: Space, vector: Array) -> list[Literal["lower", "upper"] | None]:
+    """Return the bound at which each parameter has ended, if it has."""
+    return [
+        "lower" if share < AT_BOUND else "upper" if share > 1 - AT_BOUND else None
+        for share in space.share(vector)
+    ]
 
 
 def _shares(information: FisherInformation, flights: int) -> tuple[Array, Array]:
