@@ -39,7 +39,7 @@ from tuner.objective.space import Space
 from tuner.search.continuation import grow
 from tuner.search.estimation import free_offsets
 from tuner.search.fitted import Fitted
-from tuner.search.job_flights import read_recordings
+from tuner.search.job_flights import read_usable
 from tuner.search.optimiser import Free
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import beginning, criterion_of, point_of
@@ -191,7 +191,7 @@ def reference_job() -> Job:
     """Return the reference flights' job: their plan, stamps and noise."""
     paths = [str(path) for path in sorted((ROOT / "reference_flights").glob("*.bag"))]
     settings = settle(Options(paths, config=str(ROOT / "reference_flights" / "tune.yaml")))
-    return job_of(settings, read_recordings(settings))
+    return job_of(settings, read_usable(settings)[0])
 
 
 @lru_cache(maxsize=2)

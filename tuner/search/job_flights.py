@@ -97,12 +97,12 @@ def as_logged(settings: Settings) -> tuple[Settings, tuple[Finding, ...]]:
     return changed, tuple(findings)
 
 
-def read_recordings(
-    settings: Settings, *, holdout: Sequence[str] | None = None
-) -> tuple[Recording, ...]:
-    """Read every mission of the settled files, and assign it what the job file says of it.
+def read_usable(
+    settings: Settings, *, holdout: Sequence[str] | None = None, fits: bool = True
+) -> tuple[tuple[Recording, ...], tuple[Finding, ...]]:
+    """Read every mission of the settled files that can be simulated, and name the others.
 
-    What cannot be used is left out (`read_usable` names it), if others are left.
+    Each is assigned what the job file says of it.
 
     Parameters
     ----------
@@ -110,26 +110,6 @@ def read_recordings(
         Of the job.
     holdout
         Names of the flights that are held out; None takes the job's.
-
-    Raises
-    ------
-    InputError
-        No file can be read, no flight holds what its inlet needs, a side-car names an
-        impossible trajectory, or a held-out flight does not exist.
-    """
-    recordings, _ = read_usable(settings, holdout=holdout)
-    return recordings
-
-
-def read_usable(
-    settings: Settings, *, holdout: Sequence[str] | None = None, fits: bool = True
-) -> tuple[tuple[Recording, ...], tuple[Finding, ...]]:
-    """Read every mission of the settled files that can be simulated, and name the others.
-
-    Parameters
-    ----------
-    settings, holdout
-        As of `read_recordings`.
     fits
         Whether one that is not held out has to be left.
 
@@ -143,7 +123,8 @@ def read_usable(
     Raises
     ------
     InputError
-        As `read_recordings`.
+        No file can be read, no flight holds what its inlet needs, a side-car names an
+        impossible trajectory, or a held-out flight does not exist.
     """
     job = settings.job
     flights: list[Flight] = []
@@ -213,7 +194,7 @@ def recordings_of(
     Parameters
     ----------
     settings, holdout
-        As of `read_recordings`.
+        As of `read_usable`.
     flights
         With a reference where one is named.
 

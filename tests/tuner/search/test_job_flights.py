@@ -10,7 +10,6 @@ from tuner.core.errors import InputError, RecordingError
 from tuner.findings.findings import sentence
 from tuner.search.job_flights import (
     Recording,
-    read_recordings,
     read_usable,
     recordings_of,
     with_offsets,
@@ -27,7 +26,7 @@ def settings():
 
 @pytest.fixture(scope="module")
 def flights(settings):
-    return [recording.flight for recording in read_recordings(settings)]
+    return [recording.flight for recording in read_usable(settings)[0]]
 
 
 def assigned(settings, recorded, **job):
@@ -36,11 +35,11 @@ def assigned(settings, recorded, **job):
 
 
 def test_the_shipped_job_holds_one_flight_out_and_estimates_the_clocks(settings):
-    spin, circle = read_recordings(settings)
+    spin, circle = read_usable(settings)[0]
     assert (spin.holdout, circle.holdout) == (False, True)
     assert {spin.inlet, circle.inlet} == {"reference"}
     assert spin.time_offset is circle.time_offset is None
-    assert not any(recording.holdout for recording in read_recordings(settings, holdout=()))
+    assert not any(recording.holdout for recording in read_usable(settings, holdout=())[0])
 
 
 def test_what_is_set_for_a_flight_wins_over_what_is_set_for_all(settings, flights):
@@ -65,7 +64,7 @@ def test_a_flight_that_is_held_out_must_feed_its_inlet_too(settings, flights):
     with pytest.raises(RecordingError, match=CIRCLE):
         recordings_of(settings, bare[1:])
     with pytest.raises(InputError, match="there is no flight 'circle_4mps-2'; did you mean"):
-        read_recordings(replace(settings, job=settings.job.replace(holdout=("circle_4mps-2",))))
+        read_usable(replace(settings, job=settings.job.replace(holdout=("circle_4mps-2",))))[0]
 
 
 def test_recordings_of_which_no_flight_can_be_made_are_left_out_by_name(tmp_path):

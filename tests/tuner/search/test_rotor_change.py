@@ -10,7 +10,7 @@ from tuner.config import Options, settle
 from tuner.findings.findings import Code
 from tuner.job.run import prepared
 from tuner.recordings.flight import Series
-from tuner.search.job_flights import read_recordings
+from tuner.search.job_flights import read_usable
 from tuner.search.rotor_change import WINDOW, change_of, used_up_to_changes
 
 ROOT = Path(__file__).parents[3]
@@ -21,7 +21,7 @@ BROKEN = 20.0
 def flown():
     paths = sorted(str(path) for path in (ROOT / "reference_flights").glob("*.bag"))
     settings = settle(Options(paths, config=str(ROOT / "reference_flights" / "tune.yaml")))
-    return settings, read_recordings(settings)
+    return settings, read_usable(settings)[0]
 
 
 def weakened(flight, vehicle, share, *, rotor=0, seconds=BROKEN):
