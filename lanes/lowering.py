@@ -20,7 +20,17 @@ from llvmlite import ir
 
 from lanes.dependence import CALLS, called
 from lanes.machine import register_bytes
-from lanes.rules import BOOL, ELEMENTWISE, Emitter, constant, converted, mangled, type_of
+from lanes.rules import (
+    BOOL,
+    CONTRACT,
+    ELEMENTWISE,
+    LINEAR,
+    Emitter,
+    constant,
+    converted,
+    mangled,
+    type_of,
+)
 from lanes.values import (
     Deferred,
     Element,
@@ -193,10 +203,13 @@ class Lowering:
         """Apply a rule to elements, column by column where one is a tangent."""
         rule = ELEMENTWISE[name]
         if any(isinstance(x, tuple) for x in elements):
-            return tuple(
+            self.e.flags = LINEAR
+            found = tuple(
                 self.apply(name, params, *(x[k] if isinstance(x, tuple) else x for x in elements))
                 for k in range(self.columns)
             )
+            self.e.flags = CONTRACT
+            return found
         return rule(self.e, params, *self._alike(name, elements))
 
     def _alike(self, name: str, elements: Sequence[ir.Value]) -> tuple[ir.Value, ...]:

@@ -20,8 +20,10 @@ Parameters: TypeAlias = Mapping[str, Any]
 Rule: TypeAlias = Callable[..., ir.Value]
 
 CONTRACT = ("contract",)
-"""A product may be fused with a sum. Nothing else of fast-math is safe: without NaN and infinity
-the test for a crash is folded away."""
+"""A product may be fused with a sum. Nothing else of fast-math is safe for values: in another order
+what cancels cancels no more, and without NaN and infinity the test for a crash is folded away."""
+LINEAR = ("contract", "reassoc", "nsz")
+"""Of derivatives, which are products and sums of others: these may be factored and reordered."""
 
 BOOL, I32, I64 = (ir.IntType(bits) for bits in (1, 32, 64))
 TYPES: Mapping[np.dtype[Any], ir.Type] = {
@@ -79,6 +81,8 @@ class Emitter:
     def __init__(self, module: ir.Module, width: int) -> None:
         self.module, self.width = module, width
         self.b = ir.IRBuilder()
+        self.flags = CONTRACT
+        """What may be done to sums, products and quotients."""
         self._splats: dict[tuple[ir.Block, ir.Value], ir.Value] = {}
 
     def vector(self, kind: ir.Type) -> ir.VectorType:
@@ -175,7 +179,7 @@ def mangled(kind: ir.Type) -> str:
 def _arithmetic(of_floats: str, of_integers: str) -> Rule:
     def rule(e: Emitter, _: Parameters, x: ir.Value, y: ir.Value) -> ir.Value:
         if is_float(x):
-            return getattr(e.b, of_floats)(x, y, flags=CONTRACT)
+            return getattr(e.b, of_floats)(x, y, flags=e.flags)
         return getattr(e.b, of_integers)(x, y)
 
     return rule
