@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import pairwise
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lanes import Argument, Program
 from sim_jax.rigid_body import Motion, angular_acceleration
+from sim_jax.terms import total
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from tuner.equation_error.measured import Measured
+from tuner.objective.flown import CODE
 from tuner.recordings.flight import Array
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model, with_coefficients
 
 NUDGE = 1e-3
-"""Change of a scaled coordinate over its usual size, and of a rotor's speed over itself, by which
-accelerations are differentiated: they are linear in most."""
+"""Change of a rotor's speed over itself by which accelerations are differentiated."""
 ROTORS = 4
 EVERY = 5
 """Steps of which one tells how the noise of rotor speeds moves what is computed."""
@@ -104,15 +107,15 @@ class Accelerations:
         self, point: Array, faster: Array, steps: tuple[Motion, Array, Array]
     ) -> tuple[Array, Array]:
         """Return accelerations (M, 6) and columns (M, 6, K) with rotors (4,) faster by a share."""
-        nudge = NUDGE * np.array([p.usual or 1.0 for p in self.parameters])
-        points = np.stack([point, *(point + np.diag(nudge)), *(point - np.diag(nudge))])
-        names = tuple(name for p in self.parameters for name in p.ratios)
-        numbers = np.stack([list(values_at(self.parameters, there).values()) for there in points])
         motion, speed, acceleration = steps
-        there = motion, speed * (1.0 + faster), acceleration
-        made = np.asarray(_accelerations(self.model, names, numbers, there))
-        above, below = np.split(made[1:], 2)
-        return made[0], np.moveaxis((above - below) / (2.0 * nudge)[:, None, None], 0, -1)
+        numbers, directions = _numbers(self.parameters, point)
+        given = (
+            jax.tree.map(np.asarray, self.model),
+            numbers,
+            (motion, (speed * (1.0 + faster)).T, acceleration.T),
+        )
+        run = _program_for(given)(given, directions, lanes=len(speed))
+        return run.values, run.columns if directions else np.zeros((*run.values.shape, 0))
 
 
 def _joined(flights: Sequence[Measured], every: int) -> tuple[Motion, Array, Array]:
@@ -140,34 +143,45 @@ def values_at(parameters: Sequence[Parameter], point: Array) -> dict[str, float]
     }
 
 
-@eqx.filter_jit
-def _accelerations(
-    model: Model,
-    names: tuple[str, ...],
-    numbers: Array,
-    steps: tuple[Motion, Array, Array],
-) -> jax.Array:
-    """Return (B, M, 6) specific force and angular acceleration, body axes, at B sets of values.
+def _numbers(parameters: Sequence[Parameter], point: Array) -> tuple[dict[str, Array], list[Array]]:
+    """Return coefficient -> value at a point (K,), and the derivatives (K,), sorted by name."""
+    values, slopes = values_at(parameters, point), dict[str, Array]()
+    for number, parameter in enumerate(parameters):
+        for name, ratio in parameter.ratios.items():
+            slope = values[name] if parameter.scale == "log" else ratio
+            slopes[name] = slope * np.eye(len(parameters))[number]
+    names = sorted(values)
+    return {name: np.asarray(values[name]) for name in names}, [slopes[name] for name in names]
 
-    Parameters
-    ----------
-    model
-        Holds the coefficients that are not named.
-    names, numbers
-        Coefficients, and their values (B, names).
-    steps
-        Motion, leaves (M,), and rotor speeds and their change, (M, 4).
-    """
-    motion = steps[0]
-    speeds, changes = (tuple(map(jnp.asarray, part.T)) for part in steps[1:])
 
-    def made(row: jax.Array) -> jax.Array:
-        vehicle = with_coefficients(model, dict(zip(names, row, strict=True))).vehicle
-        air = Air.around(vehicle, motion, rotor_acceleration=changes)
-        acting = total_wrench(vehicle, motion, speeds, air)
-        turning = angular_acceleration(vehicle.body, motion.body_rate, acting.moment)
-        pull = acting.force * (1.0 / vehicle.body.mass)
-        return jnp.concatenate([pull.stacked(), turning.stacked()]).T
+def _program_for(given: Any) -> Program:
+    model, numbers, steps = given
+    arguments = (
+        jax.tree.map(lambda leaf: Argument(np.shape(leaf), leaf.dtype, lanes=False), model),
+        {name: Argument((), float, lanes=False, moves=True) for name in numbers},
+        jax.tree.map(lambda leaf: Argument(np.shape(leaf)[:-1], float, lanes=True), steps),
+    )
+    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
+    return _program(tuple(leaves), structure)
 
-    found: jax.Array = jax.vmap(made)(jnp.asarray(numbers))
-    return found
+
+@lru_cache(maxsize=16)
+def _program(leaves: tuple[Argument, ...], structure: Any) -> Program:
+    return Program(
+        _accelerations,
+        jax.tree.unflatten(structure, leaves),
+        name="accelerations",
+        made_of=total.TERMS,
+        packages=CODE,
+    )
+
+
+def _accelerations(given: Any, _: Mapping[str, int]) -> jax.Array:
+    """Return specific force and angular acceleration (6,), body axes, at one step."""
+    model, numbers, (motion, speeds, changes) = given
+    vehicle = with_coefficients(model, numbers).vehicle
+    air = Air.around(vehicle, motion, rotor_acceleration=tuple(changes))
+    acting = total_wrench(vehicle, motion, tuple(speeds), air)
+    turning = angular_acceleration(vehicle.body, motion.body_rate, acting.moment)
+    pull = acting.force * (1.0 / vehicle.body.mass)
+    return jnp.concatenate([pull.stacked(), turning.stacked()])

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 
-import equinox as eqx
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from lanes import Argument, Program
 from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.trajectory import TICK_RATE, publish, shapes
+from sim_jax.numeric import Array, Scalar
+from sim_jax.trajectory import TICK_RATE, Shape, publish, shapes
 from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
+from tuner.objective.flown import CODE
 from tuner.recordings.flight import Flight
 
 
@@ -68,22 +72,32 @@ def published(settings: TrajectorySettings, *, duration: float, control_rate: fl
         radius=np.asarray(settings.radius), omega=np.asarray(settings.omega)
     )
     ticks = math.ceil(duration * TICK_RATE) + 1
-    pace = np.asarray(settings.speed_scale)
-    sent = eqx.filter_jit(publish)(shape, ticks=ticks, velocity_scaler=pace)
+    given = jax.tree.map(lambda number: np.reshape(number, 1), (shape, settings.speed_scale))
+    *axes, lap = _publisher(type(shape))(given, lanes=1, turns=ticks).values
     count = math.ceil(duration * control_rate) + 1
     seen = np.minimum(np.floor(np.arange(count) * TICK_RATE / control_rate + 1e-9), ticks - 1)
     rows = seen.astype(int)
-    points: ReferencePoint = jax.tree.map(  # numpy's indexing, for jax's takes a program each
-        lambda leaf: np.asarray(np.asarray(leaf)[rows]), sent.points
-    )
+    seen_axes = [axis[0, rows] for axis in axes]
+    points = ReferencePoint(*(Vec3(*seen_axes[first : first + 3]) for first in (0, 3, 6)))
     return Published(
         ReferenceInlet(
             points,
             spins=np.asarray(shape.spins),
             yaw_rate=np.asarray(settings.yaw_rate if shape.spins else 0.0),
         ),
-        np.asarray(sent.lap)[rows],
+        lap[0, rows],
     )
+
+
+@cache
+def _publisher(shape: type[Shape]) -> Program:
+    def sent(given: tuple[Shape, Scalar], lengths: Mapping[str, int]) -> list[Array]:
+        publication = publish(given[0], ticks=lengths["turns"], velocity_scaler=given[1])
+        return [*jax.tree.leaves(publication.points), publication.lap]
+
+    number = Argument((), float, lanes=True)
+    arguments = jax.tree.map(lambda _: number, (shape(), 1.0))
+    return Program(sent, arguments, name=shape.name, made_of=shape, packages=CODE)
 
 
 def with_named_reference(flight: Flight, settings: TrajectorySettings) -> Flight:
