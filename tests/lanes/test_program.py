@@ -39,7 +39,7 @@ def filtered(given, lengths):
         state = lax.cond(state[0] > 1.0, lambda: state - 1.0, lambda: state)
         return (state, line), {"state": state, "twice": state[0] * 2.0, "high": state[1] > 0.0}
 
-    (state, _), rows = lax.scan(turn, (x, jnp.zeros((4, 3))), jnp.arange(lengths["turns"]))
+    (state, _), rows = lax.scan(turn, (x, jnp.zeros((4, 3), x.dtype)), jnp.arange(lengths["turns"]))
     return rows, state
 
 
@@ -86,17 +86,25 @@ def test_one_program_serves_every_length_and_every_number_of_lanes(program, coun
         np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13)
 
 
-def test_many_lanes_in_wider_blocks_give_what_few_do():
-    still = {name: replace(argument, moves=False) for name, argument in ARGUMENTS.items()}
+@pytest.mark.parametrize(("real", "turns"), [(float, 9), (np.float32, 37)])
+def test_many_lanes_in_wider_blocks_give_what_few_do(real, turns):
+    still = {name: replace(a, moves=False, dtype=real) for name, a in ARGUMENTS.items()}
     program, count = Program(filtered, still), lanes.program.MANY + 3
-    values, _ = given(count, 9)
+    values, _ = given(count, turns)
     few = {name: v if name == "gain" else v[..., -5:] for name, v in values.items()}
-    wide, narrow = program(values, lanes=count, turns=9), program(few, lanes=5, turns=9)
+    wide, narrow = program(values, lanes=count, turns=turns), program(few, lanes=5, turns=turns)
     assert len({kernel.width for kernel in program._kernels.values()}) == 2
     for many, some in zip(
         jax.tree.leaves(wide.values), jax.tree.leaves(narrow.values), strict=True
     ):
         np.testing.assert_allclose(many[-5:], some, rtol=1e-14)
+
+
+def test_values_beside_derivatives_are_summed_up_in_the_order_that_is_written():
+    program = Program(lambda x, _: (x + 1e16) - 1e16, Argument((), float, lanes=True, moves=True))
+    run = program(np.array([0.3, 3.0]), [np.ones(1)], lanes=2)
+    np.testing.assert_array_equal(run.values, [0.0, 4.0])
+    np.testing.assert_array_equal(run.columns, [[1.0], [1.0]])
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 9])
