@@ -483,12 +483,18 @@ class Lowering:
         return [self.b.gep(pointer, [self.b.load(place)]) for place in places]
 
     def _lay(self, vectors: list[ir.Value], lanes: Sequence[ir.Value], place: ir.Value) -> None:
-        """Write numbers, a power of two of them, side by side in each lane's part."""
+        """Write numbers, a power of two of them, side by side in each lane's part.
+
+        Where as many follow, their memory is asked for.
+        """
         count, turned = len(vectors), self._transposed(vectors)
         for number, lane in enumerate(lanes):
             row = self._some_lanes(turned[number % count], number - number % count, count)
-            pointer = self.b.bitcast(self.b.gep(lane, [place]), row.type.as_pointer())
+            begin = self.b.gep(lane, [place])
+            pointer = self.b.bitcast(begin, row.type.as_pointer())
             self.b.store(row, pointer).align = _bytes(base(row.type))
+            if count > 1:
+                self.e.fetch(self.b.gep(begin, [constant(I64, 2 * count - 1)]))
 
     def rows_of(self, memory: Memory) -> Memory | None:
         """Return memory for some rows of an output, to be laid at once; None for one at a time.

@@ -81,7 +81,7 @@ class Emitter:
     def __init__(self, module: ir.Module, width: int) -> None:
         self.module, self.width = module, width
         self.b = ir.IRBuilder()
-        self.flags = CONTRACT
+        self.flags: tuple[str, ...] = CONTRACT
         """What may be done to sums, products and quotients."""
         self._splats: dict[tuple[ir.Block, ir.Value], ir.Value] = {}
 
@@ -117,6 +117,14 @@ class Emitter:
         function = self.declared(full, ir.FunctionType(kind, [o.type for o in operands]))
         fast = CONTRACT if is_float(operands[0]) else ()
         return self.b.call(function, operands, fastmath=fast)
+
+    def fetch(self, pointer: ir.Value) -> None:
+        """Ask for the memory at an address, which will be written to and need not exist."""
+        whole, byte = ir.IntType(32), ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [byte, whole, whole, whole])
+        how = (constant(whole, n) for n in (1, 3, 1))  # to write, into the nearest cache, data
+        function = self.declared("llvm.prefetch.p0", kind)
+        self.b.call(function, [self.b.bitcast(pointer, byte), *how])
 
     def declared(self, name: str, kind: ir.FunctionType) -> ir.Function:
         """Return a function of a name, declared once."""
