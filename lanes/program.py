@@ -422,7 +422,7 @@ class _Compiled:
             )
 
         pieces = min(blocks, TASKS_A_CORE * _cores()) if lengths["turns"] or blocks > FEW else 1
-        bounds = np.linspace(0, blocks, pieces + 1).astype(int).tolist()
+        bounds = [blocks * number // pieces for number in range(pieces + 1)]
         tasks = list(pairwise(bounds))
         if len(tasks) == 1:
             work(tasks[0])
