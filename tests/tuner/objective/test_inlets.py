@@ -1,5 +1,6 @@
 """Every inlet of the simulator has one class that feeds it, and every table names the same ones."""
 
+from dataclasses import replace
 from typing import get_args
 
 import pytest
@@ -12,6 +13,7 @@ from tuner.objective.initial_conditions import STATES
 from tuner.objective.inlets import INLETS
 from tuner.recordings.inspector import inlets
 from tuner.search.inlet_choice import inlet_for
+from tuner.vehicle import COEFFICIENTS, REGISTRY
 
 
 def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():
@@ -32,6 +34,16 @@ def test_what_an_inlet_silences_and_ignores_exists(inlet, flight):
     assert set(inlet.silences) <= set(CHANNELS)
     assert set(inlet.ignores) <= set(STATES)
     assert inlet.can_be_fed(flight) == all(flight.has(signal) for signal in inlet.needs)
+
+
+@pytest.mark.parametrize(
+    ("part", "without"),
+    [("motors", {"rotor_speed"}), ("turning", {"attitude"}), ("", set())],
+)
+def test_a_coefficients_row_says_which_inlets_say_nothing_of_it(part, without, monkeypatch):
+    row = replace(COEFFICIENTS["mass"], name="gadget", part=part)
+    monkeypatch.setitem(REGISTRY, "gadget", row)
+    assert {name for name, inlet in INLETS.items() if "gadget" in inlet.bypasses} == without
 
 
 def test_an_inlet_that_a_recording_cannot_feed_names_what_is_missing(flight):
