@@ -172,7 +172,6 @@ class _Group:
                 flights,
                 noise=dict.fromkeys(POSE, 1.0),
                 schedule=self._schedule,
-                free_starts=True,  # as fits have them: one program serves both
             )
             longest = max(flight.duration for flight in flights)
             self._samples, self._limits = math.ceil(longest * rate) + 2, limits_of(flights)

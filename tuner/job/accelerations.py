@@ -60,7 +60,7 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
 
 
 def _candidates(job: Job) -> Groups:
-    groups = dict(candidate_groups(job.settings.vehicle, job.space, job.settings.job))
+    groups = dict(candidate_groups(job))
     if INFLOW not in (*job.space.free, *job.settings.job.fixed):
         groups[INFLOW] = (INFLOW,)
     return groups

@@ -121,9 +121,10 @@ def segments_of(
     noise: Mapping[str, float],
     schedule: Schedule,
     weights: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
-    free_starts: bool = False,
 ) -> Segments:
     """Lay whole flights side by side for the ``reference`` inlet.
+
+    What a spin does not forget is free at its start: see `freedom_of_spin`.
 
     Parameters
     ----------
@@ -135,8 +136,6 @@ def segments_of(
         On whose control ticks the battery's voltage is laid out.
     weights
         Flight name -> channel -> factor on the residuals.
-    free_starts
-        Whether what a spin does not forget is free at its start: see `freedom_of_spin`.
 
     Raises
     ------
@@ -156,7 +155,7 @@ def segments_of(
     inlet = INLETS["reference"].lay(flights, schedule)
     assert isinstance(inlet, ReferenceInlet)
     freed = {}
-    if free_starts and bool(np.any(inlet.spins)):
+    if bool(np.any(inlet.spins)):
         rate = np.where(inlet.spins, inlet.yaw_rate, 0.0)
         known = noise.get("position", 0.0)  # where no position is compared, none is corrected
         begun = [position_error(flight.series, known) for flight in flights]

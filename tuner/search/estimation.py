@@ -29,7 +29,6 @@ from tuner.search.optimiser import Free
 from tuner.search.problem import Job
 from tuner.search.progress import Progress, beginning, criterion_of, point_of
 from tuner.search.stages import Stage, left, plan
-from tuner.vehicle.coefficient import Parameter
 
 
 def fingerprint(job: Job) -> str:
@@ -344,11 +343,7 @@ def starting_vectors(job: Job) -> NDArray[np.float64]:
     generator = np.random.default_rng(settings.seed)
     first = space.initial
     centre, width = space.share(first), space.width
-    reach = np.array([_reach(p, settings.spread) for p in space.parameters]) / width
+    reach = np.where(space.is_log, np.log(settings.spread), space.prior_sd) / width
     drawn = generator.uniform(-1.0, 1.0, (settings.starts - 1, len(space)))
     shares = np.clip(centre + drawn * reach, INSIDE, 1.0 - INSIDE)
     return np.vstack([first, space.at_share(shares)])
-
-
-def _reach(parameter: Parameter, spread: float) -> float:
-    return float(np.log(spread)) if parameter.scale == "log" else parameter.prior_sd

@@ -212,7 +212,6 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
             noise=noise,
             weights=_weights(settings, fitted, whole=True),
             schedule=schedule,
-            free_starts=True,
         )
         objective = problem(whole, longest, limits_of(fitted))
         return Job(settings, recordings, noise, space, objective, windows)

@@ -17,7 +17,7 @@ from tuner.search.fitted import Fitted
 from tuner.search.loop import loop_of, with_loop
 from tuner.search.problem import Job
 from tuner.terms.selection_state import offsets_of
-from tuner.vehicle import COEFFICIENTS, VehicleFile, conditions, term_groups, values_of
+from tuner.vehicle import COEFFICIENTS, conditions, term_groups, values_of
 from tuner.vehicle.selection_table import Groups
 
 PRESENT = 0.5
@@ -26,10 +26,10 @@ STANDS_IN = 0.1
 """That it has what one group describes as a whole and others, candidates beside it, one by one."""
 
 
-def candidate_groups(vehicle: VehicleFile, space: Space, job: JobFile) -> Groups:
+def candidate_groups(job: Job) -> Groups:
     """Return the groups that may be added: no coefficient of theirs is given, free or fixed."""
-    given, groups = values_of(vehicle), term_groups()
-    taken = {*space.free, *job.fixed}
+    given, groups = values_of(job.settings.vehicle), term_groups()
+    taken = {*job.space.free, *job.settings.job.fixed}
     return {
         group: names
         for group, names in groups.items()

@@ -48,7 +48,7 @@ def with_first_terms(job: Job) -> Job:
     if not isinstance(settings.terms, str):
         groups = groups_named(settings.terms, job.space)
     elif settings.terms == "auto" and settings.free is None and _tilted(job, tilt):
-        candidates = candidate_groups(job.settings.vehicle, job.space, settings)
+        candidates = candidate_groups(job)
         groups = {name: candidates[name] for name in MARKERS if name in candidates}
     else:
         groups = {}
@@ -163,6 +163,6 @@ def candidates_of(job: Job) -> Groups:
         return {}
     closed = all(INLETS[inlet].closed_loop for inlet in job.inlets)
     return {
-        **candidate_groups(job.settings.vehicle, job.space, settings),
+        **candidate_groups(job),
         **groups_around(job.objective, closed_loop=closed),
     }

@@ -132,10 +132,8 @@ def test_a_spin_leaves_a_tick_of_its_integrator_and_where_it_began_open_and_noth
 def test_where_a_spin_began_is_not_asked_of_a_fit_that_compares_no_positions():
     spin = load_flight(ROOT / "reference_flights" / "yaw_spin_3rps.bag")
     noise = {"attitude": 1e-3, "body_rate": 0.01}
-    blind = segments_of([spin], noise=noise, schedule=Schedule(), free_starts=True)
-    seeing = segments_of(
-        [spin], noise={"position": 5e-4, **noise}, schedule=Schedule(), free_starts=True
-    )
+    blind = segments_of([spin], noise=noise, schedule=Schedule())
+    seeing = segments_of([spin], noise={"position": 5e-4, **noise}, schedule=Schedule())
     assert blind.freed == seeing.freed
     assert blind.freed[-1] == YAW
     np.testing.assert_array_equal(blind.freedom[:-1], 0.0)
