@@ -145,7 +145,7 @@ def _shortly_delayed(schedule: Schedule, expected: Expected) -> tuple[Schedule, 
     """
     if schedule.longest_actuator_latency == 0.0:
         return schedule, 0
-    latency = float(expected.tunable.at(expected.coefficients).vehicle.setup.actuator_latency)
+    latency = float(expected.tunable.values(expected.coefficients)["actuator_latency"])
     count = max(int(np.ceil(latency / schedule.step - 1e-9)), 1)
     return replace(schedule, longest_actuator_latency=count * schedule.step), count
 

@@ -170,8 +170,8 @@ class Predictor:
             here, self._beside(objective, point, steps, some), steps
         )
         ticks = np.zeros((len(moved), *whole.shape))
-        ticks[:, :some] = moved
-        return Slopes(slope / share, information / share, ticks / share)
+        np.divide(moved, share, out=ticks[:, :some])
+        return Slopes(slope / share, information / share, ticks)
 
     def _beside(
         self, objective: Objective, point: Point, steps: Array, ticks: int
@@ -197,15 +197,16 @@ class Predictor:
                 segments = slice(number * count, (number + 1) * count)
                 yield likelihood_of(found, ticks, segments)
 
-    def as_noisy(self, objective: Objective, point: Point) -> Predictor:
-        """Return the predictor whose samples are as noisy as the innovations, or itself."""
+    @property
+    def noise_seen(self) -> dict[str, float]:
+        """The factors on the samples' standard deviations with which innovations are white."""
         noise = dict(self.noise)
         for name, white in self._sizes():
             if name == "command":
                 continue  # how noisy it is is learnt
             spread = noise[name] * float(robust_sd(white)) if len(white) else 1.0
             noise[name] = spread if spread > NOISIER else 1.0
-        return self if noise == self.noise else replace(self, noise=noise).at(objective, point)
+        return noise
 
     @property
     def keeps_track(self) -> bool:
@@ -323,7 +324,10 @@ class Predictor:
             self.jacobian(objective, own, [*moved, *offsets]),
             objective.space,
             own,
-            lambda there: dict[str, Any](self.jacobian(objective, there, []).residuals),
+            # by one offset, too: one program serves both
+            lambda there: dict[str, Any](
+                self.jacobian(objective, there, [len(objective.space)]).residuals
+            ),
         )
         changed = {
             name: dict[str, Any](self._stepped(other).jacobian(other, own, []).residuals)

@@ -7,7 +7,9 @@ coefficients are biased in turn. Learnt one after the other they approach each o
 
 Innovations are differentiated with gains that stay: at the likeliest point the gains' own
 derivatives are met by innovations that nothing of the past explains. How likely a step's end is,
-the filter says with gains of its own.
+the filter says with gains of its own. Close to the estimate the two differ by as much as a step
+gains; there one more step of the equations is as good as any (Le Cam's one-step estimate; van der
+Vaart, "Asymptotic statistics", 1998, 5.7).
 """
 
 from __future__ import annotations
@@ -46,6 +48,8 @@ ASIDE = 0.25
 are met by the straight line through the two ticks that they were laid between."""
 ENOUGH = 0.1
 """Predicted gain of a step, in half a unit of χ², below which it is not worth taking."""
+NEAR, SETTLED = 1.0, 0.3
+"""Likewise, below which it is taken as it is, and below which it is the last."""
 
 
 def with_least_innovations(
@@ -71,21 +75,29 @@ def with_least_innovations(
     objective, point, criterion = problem
     criterion = unscaled(criterion)
     point = Point(point.coefficients, predictor.feed.offsets)
-    laid, rate = point.offsets, float(objective.schedule.log_rate)
+    laid, rate, gain = point.offsets, float(objective.schedule.log_rate), np.inf
     predictor = predictor.at(objective, point)
     for _ in range(steps):
         equations = _equations(predictor, objective, point, criterion, free)
-        if equations.step(objective.space, point) is None:
+        change = equations.step(objective.space, point)
+        if change is None:
             break
         predictor = predictor.without_gains  # those of two points at a time are too much
-        lower = _lower(equations, predictor, objective, point, criterion)
+        gain, before = equations.gain(change), gain
+        lower = _lower(equations, predictor, objective, point, criterion, near=gain < NEAR)
         if lower is None:
             return predictor.at(objective, point), point
+        if gain < SETTLED or 0.5 * before < gain < NEAR:  # they shrink no more
+            return lower
         predictor, point = lower
-        if np.abs(point.offsets - laid)[: len(CLOCKS)].max() * OFFSET_UNIT * rate > ASIDE:
-            laid = point.offsets
-            predictor = predictor.laid(objective, point, flights).at(objective, point)
-        predictor = predictor.as_noisy(objective, point)
+        del lower
+        noise, moved = predictor.noise_seen, np.abs(point.offsets - laid)[: len(CLOCKS)].max()
+        if noise != predictor.noise or moved * OFFSET_UNIT * rate > ASIDE:
+            predictor = predictor.without_gains
+            if moved * OFFSET_UNIT * rate > ASIDE:
+                laid = point.offsets
+                predictor = predictor.laid(objective, point, flights)
+            predictor = replace(predictor, noise=noise).at(objective, point)
     return predictor, point
 
 
@@ -116,6 +128,10 @@ class _Equations(NamedTuple):
     hessian: Array
     free: Mask
 
+    def gain(self, change: Array) -> float:
+        """Return by how much a step is predicted to lower the loss."""
+        return -0.5 * float(self.gradient @ change)
+
     def step(self, space: Space, point: Point, damping: float = 0.0) -> Array | None:
         """Return the Gauss-Newton step in which what would leave its bounds stays where it is.
 
@@ -131,7 +147,7 @@ class _Equations(NamedTuple):
             share = _share_after(space, point, change)
             leaves = np.flatnonzero(free[: len(space)] & ((share <= 0.0) | (share >= 1.0)))
             if not len(leaves):
-                return change if -0.5 * (self.gradient @ change) >= ENOUGH else None
+                return change if self.gain(change) >= ENOUGH else None
             free[leaves] = False
 
 
@@ -148,14 +164,15 @@ def _equations(
     size = count + kinds
     by_kind = free[count:].reshape(kinds, flights).any(axis=1)
     moved = [*np.flatnonzero(free[:count]), *(count + np.flatnonzero(by_kind))]
+    slope, information, moves = predictor.slopes(objective, point)
+    by_strengths = gathered(moves, predictor.feed.widths, predictor.rows)
+    del moves  # derivatives take most of the memory
     jacobian = predictor.jacobian(objective, point, moved)
-    slopes = predictor.slopes(objective, point)
-    by_strengths = gathered(slopes.moved, predictor.feed.widths, predictor.rows)
-    segments, total = jacobian.crash_time.shape[0], size + len(slopes.slope)
+    segments, total = jacobian.crash_time.shape[0], size + len(slope)
     gradient, hessian = np.zeros((segments, total)), np.zeros((segments, total, total))
     loss, huber = np.zeros(segments), float(criterion.huber)
     for name, more in by_strengths.items():
-        columns = np.concatenate([jacobian.columns[name], more])
+        columns = np.concatenate([jacobian.columns.pop(name), more])
         errors = np.moveaxis(np.asarray(jacobian.residuals[name]), -1, 0)
         scale = np.asarray(criterion.scale[name])
         along, bend = gauss_newton(np.moveaxis(columns, (0, -1), (-1, 0)), errors, scale, huber)
@@ -177,8 +194,8 @@ def _equations(
     owner = flight[:, None] == np.arange(flights)
     of_flights = np.moveaxis(across[count:] @ owner, -1, 1).reshape(kinds * flights, -1)
     across = np.concatenate([across[:count].sum(axis=-1), of_flights])
-    bend = slopes.information + 1e-9 * np.eye(len(slopes.slope))
-    strengths, slope = predictor.strengths, slopes.slope
+    bend = information + 1e-9 * np.eye(len(slope))
+    strengths = predictor.strengths
     held = (strengths <= LEAST) & (slope > 0.0) | (strengths >= MOST) & (slope < 0.0)
     return _Equations(
         np.concatenate([own, slope]),
@@ -193,8 +210,13 @@ def _lower(
     objective: Objective,
     point: Point,
     criterion: Criterion,
+    *,
+    near: bool,
 ) -> tuple[Predictor, Point] | None:
-    """Return what predicts at the end of a step, and where that is; None if nothing is gained."""
+    """Return what predicts at the end of a step, and where that is; None if nothing is gained.
+
+    Where the estimate is ``near`` a step need not lower the loss.
+    """
     space, strengths = objective.space, predictor.strengths
     here = _loss(predictor, objective, point, criterion)
     for damping in DAMPED:
@@ -204,8 +226,9 @@ def _lower(
         by_strengths = np.clip(change[-len(strengths) :], -FURTHEST, FURTHEST)
         to = _moved(space, point, change[: -len(strengths)])
         tried = replace(predictor, strengths=within(strengths + by_strengths)).at(objective, to)
-        if _loss(tried, objective, to, criterion) < here:
+        if _loss(tried, objective, to, criterion) < here or (near and not tried.is_lost):
             return tried, to
+        del tried  # its gains are large
     return None
 
 

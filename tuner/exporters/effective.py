@@ -11,14 +11,13 @@ the run ended with them.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from tuner.config import JobFile, Settings
@@ -67,6 +66,8 @@ from tuner.vehicle.model import model_of
 
 STAGES = slice(-3, None)
 """Of the search: whole flights, then the polish in the weights that what is missing leaves."""
+LEFT = 1e-4
+"""Share of the loss that may be left to gain: half as much of how far off the flights are."""
 
 
 @dataclass(frozen=True)
@@ -228,58 +229,58 @@ def refitted(
         Called after every iteration.
     """
     values = initial_values(bare, job.settings.controller, fitted.objective.space.free)
-    parameters = tuple(
+    parameters = [
         _about(parameter, values[parameter.name])
         for parameter in fitted.objective.space.parameters
         if not set(lost).intersection(parameter.ratios)
-    )
-    space = Space(parameters, {}, size=fitted.objective.space.size)
+        and parameter.name not in fitted.held
+        and (row := COEFFICIENTS[parameter.name]).scope == "vehicle"
+        and not row.is_effect
+    ]
     model = replace(
         model_of(bare, controller_flown(job, fitted)),
         reference_voltage=fitted.objective.model.reference_voltage,
     )
     start = replace(
         fitted,
-        objective=replace(fitted.objective, model=model, space=space),
-        point=Point(np.asarray(space.initial), _without_conditions(fitted, lost).offsets),
+        objective=replace(fitted.objective, model=model),
+        point=_without_conditions(fitted, lost),
     )
-    rows = [COEFFICIENTS[parameter.name] for parameter in parameters]
-    own = [row.scope == "vehicle" and not row.is_effect for row in rows]
-    movable = np.array(
-        [o and r.name not in fitted.held for o, r in zip(own, rows, strict=True)], bool
-    )
-    end = _polished(job, start, movable, on_progress)
+    end = _polished(job, start, parameters, on_progress)
     try:
-        return end, _vehicle_at(bare, end, movable)
+        return end, _vehicle_at(bare, end)
     except ConfigError:  # together the moments are no rigid body's
-        movable &= np.array([row.place[0] != "inertia" for row in rows], bool)
-        end = _polished(job, start, movable, on_progress)
-        return end, _vehicle_at(bare, end, movable)
+        others = [p for p in parameters if COEFFICIENTS[p.name].place[0] != "inertia"]
+        end = _polished(job, start, others, on_progress)
+        return end, _vehicle_at(bare, end)
 
 
 def _polished(
-    job: Job, start: Fitted, movable: NDArray[np.bool_], on_progress: OnProgress
+    job: Job, start: Fitted, parameters: Sequence[Parameter], on_progress: OnProgress
 ) -> Fitted:
-    if not movable.any():
+    """Return the fit by some parameters alone, from where they begin."""
+    space = Space(tuple(parameters), {}, size=start.objective.space.size)
+    start = replace(
+        start,
+        objective=replace(start.objective, space=space),
+        point=Point(np.asarray(space.initial), start.point.offsets),
+    )
+    if not parameters:
         return start
     return polished(
         job,
         start,
-        free=Free(movable, np.zeros(start.point.offsets.shape, bool)),
+        free=Free(np.ones(len(space), bool), np.zeros(start.point.offsets.shape, bool)),
         title="for Gazebo",
         on_progress=lambda progress: on_progress(job, progress),
         stages=STAGES,
+        left=LEFT,
     )
 
 
-def _vehicle_at(bare: VehicleFile, end: Fitted, movable: NDArray[np.bool_]) -> VehicleFile:
+def _vehicle_at(bare: VehicleFile, end: Fitted) -> VehicleFile:
     space = end.objective.space
-    moved = {
-        name
-        for parameter, moves in zip(space.parameters, movable, strict=True)
-        if moves
-        for name in parameter.ratios
-    }
+    moved = {name for parameter in space.parameters for name in parameter.ratios}
     numbers = space.numbers(end.point.coefficients)
     return with_values(bare, {name: numbers[name] for name in numbers if name in moved})
 

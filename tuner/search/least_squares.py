@@ -164,6 +164,8 @@ def _gains_little(
 def _predicts_little(problem: StageProblem, step: Step) -> NDArray[np.bool_]:
     """Return (S,) whether no step from the best points is worth to be tried in this stage."""
     predicted = np.asarray(step.predicted_reduction)
+    if problem.stage.rough:
+        return np.asarray(predicted <= problem.stage.tolerance)
     if not problem.last:
         return np.asarray((predicted <= HANDED_ON) & _is_near(problem, step))
     assert step.sums is not None, "what has stepped has sums"

@@ -21,6 +21,8 @@ from tuner.search.stages import Stage
 
 LAST_TWO, LAST, ROUGHLY = slice(-2, None), slice(-1, None), slice(-2, -1)
 """Stages: polish and polish again, the latter alone where the weights are known, or the former."""
+ROUGH = 1e-3
+"""Share of the loss that a rough fit leaves to a linear step: a tenth of a term's least gain."""
 
 
 def polished(
@@ -31,6 +33,7 @@ def polished(
     title: str,
     on_progress: Callable[[Progress], None],
     stages: slice = LAST_TWO,
+    left: float | None = None,
 ) -> Fitted:
     """Return a fit polished again, by the last stages from its point.
 
@@ -48,6 +51,8 @@ def polished(
         Called after every iteration.
     stages
         Which of the stages: of the last two the first weighs what the second polishes.
+    left
+        Share of the loss that may be left to gain: a rough fit.
     """
     names = [flight.name for flight in job.fitted]
     progress = Progress(
@@ -70,7 +75,7 @@ def polished(
         job,
         fitted,
         progress,
-        stages_of(job, fitted.objective)[stages],
+        [_rough(stage, left) for stage in stages_of(job, fitted.objective)[stages]],
         free=free,
         undecided=(),
         title=title,
@@ -97,7 +102,8 @@ def searched_again(
 
     The other arguments are those of `polished`. What terms that were missing did to a fit, a
     coefficient at its bound say, is forgotten that way; what is undecided of the loop, too, is
-    tried both ways again. The last polish is left to a fit of what proves to be needed.
+    tried both ways again. The fit is rough: the last polish is left to one of what proves to be
+    needed.
     """
     progress = replace(
         beginning(fitted.objective, vector[None]),
@@ -105,17 +111,23 @@ def searched_again(
         evaluations=fitted.evaluations,
         loop=loop_of(job.objective),
     )
-    stages = stages_of(job, fitted.objective)[:-1]
+    *stages, polish, _ = stages_of(job, fitted.objective)
     return _grown(
         job,
         fitted,
         progress,
-        stages,
+        (*stages, _rough(polish, ROUGH)),
         free=free,
         undecided=job.undecided(fitted.objective),
         title=title,
         on_progress=on_progress,
     )
+
+
+def _rough(stage: Stage, left: float | None) -> Stage:
+    if left is None:
+        return stage
+    return replace(stage, tolerance=max(stage.tolerance, left), rough=True)
 
 
 def _grown(

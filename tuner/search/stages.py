@@ -70,6 +70,9 @@ class Stage:
         Loss, in inflated standard deviations, below which the next stage may as well begin.
     decides
         Whether what is undecided of the loop is tried both ways.
+    rough
+        Whether it ends where the normal equations predict less than the tolerance: a linear step is
+        left.
     """
 
     name: str
@@ -85,6 +88,7 @@ class Stage:
     coefficients: bool = True
     enough: float = 0.0
     decides: bool = False
+    rough: bool = False
 
 
 def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,8 +96,19 @@ class Linear:
 
     def information(self, inside: NDArray[np.bool_] | None = None) -> Array:
         """Return the information (P, P) of some stretches (S,), of all by default."""
-        total = np.zeros((len(self.scaled), len(self.scaled)))
         inside = np.ones(len(self.flight), bool) if inside is None else inside
+        known, key = self._informations, inside.tobytes()
+        if key not in known:
+            known[key] = self._information(inside)
+        return known[key]
+
+    @cached_property
+    def _informations(self) -> dict[bytes, Array]:
+        """Which stretches, as bytes -> their information: every group is scored in a few folds."""
+        return {}
+
+    def _information(self, inside: NDArray[np.bool_]) -> Array:
+        total = np.zeros((len(self.scaled), len(self.scaled)))
         for number in np.unique(self.flight[inside]):
             of_flight = inside & (self.flight == number)
             seen = self.columns[np.argmax(of_flight)]
@@ -109,7 +120,11 @@ class Linear:
         local = self.score + np.einsum("spq,sq->sp", self.hessian, change[self.columns])
         return self._spread(local)
 
-    @property
+    @cached_property
+    def _scores(self) -> Array:
+        return self._spread(self.score)
+
+    @cached_property
     def diagonals(self) -> Array:
         """The information (S, P) of each stretch about each column by itself."""
         return self._spread(np.einsum("spp->sp", self.hessian))
@@ -154,7 +169,7 @@ class Linear:
         """
         change = np.zeros(len(self.scaled)) if from_ is None else from_.copy()
         hessian = self.information(inside) + self.prior
-        score = self._spread(self.score)[inside].sum(axis=0)
+        score = self._scores[inside].sum(axis=0)
         slope = score + self.pull + hessian @ change
         square = hessian[np.ix_(free, free)]
         change[free] -= scaled_solve(square, slope[free], RIDGE)
@@ -163,7 +178,7 @@ class Linear:
     def change_of_loss(self, change: Array) -> Array:
         """Return by how much each stretch's loss (S,) changes."""
         local = change[self.columns]
-        quadratic = np.einsum("sp,spq,sq->s", local, self.hessian, local, optimize=True)
+        quadratic = (local * (self.hessian @ local[..., None])[..., 0]).sum(axis=1)
         return np.asarray((self.score * local).sum(axis=1) + 0.5 * quadratic)
 
     def folds(self, by: NDArray[np.intp]) -> Iterator[NDArray[np.bool_]]:

@@ -29,7 +29,7 @@ from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
 from tuner.search.loop import loop_of, with_loop
 from tuner.search.optimiser import Free
-from tuner.search.polish import LAST, ROUGHLY, polished, searched_again
+from tuner.search.polish import LAST, ROUGH, ROUGHLY, polished, searched_again
 from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.terms.candidates import (
@@ -81,8 +81,10 @@ class Selection:
         """Add groups until none earns its place."""
         state = self.linearised(self.fitted, {})
         dropped: dict[str, SelectionCode] = {}
-        if self._worth_fitting(state, dropped):
-            state = self._with_all(state) or state
+        if self._worth_fitting(state, dropped) and (pruned := self._with_all(state)):
+            state = pruned
+            gone = (name for name in self._worth_fitting(state, {}) if not is_stand_in(name))
+            dropped = dict.fromkeys(gone, SelectionCode.WORSE_AFTER_REFIT)
         for _ in range(MAX_ROUNDS):
             wanted = self._wanted(state, dropped)
             if not wanted:
@@ -97,7 +99,7 @@ class Selection:
         selected = Selected(*base, rows, base=base)
         doubt = self._in_doubt(state, selected.left_out)
         if state.added:
-            fitted = self._fitted(state, state.added, stages=LAST)
+            fitted = self._fitted(state, state.added, roughly=False)
             job, fitted = with_groups(base, state.added, fitted, said=findings_at(*base))
             selected = replace(selected, job=job, fitted=fitted)
         return replace(selected, in_doubt=doubt)
@@ -139,7 +141,8 @@ class Selection:
         missing terms picks those that stand in for them, or lets none of them predict by itself. So
         the search begins again where it began, with every candidate in the model but those that
         describe as a whole what others do one by one: beside them nothing else would seem needed,
-        and noise would choose. They are added if something is left to explain.
+        and noise would choose. They are added if something is left to explain; the others have had
+        their trial.
         """
         groups = {
             group: names for group, names in self.candidates.items() if not is_stand_in(group)
@@ -160,15 +163,18 @@ class Selection:
 
         Those that do not hold them beside all others are not tried again.
         """
-        best = max(wanted, key=lambda name: wanted[name].gain_holdout)
+        best, judged = max(wanted, key=lambda name: wanted[name].gain_holdout), list[set[str]]()
         for names in dict.fromkeys([tuple(wanted), (best,)]):
-            self.on_message(f"Fitting again with {listed(names)}.")
             groups = {**state.added, **{name: self.candidates[name] for name in names}}
+            if set(groups) in judged:
+                break
+            self.on_message(f"Fitting again with {listed(names)}.")
             trial = self._pruned(self._refitted(state, groups))
             by_flight = wanted[best].reason is SelectionCode.PREDICTS_FLIGHTS
             gone = [name for name in names if name not in trial.added]
             dropped |= dict.fromkeys(gone, SelectionCode.WORSE_AFTER_REFIT)
-            other = set(trial.added) not in (set(), set(state.added))
+            judged.append(set(trial.added))
+            other = judged[-1] not in (set(), set(state.added))
             if other and self._predicts_better(trial, state, by_flight=by_flight):
                 return trial
         dropped[best] = SelectionCode.WORSE_AFTER_REFIT
@@ -221,7 +227,7 @@ class Selection:
         return self.linearised(self._fitted(state, groups, anew=anew), groups)
 
     def _fitted(
-        self, state: LinearisedFit, groups: Groups, *, anew: bool = False, stages: slice = ROUGHLY
+        self, state: LinearisedFit, groups: Groups, *, anew: bool = False, roughly: bool = True
     ) -> Fitted:
         """Return the fit with exactly these groups, from where the last one ended or anew."""
         wanted, around = coefficients_in(groups), conditions_in(self.candidates)
@@ -261,7 +267,8 @@ class Selection:
             free=free_ones,
             title=title,
             on_progress=on_progress,
-            stages=stages,
+            stages=ROUGHLY if roughly else LAST,
+            left=ROUGH if roughly else None,
         )
 
     def linearised(self, fitted: Fitted, added: Groups) -> LinearisedFit:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -69,23 +70,19 @@ def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
     """
     rows = [COEFFICIENTS[name] for name in values]
     replaced = [row for row in rows if not row.is_effect]
-    changed: Model = eqx.tree_at(
-        lambda tree: [_leaf(tree, row) for row in replaced],
-        model,
-        [values[row.name] for row in replaced],
-        is_leaf=lambda leaf: leaf is None,
-    )
+    changed = model
+    if replaced:
+        changed = eqx.tree_at(
+            lambda tree: [_leaf(tree, row) for row in replaced],
+            model,
+            [values[row.name] for row in replaced],
+            is_leaf=lambda leaf: leaf is None,
+        )
     effects = {row.name: values[row.name] for row in rows if row.is_effect}
     if not effects:
         return changed
-    before = changed.vehicle.effects
-    with_effects: Model = eqx.tree_at(
-        lambda tree: tree.vehicle.effects,
-        changed,
-        before | effects,
-        is_leaf=lambda node: node is before,
-    )
-    return with_effects
+    vehicle = changed.vehicle
+    return replace(changed, vehicle=replace(vehicle, effects=vehicle.effects | effects))
 
 
 def with_terms_computed(model: Model, names: Collection[str]) -> Model:

@@ -237,6 +237,28 @@ def test_disturbances_that_are_taken_for_five_times_too_strong_are_given_up_in_f
     assert again.found.loss.sum() == pytest.approx(predictor.found.loss.sum(), abs=2.0)
 
 
+def test_near_the_estimate_one_step_ends_at_it(monkeypatch, fitted, exact) -> None:
+    problem, predictor, point = fitted
+    criterion = making.fitted_of(problem, point).criterion
+    told = predictor.jacobian(problem, point, range(len(FREE)))
+    error = covariance_of(
+        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
+    ).error
+    slope = exact.space.slope(np.asarray(point.coefficients))
+    shift = np.zeros(len(FREE))
+    shift[0] = error[0]
+    where = Point(jnp.asarray(point.coefficients + shift / slope), point.offsets)
+    passes, at = [], Predictor.at
+    monkeypatch.setattr(Predictor, "at", lambda *a: passes.append(1) or at(*a))
+    free = np.concatenate([np.ones(5, bool), OFFSETS.ravel()])
+    _, there = with_least_innovations(
+        predictor, gusty(exact, 1)[1], (problem, where, criterion), free
+    )
+    moved = (np.asarray(there.coefficients) - np.asarray(point.coefficients)) * slope
+    assert len(passes) == 2
+    assert (np.abs(moved) < 0.3 * error).all(), moved / error
+
+
 def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitted) -> None:
     problem, predictor, point = fitted
     ticks = predictor.ticks
@@ -259,7 +281,7 @@ def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitt
 def test_noise_that_a_wrong_beginning_took_for_more_is_taken_back(fitted) -> None:
     problem, predictor, point = fitted
     noisy = replace(predictor, noise=dict.fromkeys(predictor.noise, 1.3)).at(problem, point)
-    assert all(noise == 1.0 for noise in noisy.as_noisy(problem, point).noise.values())
+    assert all(noise == 1.0 for noise in noisy.noise_seen.values())
 
 
 @pytest.mark.parametrize("claimed", [2.0, 0.7])

@@ -168,6 +168,24 @@ def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
     assert bool(searched) is tried
 
 
+def test_what_an_elimination_took_is_not_tried_again_unless_it_was_no_part_of_it(monkeypatch):
+    own, wanted = selection.Selection, []
+    fitted = SimpleNamespace(residuals_at_noise_level=False, point=None, objective=None)
+    standing = LinearisedFit(fitted, {}, None)
+    score = Score(0.4, 0.3, 0.1, 0.0, SelectionCode.PREDICTS_FLIGHTS)
+    rows = []
+    monkeypatch.setattr(own, "_score", lambda *_: score)
+    monkeypatch.setattr(own, "linearised", lambda *_: standing)
+    monkeypatch.setattr(own, "_with_all", lambda *_: standing)
+    monkeypatch.setattr(own, "_grown", lambda _, __, groups, ___: wanted.extend(groups) or standing)
+    monkeypatch.setattr(own, "_rows", lambda _, __, dropped: rows.extend(dropped) or ())
+    monkeypatch.setattr(own, "_in_doubt", lambda *_: {})
+    groups = {"fuselage_drag": ("fuselage_drag",), "linear_drag": ("linear_drag_x",)}
+    own(SimpleNamespace(), fitted, groups, print, print).run()
+    assert wanted == ["linear_drag"]
+    assert rows == ["fuselage_drag"]
+
+
 @pytest.mark.slow
 def test_terms_that_are_free_from_the_beginning_stand_in_the_table_with_what_they_are_worth(
     monkeypatch,
