@@ -46,7 +46,7 @@ from tuner.vehicle.model import with_terms_computed
 
 Array = NDArray[np.float64]
 
-AT_ONCE = 24
+AT_ONCE = 16
 """Parameters by which is differentiated at a time."""
 LOST = 0.05
 """Share of a channel's innovations beyond the gate from which the filter has lost a flight."""

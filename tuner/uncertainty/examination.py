@@ -113,17 +113,17 @@ def examine(
         slopes = predictor.slopes(objective, Point(point.coefficients, predictor.feed.offsets))
     residuals: list[Residual] = []
     for flights, batch in portions(objective, point, criterion):
-        jacobian = batch[0].jacobian(*batch[1:])
         flight_names = [names[number] for number in flights]
         others = {
             name: portion(replace(other, space=objective.space), point, criterion, flights)[0]
             for name, other in otherwise.items()
         }
-        moved = {name: other.residuals(*batch[1:]) for name, other in others.items()}
-        if predictor is not None and slopes is not None:
+        if predictor is not None and slopes is not None:  # first: two Jacobians are too much
             of_flights = predictor.among(flights)
             by_strengths = slopes.moved[..., flights]
             predicted.append(of_flights.information(*batch, others, by_strengths))
+        jacobian = batch[0].jacobian(*batch[1:])
+        moved = {name: other.residuals(*batch[1:]) for name, other in others.items()}
         compared = jacobian if predictor is None else jacobian.of(predictor.rows)
         informations.append(information_from_jacobian(*batch, compared, otherwise=moved))
         sensitivities.append(
