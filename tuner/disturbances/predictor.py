@@ -320,18 +320,19 @@ class Predictor:
         moved = np.flatnonzero(~hidden(objective.space.names))
         offsets = np.arange(len(point.offsets)) + len(objective.space)
         own = Point(point.coefficients, self.feed.offsets)
+
+        def flown(predictor: Predictor, objective: Objective, there: Point) -> dict[str, Any]:
+            # by one offset, too: one program serves both
+            return dict(predictor.jacobian(objective, there, [len(objective.space)]).residuals)
+
         jacobian = with_secants(
             self.jacobian(objective, own, [*moved, *offsets]),
             objective.space,
             own,
-            # by one offset, too: one program serves both
-            lambda there: dict[str, Any](
-                self.jacobian(objective, there, [len(objective.space)]).residuals
-            ),
+            lambda there: flown(self, objective, there),
         )
         changed = {
-            name: dict[str, Any](self._stepped(other).jacobian(other, own, []).residuals)
-            for name, other in otherwise.items()
+            name: flown(self._stepped(other), other, own) for name, other in otherwise.items()
         }
         if by_strengths is not None:
             moves = gathered(by_strengths, self.feed.widths, self.rows)
@@ -345,7 +346,7 @@ class Predictor:
         )
 
     def _stepped(self, other: Objective) -> Predictor:
-        """Return the predictor of another problem: finer steps, pushed along, other stamps."""
+        """Return the predictor of another problem: finer steps, pushed along, other readings."""
         segments = self.feed.segments
         times = other.schedule.physics_rate // self.schedule.physics_rate
         inlet = jax.tree.map(lambda rows: np.repeat(rows, times, axis=0), segments.inlet)
@@ -354,7 +355,12 @@ class Predictor:
             schedule=other.schedule,
             feed=replace(
                 self.feed,
-                segments=replace(segments, inlet=inlet, disturbance=other.segments.disturbance),
+                segments=replace(
+                    segments,
+                    inlet=inlet,
+                    disturbance=other.segments.disturbance,
+                    log_voltage=other.segments.log_voltage,
+                ),
                 samples={
                     name: self._placed(name, other.segments.measured[name].time)
                     for name in self.feed.samples

@@ -106,16 +106,16 @@ def beginning_of(
     if markers is not None:
         start = markers.start(start, segments.resting, model.controller.sees_markers)
     environment = environment_of(model, segments, conditions)
+    exponent = model.vehicle.effects.get("battery_exponent")
+    factor = environment.speed_factor(exponent, jnp.asarray(0), schedule)
     if segments.resting is not None:
-        exponent = model.vehicle.effects.get("battery_exponent")
-        factor = environment.speed_factor(exponent, jnp.asarray(0), schedule)
         start = in_trim(
             model.vehicle, model.controller, start, segments.resting, speed_factor=factor
         )
     if segments.wander is not None:
         start = moved(start, segments.wander)
     if segments.turning is not None:
-        start = spun_up(start, model.vehicle, segments.turning)
+        start = spun_up(start, model.vehicle, segments.turning, speed_factor=factor)
     if states is not None and segments.freedom is not None:
         change = whole(states * segments.freedom, segments.freed)
         start = moved(start, change)

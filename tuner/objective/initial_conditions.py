@@ -229,18 +229,26 @@ def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inle
     return recorded_inlet_of(inlet).trimmed(inlet, trim)
 
 
-def spun_up(start: Start, vehicle: Vehicle, turning: Float[Array, "4 F"]) -> Start:
+def spun_up(
+    start: Start,
+    vehicle: Vehicle,
+    turning: Float[Array, "4 F"],
+    *,
+    speed_factor: Float[Array, " F"] | None = None,
+) -> Start:
     """Return a start whose rotors without a tachometer turn as their commands ask.
 
     Parameters
     ----------
     turning
         Recent motor commands 0..1, NaN for a rotor whose speed was measured.
+    speed_factor
+        The battery's factor on reference rotor speeds at the start; None for one.
     """
-    measured = jnp.isnan(turning)
+    measured, factor = jnp.isnan(turning), 1.0 if speed_factor is None else speed_factor
     asked = jnp.where(measured, 0.5, turning)
     speeds = tuple(
-        jnp.where(measured[i], speed, reference_speed(vehicle.motor, asked[i]))
+        jnp.where(measured[i], speed, reference_speed(vehicle.motor, asked[i]) * factor)
         for i, speed in enumerate(start.rotor_speed)
     )
     return Start(start.motion, speeds, start.command, start.rate_integral)

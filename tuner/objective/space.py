@@ -293,6 +293,7 @@ class Tunable(eqx.Module):
 
     def at(self, vector: ArrayLike) -> Model:
         """Return the model with the coefficients of a search vector (K,), which may be traced."""
-        if not isinstance(vector, jax.core.Tracer):
-            vector = np.asarray(vector)
-        return with_coefficients(self.model, self.space.values(vector))
+        if isinstance(vector, jax.core.Tracer):
+            return with_coefficients(self.model, self.space.values(vector))
+        moved = self.space.values(np.asarray(vector))
+        return with_coefficients(self.model, {name: np.asarray(v) for name, v in moved.items()})

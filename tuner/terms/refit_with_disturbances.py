@@ -136,7 +136,7 @@ def with_disturbances(
         wall_time=fitted.wall_time + time.perf_counter() - clock,
         findings=(*again.findings, _finding(predictor)),
     )
-    otherwise = alternatives_of(again.objective, again.point)
+    otherwise = alternatives_of(again.objective, again.point, job.fitted)
     lack = lack_of(again, job.fitted)
     examination = examine(
         again, otherwise=otherwise, predictor=predictor, in_doubt=seen.in_doubt(), lack=lack

@@ -437,3 +437,30 @@ def test_samples_that_are_stamped_otherwise_move_their_own_innovations_in_propor
         assert np.abs(moved).max() > 0.1
         bent = np.abs(twice[name] - rows - 2.0 * moved)  # where a rotor starts to change its speed
         assert np.quantile(bent, 0.98) < 0.05 * np.abs(moved).max()
+
+
+def test_a_voltage_that_is_read_higher_moves_innovations_as_faster_motors_do(fitted) -> None:
+    problem, predictor, point = fitted
+    vehicle, higher = problem.model.vehicle, 1e-3
+    battery = {**vehicle.effects, "battery_exponent": jnp.asarray(1.0)}
+    model = replace(
+        problem.model,
+        vehicle=replace(vehicle, effects=battery),
+        reference_voltage=jnp.asarray(1.0),
+    )
+
+    def read(log_voltage: float) -> Objective:
+        volts = jnp.full((problem.samples + 2, 2), log_voltage)
+        return replace(problem, model=model, segments=replace(problem.segments, log_voltage=volts))
+
+    def speeds(objective: Objective) -> list[jax.Array]:
+        motor = objective.model.vehicle.motor
+        return [motor.input_scaling, motor.zero_position_armed, motor.max_rotor_velocity]
+
+    faster = eqx.tree_at(speeds, problem, [s * np.exp(higher) for s in speeds(problem)])
+    found, same, expected = (
+        predictor._stepped(other).jacobian(other, point, []).residuals["rotor_speed"]
+        for other in (read(higher), read(0.0), faster)
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    assert np.abs(found - same).max() > 0.1

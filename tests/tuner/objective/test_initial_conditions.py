@@ -20,13 +20,13 @@ from tests.tuner.uncertainty.making import (
     with_data,
 )
 from tuner.disturbances.predictor import unscaled
+from tuner.objective.flight import beginning_of
 from tuner.objective.initial_conditions import (
     ROWS,
     eliminated,
     freedom_of,
     freedom_of_spin,
     moved,
-    spun_up,
     whole,
 )
 from tuner.objective.segments import segments_of
@@ -94,15 +94,22 @@ def test_what_is_free_of_a_start_takes_its_place_in_all_of_it():
     assert np.count_nonzero(all_of_it) == 4
 
 
-def test_a_rotor_without_tachometer_turns_as_its_command_asks(still):
-    vehicle, start = still
-    turning = jnp.asarray([[np.nan, 0.3]] + [[np.nan, np.nan]] * 3)
-    there = spun_up(start, vehicle, turning)
-    motor = vehicle.motor
-    asked = 0.3 * float(motor.input_scaling) + float(motor.zero_position_armed)
-    assert float(there.rotor_speed[0][1]) == pytest.approx(asked)
+@pytest.mark.parametrize("share", [1.0, 0.9])
+def test_a_rotor_without_tachometer_turns_as_its_command_asks_of_the_battery(share):
+    objective = problem(("inertia_zz",))
+    vehicle = replace(objective.model.vehicle, effects={"battery_exponent": jnp.asarray(1.0)})
+    model = replace(objective.model, vehicle=vehicle, reference_voltage=jnp.asarray(1.0))
+    segments = replace(
+        objective.segments,
+        turning=jnp.asarray([[np.nan, 0.3]] + [[np.nan, np.nan]] * 3),
+        log_voltage=jnp.full((3, 2), np.log(share)),
+    )
+    there, _, _ = beginning_of(model, segments, objective.schedule)
+    asked = 0.3 * float(vehicle.motor.input_scaling) + float(vehicle.motor.zero_position_armed)
+    assert float(there.rotor_speed[0][1]) == pytest.approx(share * asked)
     for rotor in range(1, 4):
-        np.testing.assert_array_equal(there.rotor_speed[rotor][1], start.rotor_speed[rotor])
+        recorded = objective.segments.start.rotor_speed[rotor]
+        np.testing.assert_array_equal(there.rotor_speed[rotor][1], recorded[1])
 
 
 YAW = ROWS["rate_integral"].stop - 1
