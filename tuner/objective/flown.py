@@ -143,7 +143,8 @@ def fly(
         model, conditions = _with_all(model, segments, conditions)
     names = tuple(segments.measured) if channels is None else channels
     moves = tangents is not None
-    logged = names if moves else tuple(dict.fromkeys((*LOGGED, *names)))
+    # in one order, for it tells programs apart
+    logged = tuple(sorted(names if moves else {*LOGGED, *names}))
     coefficients = {**coefficients_in(model), **coefficients}
     own = not moves or any(np.ndim(value) for value in coefficients.values())
     if segments.freedom is None and isinstance(segments.inlet, ReferenceInlet):

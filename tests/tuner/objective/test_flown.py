@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lanes import joined
+from lanes import Run, joined
 from sim_jax.crash import AIRBORNE
 from sim_jax.inlet import ActuatorInlet
 from sim_jax.rollout import rollout
@@ -96,3 +96,31 @@ def test_six_rotors_fly_from_where_they_were_recorded(effects):
     )
     place = found.channels["position"][0]
     np.testing.assert_allclose(place, np.broadcast_to([0.0, 0.0, 1.0], place.shape), atol=1e-6)
+
+
+@pytest.mark.parametrize("tangents", [None, {"mass": np.ones(1)}])
+def test_channels_in_another_order_are_no_other_program(monkeypatch, tangents):
+    """Recordings name them in theirs, and what a search cuts out of a problem in the alphabet's."""
+    craft = round_airframe(4)
+    one = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], hover(craft, vec(0.0, 0.0, 1.0)))
+    commands = tuple(np.tile(command, (STEPS + 2, 1)) for command in one.command)
+    segments = Segments(ActuatorInlet(commands), one, {}, np.zeros(1, int))
+    asked = []
+
+    def program(*key):
+        asked.append(key)
+        return lambda *_, **__: Run(({name: name for name in key[2].channels}, None), None)
+
+    monkeypatch.setattr(flown, "_program", program)
+    for names in (("position", "attitude"), ("attitude", "position")):
+        found = flown.fly(
+            Model(craft, controller()),
+            segments,
+            SCHEDULE,
+            samples=STEPS,
+            limits=AIRBORNE,
+            tangents=tangents,
+            channels=names,
+        )
+        assert list(found.channels) == list(names)
+    assert asked[0] == asked[1]
