@@ -116,11 +116,11 @@ def with_disturbances(
         predictor = predictor.without_gains  # their memory is for the next ones
         there, predictor = _descended(selected, there, predictor)
         seen = Innovations.of(selected, there, predictor)
+    simulated = seen.selected
+    seen, there, predictor = _with_lags(seen, there, predictor, on_message)
     if not predictor.keeps_track:
         on_message(LACKS)
         return None
-    simulated = seen.selected
-    seen, there, predictor = _with_lags(seen, there, predictor, on_message)
     job = seen.selected.job
     offsets = free_offsets(job)
     again = polished(
@@ -172,9 +172,10 @@ def _with_lags(
     """Return the fit with what acts as a latency at its neutral value, if samples call for it.
 
     There a fit has long made up for it, with other lags and stronger disturbances: what it is worth
-    is seen once all of these have followed. Terms are judged once more beside it.
+    is seen once all of these have followed. Terms are judged once more beside it. A filter that has
+    lost a flight calls for nothing.
     """
-    with_lags = seen.with_lags()
+    with_lags = seen.with_lags() if predictor.keeps_track else None
     if with_lags is None:
         return seen, there, predictor
     without, had = predictor.without_gains, _kept(seen.selected)

@@ -129,6 +129,15 @@ def fitted(exact: Objective) -> tuple[Objective, Predictor, Point]:
     return problem, *with_least_innovations(predictor, flights, (problem, truth, criterion), moves)
 
 
+def error_of(problem: Objective, predictor: Predictor, point: Point) -> np.ndarray:
+    """Return the standard errors (K,) that innovations speak for."""
+    criterion = unscaled(making.fitted_of(problem, point).criterion)
+    told = predictor.jacobian(problem, point, range(len(FREE)))
+    return covariance_of(
+        information_from_jacobian(problem, point, criterion, told, offsets_fitted=OFFSETS)
+    ).error
+
+
 def test_what_is_learnt_of_the_disturbances_is_what_pushed(fitted) -> None:
     _, predictor, _ = fitted
     gust = np.exp(predictor.strengths[0] - STRENGTHS[0])
@@ -140,10 +149,7 @@ def test_what_is_learnt_of_the_disturbances_is_what_pushed(fitted) -> None:
 def test_the_fit_is_sharper_than_least_squares_and_its_errors_hold_the_truth(fitted, exact) -> None:
     problem, predictor, point = fitted
     criterion = making.fitted_of(problem, point).criterion
-    told = predictor.jacobian(problem, point, range(len(FREE)))
-    error = covariance_of(
-        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
-    ).error
+    error = error_of(problem, predictor, point)
     plain = covariance_of(information_at(problem, point, criterion, offsets_fitted=OFFSETS)).error
     assert np.median(error / plain) < 0.6
     space = exact.space
@@ -240,10 +246,7 @@ def test_disturbances_that_are_taken_for_five_times_too_strong_are_given_up_in_f
 def test_near_the_estimate_one_step_ends_at_it(monkeypatch, fitted, exact) -> None:
     problem, predictor, point = fitted
     criterion = making.fitted_of(problem, point).criterion
-    told = predictor.jacobian(problem, point, range(len(FREE)))
-    error = covariance_of(
-        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
-    ).error
+    error = error_of(problem, predictor, point)
     slope = exact.space.slope(np.asarray(point.coefficients))
     shift = np.zeros(len(FREE))
     shift[0] = error[0]

@@ -1,5 +1,6 @@
 """A descent to least innovations takes steps that are numbers; when another is surely better."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -7,6 +8,8 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
+from tuner.disturbances.disturbances import USUAL
+from tuner.disturbances.observer import Feed
 from tuner.disturbances.predictor import Predictor
 from tuner.disturbances.refit import _Equations
 
@@ -20,6 +23,17 @@ def test_no_step_is_taken_where_a_filter_has_lost_a_flight():
     assert _Equations(slope * np.nan, np.eye(count), free).step(fit.space, point) is None
     bend = np.where(np.eye(count) > 0.0, np.nan, 0.0)
     assert _Equations(slope, bend, free).step(fit.space, point) is None
+
+
+def test_a_filter_flies_on_the_voltage_that_another_problem_reads():
+    """What it does then is seen in `test_predictor`, at length."""
+    fit = problem(("inertia_xx",))
+    feed = Feed(fit.segments, np.zeros((5, fit.segments.count)), {})
+    predictor = Predictor(fit.schedule, feed, {}, USUAL, {})
+    volts = np.full((3, fit.segments.count), 0.1)
+    other = replace(fit, segments=replace(fit.segments, log_voltage=volts))
+    assert predictor._stepped(fit).feed.segments.log_voltage is None
+    assert predictor._stepped(other).feed.segments.log_voltage is volts
 
 
 @pytest.mark.parametrize(

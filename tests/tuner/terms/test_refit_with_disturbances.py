@@ -152,6 +152,24 @@ def test_no_terms_are_chosen_by_innovations_of_a_filter_that_lost_a_flight(monke
     assert said[-1] == disturbances.LACKS
 
 
+def test_a_fit_with_a_lag_whose_filter_loses_a_flight_is_not_taken(monkeypatch):
+    full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
+    tracks, loses = (SimpleNamespace(memory=0, is_lost=False, keeps_track=t) for t in (True, False))
+    tracks.without_gains = tracks
+    monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
+    monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: tracks)
+    monkeypatch.setattr(disturbances, "_descended", lambda _, there, own, **__: (there, own))
+    settings = SimpleNamespace(job=JobFile(disturbances="follow"))
+    job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
+    begin = Selected(job, fitted(2.0 * COLOURED))
+    seen = SimpleNamespace(selected=begin, selection=lambda *_, **__: None)
+    monkeypatch.setattr(disturbances.Innovations, "of", lambda *_: seen)
+    monkeypatch.setattr(disturbances, "_with_lags", lambda found, there, *_: (found, there, loses))
+    said: list[str] = []
+    assert with_disturbances(begin, lambda *_: None, said.append) is None
+    assert said[-1] == disturbances.LACKS
+
+
 @pytest.mark.parametrize(
     ("group", "titles", "lag"),
     [("angular_drag", 2, False), ("fuselage_drag", 1, False), ("angular_drag", 1, True)],
@@ -168,7 +186,8 @@ def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, g
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
     row = SimpleNamespace(group=group, kept=True)
     begin = Selected(job, fitted(2.0 * COLOURED), (cast(Any, row),))
-    polished, examined, chosen = [], [], iter([replace(begin, rows=()), None])
+    polished, examined, read = [], [], []
+    chosen = iter([replace(begin, rows=()), None])
 
     def seen(selected: Selected, *_: Any) -> Any:
         return SimpleNamespace(
@@ -194,7 +213,7 @@ def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, g
     monkeypatch.setattr(disturbances.Innovations, "of", seen)
     monkeypatch.setattr(disturbances, "free_offsets", lambda _: np.zeros((0, 0), bool))
     monkeypatch.setattr(disturbances, "polished", polish)
-    monkeypatch.setattr(disturbances, "alternatives_of", lambda *_: {})
+    monkeypatch.setattr(disturbances, "alternatives_of", lambda *given: read.append(given[2:]))
     monkeypatch.setattr(disturbances, "lack_of", lambda *_: None)
     monkeypatch.setattr(disturbances, "examine", examine)
     monkeypatch.setattr(disturbances, "_with_lags", with_lags)
@@ -204,6 +223,7 @@ def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, g
     assert polished == ["clocks", "simulated"][:titles]
     assert len(examined) == 2 - lag
     assert (examined[-1] is begin.fitted) == (titles == 1 and not lag)
+    assert read[0] == (job.fitted,)  # whose voltmeters are read again
 
 
 @pytest.mark.parametrize(
@@ -222,7 +242,7 @@ def test_what_no_derivative_tells_is_judged_by_a_fit_with_it(
     full = SimpleNamespace(objective=NOBODY, point=SimpleNamespace(coefficients=np.zeros(0)))
     beside = SimpleNamespace(keeps_track=tracks, is_likelier_than=lambda _: likelier)
     beside.without_gains = beside
-    without = SimpleNamespace(feed=SimpleNamespace(offsets=np.zeros((5, 1))))
+    without = SimpleNamespace(feed=SimpleNamespace(offsets=np.zeros((5, 1))), keeps_track=True)
     without.without_gains = without
     without.at = lambda *_: "as it was"
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
