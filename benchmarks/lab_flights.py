@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
 from benchmarks.lab_effects import NOTHING, Effect, controller_with, inlet_with, logged_speeds
-from sim_jax.autopilot import gyro_rate
+from sim_jax.autopilot import gyro_of
 from sim_jax.constants import GRAVITY
 from sim_jax.disturbance import Disturbance
 from sim_jax.environment import Environment
@@ -315,7 +315,7 @@ def _measured(
     )
     true = Rotation.from_quat(signals["attitude"], scalar_first=True)
     turning = true.apply(np.cross(signals["body_rate"], offset))
-    gyro = gyro_rate(vehicle_of(lab.vehicle), Vec3.of(jnp.asarray(signals["body_rate"].T)))
+    gyro = gyro_of(vehicle_of(lab.vehicle)).reading(Vec3.of(jnp.asarray(signals["body_rate"].T)))
     noise = Rotation.from_rotvec(TURNED * random.normal(size=(len(signals["lap"]), 3)))
     measured = {
         **signals,

@@ -42,19 +42,12 @@ class Gyro(eqx.Module):
         return along if self.turn is None else self.turn.to_world(along)
 
 
-def gyro_of(vehicle: Vehicle) -> Gyro | None:
-    """Return a vehicle's gyro; None where it reads the body rate."""
-    turn, scale = tilt_of(vehicle), vehicle.along_axes("gyro_scale", neutral=1.0)
-    return None if turn is None and scale is None else Gyro(turn, scale)
+def gyro_of(vehicle: Vehicle) -> Gyro:
+    """Return a vehicle's gyro."""
+    return Gyro(tilt_of(vehicle), vehicle.along_axes("gyro_scale", neutral=1.0))
 
 
 def tilt_of(vehicle: Vehicle) -> Quaternion | None:
     """Return the turn from the autopilot's axes to the body's; None where they are the same."""
     tilt = vehicle.along_axes("autopilot_tilt")
     return None if tilt is None else rotation(tilt)
-
-
-def gyro_rate(vehicle: Vehicle, body_rate: Vec3) -> Vec3:
-    """Return what a vehicle's gyro reads of a body rate in rad/s."""
-    gyro = gyro_of(vehicle)
-    return body_rate if gyro is None else gyro.reading(body_rate)

@@ -33,12 +33,6 @@ class Disturbance(eqx.Module):
     rate: float | None = eqx.field(static=True, default=None)
     """Hz of the ticks; None for those of position control."""
 
-    @property
-    def at_first(self) -> Disturbance:
-        """The values at the first tick, every leaf (\\*batch)."""
-        first: Disturbance = jax.tree.map(lambda series: series[0], self)
-        return first
-
     def during(self, step: Int[Array, ""], schedule: Schedule) -> Disturbance:
         """Return the values in the middle of a physics step, every leaf (\\*batch)."""
         rate = schedule.position_control_rate if self.rate is None else self.rate

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, PyTree
 
 from sim_jax.disturbance import Disturbance
 from sim_jax.numeric import Array, Scalar
@@ -33,12 +34,10 @@ class Environment(eqx.Module):
     what they leave of it in the mean. None for still air."""
 
     @property
-    def at_first(self) -> tuple[Vec3 | Scalar | Disturbance | None, ...]:
+    def at_first(self) -> PyTree[Array]:
         """The values at the first control tick, every leaf (\\*batch)."""
-        series = self.log_voltage
-        voltage = None if series is None else series[0]
-        disturbance = None if self.disturbance is None else self.disturbance.at_first
-        return self.wind, self.battery_decline, self.begin, voltage, disturbance, self.draught
+        series = jax.tree.map(lambda values: values[0], (self.log_voltage, self.disturbance))
+        return series, self.wind, self.battery_decline, self.begin, self.draught
 
     def during(self, step: Int[Array, ""], schedule: Schedule) -> Environment:
         """Return what surrounds the flight in a physics step: its gust is part of the wind."""

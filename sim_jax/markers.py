@@ -15,7 +15,7 @@ gyro, and what follows it, is the autopilot's own (`sim_jax.autopilot`).
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 from jaxtyping import Bool
 
 from sim_jax.autopilot import tilt_of
@@ -82,7 +82,7 @@ class Markers(eqx.Module):
             attitude = attitude.product(self.turn.conjugate())
             if resting is not None:
                 level = Quaternion(attitude.w, 0.0 * attitude.x, 0.0 * attitude.y, attitude.z)
-                attitude = _of_each(resting, level.normalized(), attitude)
+                attitude = where(resting, level.normalized(), attitude)
         if self.offset is not None:
             position = position - attitude.to_world(self.offset)
             turning = attitude.to_world(motion.body_rate.cross(self.offset))
@@ -91,29 +91,20 @@ class Markers(eqx.Module):
         return Start(moved, recorded.rotor_speed, recorded.command, recorded.rate_integral)
 
 
-def markers_of(vehicle: Vehicle) -> Markers | None:
-    """Return a vehicle's markers; None where they are at its centre of mass and along its axes."""
-    offset, tilt = vehicle.along_axes("marker_offset"), vehicle.along_axes("marker_tilt")
-    if offset is None and tilt is None:
-        return None
-    return Markers(offset, None if tilt is None else rotation(tilt))
+def markers_of(vehicle: Vehicle) -> Markers:
+    """Return a vehicle's markers."""
+    tilt = vehicle.along_axes("marker_tilt")
+    turn = None if tilt is None else rotation(tilt)
+    return Markers(vehicle.along_axes("marker_offset"), turn)
 
 
 def estimated(vehicle: Vehicle, controller: Controller, motion: Motion) -> Motion:
     """Return the motion that position and attitude control see of a motion, were it not old."""
     markers, tilt = markers_of(vehicle), tilt_of(vehicle)
-    if markers is None and tilt is None:
+    if not jax.tree.leaves((markers, tilt)):
         return motion
-    by_markers = motion if markers is None else markers.seen(motion)
     by_sensors = motion
     if tilt is not None:
         attitude = motion.attitude.product(tilt)
         by_sensors = Motion(motion.position, motion.velocity, attitude, motion.body_rate)
-    return where(controller.sees_markers > 0.5, by_markers, by_sensors)
-
-
-def _of_each(flag: Array, first: Quaternion, second: Quaternion) -> Quaternion:
-    pairs: list[Scalar] = [
-        jnp.where(flag, getattr(first, name), getattr(second, name)) for name in "wxyz"
-    ]
-    return Quaternion(*pairs)
+    return where(controller.sees_markers > 0.5, markers.seen(motion), by_sensors)

@@ -83,8 +83,8 @@ class Plant(eqx.Module):
     inlet: Inlet
     lag: Lag | SwitchedLag
     gyro: GyroFilter
-    senses: Gyro | None = None
-    """What the gyro reads; None where that is the body rate."""
+    senses: Gyro
+    """What the gyro reads."""
     tachometer: Tachometer | None = None
 
     def position_control(
@@ -93,7 +93,7 @@ class Plant(eqx.Module):
         """Return what position and attitude control ask for, or asked for when last due."""
         if self.schedule.block_rate == self.schedule.position_control_rate:
             return self._follow(state, step, reference)
-        due = self.schedule.control_due(step)
+        due = self.schedule.is_due(step, self.schedule.position_control_rate)
         setpoints: Setpoints = lax.cond(
             due, lambda: self._follow(state, step, reference), lambda: state.setpoints
         )
@@ -137,17 +137,14 @@ class Plant(eqx.Module):
         """Run rate control where it is due."""
         if self.schedule.rate_control_rate == self.schedule.physics_rate:
             return self._stabilise(state)
-        due = self.schedule.rate_due(step)
+        due = self.schedule.is_due(step, self.schedule.rate_control_rate)
         commanded: State = lax.cond(due, lambda: self._stabilise(state), lambda: state)
         return commanded
 
     def _stabilise(self, state: State) -> State:
         """Run gyro filters, rate PID and mixer once; PX4 thinks in FRD."""
         controller, rate_hz = self.controller, self.schedule.rate_control_rate
-        reading = state.motion.body_rate
-        if self.senses is not None:
-            reading = self.senses.reading(reading)
-        gyro = filtered(self.gyro, state.gyro, reading, rate_hz)
+        gyro = filtered(self.gyro, state.gyro, self.senses.reading(state.motion.body_rate), rate_hz)
         measured, wanted = _frd(gyro.rate), _frd(state.setpoints.rate)
         torque = rate.torque_setpoint(
             controller.rate,

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Int, PyTree
+from jaxtyping import Int
 
 from sim_jax.autopilot import gyro_of
 from sim_jax.constants import GRAVITY
@@ -19,15 +19,14 @@ from sim_jax.markers import estimated
 from sim_jax.motor import Lag, LagSlope, SwitchedLag
 from sim_jax.numeric import Array, Scalar
 from sim_jax.plant import Plant, Sample
-from sim_jax.precision import Precision, in_precision, precision_of
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter, Tachometer
 from sim_jax.state import Start, State, first_state, hover_speed
-from sim_jax.trees import forgetful
+from sim_jax.trees import Precision, forgetful, in_precision, precision_of
 from sim_jax.vehicle import Vehicle
 
-SECOND_LAG, TACHOMETER_LAG = "time_constant_second", "tachometer_lag"
-"""The effects of a second lag of the motors, and of one of what measures their speeds."""
+SECOND_LAG = "time_constant_second"
+"""The effect of a second lag of the motors."""
 
 
 class Rollout(eqx.Module):
@@ -44,22 +43,13 @@ class Rollout(eqx.Module):
 
 
 def _lag(vehicle: Vehicle, schedule: Schedule) -> Lag | SwitchedLag:
-    slope, second = _lag_slope(vehicle), vehicle.effects.get(SECOND_LAG)
+    relative, second = vehicle.effects.get("time_constant_slope"), vehicle.effects.get(SECOND_LAG)
+    slope = None if relative is None else LagSlope(relative, hover_speed(vehicle))
     if schedule.longest_actuator_latency == 0:
         return Lag.over(vehicle.motor, schedule.step, slope, second)
     age = vehicle.setup.actuator_latency * schedule.physics_rate
     part = age - jnp.floor(age)
     return SwitchedLag.over(vehicle.motor, schedule.step, part, slope, second)
-
-
-def _lag_slope(vehicle: Vehicle) -> LagSlope | None:
-    slope = vehicle.effects.get("time_constant_slope")
-    return None if slope is None else LagSlope(slope, hover_speed(vehicle))
-
-
-def _batch_shape(inlet: Inlet, others: PyTree[Array]) -> tuple[int, ...]:
-    shapes = (jnp.shape(leaf) for leaf in jax.tree.leaves(others))
-    return jnp.broadcast_shapes(*shapes, inlet.batch_shape())
 
 
 def _check_rotors(vehicle: Vehicle, inlet: Inlet, start: Start) -> None:
@@ -101,8 +91,9 @@ def begun(
     arguments = vehicle, controller, inlet, start, environment
     dtype = precision_of(arguments) if precision is None else jnp.dtype(precision)
     vehicle, controller, inlet, start, environment = in_precision(arguments, dtype)
-    shape = _batch_shape(inlet, (vehicle, controller, start, environment.at_first))
-    senses, read_late = gyro_of(vehicle), vehicle.effects.get(TACHOMETER_LAG)
+    others = jax.tree.leaves((vehicle, controller, start, environment.at_first))
+    shape = jnp.broadcast_shapes(*map(jnp.shape, others), inlet.batch_shape())
+    senses, read_late = gyro_of(vehicle), vehicle.effects.get("tachometer_lag")
     plant = Plant(
         vehicle=vehicle,
         controller=with_gains_of(controller, vehicle),
@@ -117,7 +108,6 @@ def begun(
         senses=senses,
         tachometer=None if read_late is None else Tachometer.over(read_late, schedule.step),
     )
-    rate = start.motion.body_rate
     return plant, first_state(
         start,
         vehicle.motor,
@@ -125,7 +115,7 @@ def begun(
         plant.gyro,
         shape,
         seen=estimated(vehicle, controller, start.motion),
-        read=rate if senses is None else senses.reading(rate),
+        read=senses.reading(start.motion.body_rate),
         lags_twice=SECOND_LAG in vehicle.effects,
         read_late=read_late is not None,
     )
@@ -140,12 +130,13 @@ def rollout(
     *,
     samples: int,
     environment: Environment = NOTHING_AROUND,
-    horizon: Int[Array, ""] | None = None,
     limits: Limits | None = None,
     gravity: float = GRAVITY,
     precision: Precision | None = None,
 ) -> Rollout:
     """Fly: one vehicle, or a batch along trailing axes of any leaf.
+
+    Reverse mode remembers the state at every tick and computes the steps between again.
 
     Parameters
     ----------
@@ -162,10 +153,6 @@ def rollout(
         a time is the state at that time, before the physics that follows it.
     environment
         What surrounds the flight; by default nothing.
-    horizon
-        If given, only so many samples are flown, and the rest of the log is zero. It may be traced:
-        one compiled function serves every horizon; derivatives are then forward-mode only. Reverse
-        mode remembers the state at every tick and computes the steps between again.
     limits
         The space in which a flight counts as flying.
     gravity
@@ -195,25 +182,11 @@ def rollout(
         limits=limits,
         gravity=gravity,
         precision=precision,
-        reversible=horizon is None,
+        reversible=True,
     )
 
     def sample(state: State, number: Int[Array, ""]) -> tuple[State, Sample]:
         return plant.sample(state, number)
 
-    if horizon is None:
-        state, log = lax.scan(forgetful(sample), first, jnp.arange(samples))
-        return Rollout(log, state.crash_time)
-
-    def logged(number: Int[Array, ""], carried: tuple[State, Sample]) -> tuple[State, Sample]:
-        state, log = carried
-        state, row = sample(state, number)
-        log = jax.tree.map(
-            lambda rows, now: lax.dynamic_update_index_in_dim(rows, now, number, 0), log, row
-        )
-        return state, log
-
-    row = jax.eval_shape(sample, first, jnp.asarray(0))[1]
-    empty = jax.tree.map(lambda leaf: jnp.zeros((samples, *leaf.shape), leaf.dtype), row)
-    state, log = lax.fori_loop(0, jnp.minimum(horizon, samples), logged, (first, empty))
+    state, log = lax.scan(forgetful(sample), first, jnp.arange(samples))
     return Rollout(log, state.crash_time)

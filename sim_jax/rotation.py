@@ -13,22 +13,6 @@ SMALL = 1e-6
 """rad² below which sin(a)/a is its series."""
 
 
-class Matrix3(eqx.Module):
-    """A rotation matrix by its columns: the body axes in world coordinates."""
-
-    x_axis: Vec3
-    y_axis: Vec3
-    z_axis: Vec3
-
-    def to_world(self, body: Vec3) -> Vec3:
-        """Turn a body vector into world coordinates: R v."""
-        return self.x_axis * body.x + self.y_axis * body.y + self.z_axis * body.z
-
-    def to_body(self, world: Vec3) -> Vec3:
-        """Turn a world vector into body coordinates: Rᵀ v."""
-        return Vec3(self.x_axis.dot(world), self.y_axis.dot(world), self.z_axis.dot(world))
-
-
 class Quaternion(eqx.Module):
     """A rotation from body to world.
 
@@ -106,18 +90,6 @@ class Quaternion(eqx.Module):
             2.0 * (self.x * self.z - self.w * self.y),
             2.0 * (self.y * self.z + self.w * self.x),
             1.0 - 2.0 * (self.x * self.x + self.y * self.y),
-        )
-
-    def matrix(self) -> Matrix3:
-        """Return the rotation matrix R with v_world = R v_body."""
-        x2, y2, z2 = self.x + self.x, self.y + self.y, self.z + self.z
-        xx, yy, zz = self.x * x2, self.y * y2, self.z * z2
-        xy, xz, yz = self.x * y2, self.x * z2, self.y * z2
-        wx, wy, wz = self.w * x2, self.w * y2, self.w * z2
-        return Matrix3(
-            x_axis=Vec3(1.0 - (yy + zz), xy + wz, xz - wy),
-            y_axis=Vec3(xy - wz, 1.0 - (xx + zz), yz + wx),
-            z_axis=Vec3(xz + wy, yz - wx, 1.0 - (xx + yy)),
         )
 
     def z_axis(self) -> Vec3:

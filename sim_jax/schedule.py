@@ -74,15 +74,9 @@ class Schedule(eqx.Module):
         steps = jnp.asarray(self.physics_rate, step.dtype)
         return lax.div(step * self.position_control_rate, steps)
 
-    def control_due(self, step: Int[Array, ""]) -> Bool[Array, ""]:
-        """Return whether the position controller runs at a physics step."""
-        return _begins(step, self.position_control_rate, self.physics_rate)
+    def is_due(self, step: Int[Array, ""], rate: int) -> Bool[Array, ""]:
+        """Return whether a loop of a rate in Hz runs at a physics step.
 
-    def rate_due(self, step: Int[Array, ""]) -> Bool[Array, ""]:
-        """Return whether the rate controller runs at a physics step."""
-        return _begins(step, self.rate_control_rate, self.physics_rate)
-
-
-def _begins(step: Int[Array, ""], rate: int, of: int) -> Bool[Array, ""]:
-    """Return whether ⌊step·rate/of⌋ is greater than it was at the last step."""
-    return lax.rem(step * rate, jnp.asarray(of, step.dtype)) < rate
+        That is where ⌊step·rate/physics_rate⌋ is greater than it was at the last step.
+        """
+        return lax.rem(step * rate, jnp.asarray(self.physics_rate, step.dtype)) < rate

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from sim_jax.constants import GRAVITY
-from sim_jax.motor import reference_speed
+from sim_jax.motor import command_of, reference_speed
 from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
@@ -69,7 +69,7 @@ def hover_speed(vehicle: Vehicle, *, gravity: float = GRAVITY) -> Scalar:
 def hover(vehicle: Vehicle, position: Vec3, *, gravity: float = GRAVITY) -> Start:
     """Return a level vehicle at rest at a position in m, its rotors carrying its weight."""
     count, speed = len(vehicle.rotors), hover_speed(vehicle, gravity=gravity)
-    command = (speed - vehicle.motor.zero_position_armed) / vehicle.motor.input_scaling
+    command = command_of(vehicle.motor, speed)
     rest = Vec3.zeros(position.x)
     return Start(
         motion=Motion(position, rest, Quaternion.identity(position.x), rest),

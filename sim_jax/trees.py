@@ -1,19 +1,20 @@
-"""Small things done to a whole pytree at once."""
+"""Small things done to a whole pytree at once: choices, rows, loops, precision."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Literal, ParamSpec, TypeAlias, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Int, PyTree
 
 from sim_jax.numeric import Array
-from sim_jax.state import State
 
+Precision: TypeAlias = Literal["float32", "float64"]
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -49,13 +50,32 @@ def like(tree: PyTree[Array], other: T) -> T:
     return same
 
 
-def replaced(state: State, **changes: object) -> State:
-    """Return a state with some of its parts replaced; None may become a part."""
+def replaced(tree: T, **changes: object) -> T:
+    """Return a pytree with some of its parts replaced; None may become a part."""
     names = list(changes)
-    changed: State = eqx.tree_at(
-        lambda s: [getattr(s, name) for name in names],
-        state,
+    changed: T = eqx.tree_at(
+        lambda t: [getattr(t, name) for name in names],
+        tree,
         [changes[name] for name in names],
         is_leaf=lambda leaf: leaf is None,
     )
     return changed
+
+
+def in_precision(tree: T, dtype: np.dtype[np.floating]) -> T:
+    """Return a pytree with its real numbers in a precision; whole numbers and flags stay."""
+
+    def cast(leaf: object) -> object:
+        real = jnp.issubdtype(jnp.result_type(leaf), jnp.floating)
+        return jnp.asarray(leaf, dtype) if real else leaf
+
+    changed: T = jax.tree.map(cast, tree)
+    return changed
+
+
+def precision_of(*trees: object) -> np.dtype[np.floating]:
+    """Return the precision that holds all real numbers of some pytrees."""
+    types = [jnp.result_type(leaf) for leaf in jax.tree.leaves(trees)]
+    real = [dtype for dtype in types if jnp.issubdtype(dtype, jnp.floating)]
+    widest: np.dtype[np.floating] = jnp.result_type(*real)
+    return widest

@@ -24,6 +24,7 @@ from sim_jax.rotation import Quaternion
 from sim_jax.state import Start, hover_speed
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
+from sim_jax.trees import where
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 
@@ -60,20 +61,8 @@ def in_trim(
     asked = speeds if speed_factor is None else tuple(speed / speed_factor for speed in speeds)
     commands = tuple(command_of(vehicle.motor, speed) for speed in asked)
     integral = torque_of(controller.mixer, commands)
-
-    def chosen(trimmed: Scalar, recorded: Scalar) -> Scalar:
-        return jnp.where(resting, trimmed, recorded)
-
-    return Start(
-        start.motion,
-        tuple(map(chosen, speeds, start.rotor_speed)),
-        tuple(map(chosen, commands, start.command)),
-        Vec3(
-            chosen(integral.x, start.rate_integral.x),
-            chosen(integral.y, start.rate_integral.y),
-            chosen(integral.z, start.rate_integral.z),
-        ),
-    )
+    recorded = start.rotor_speed, start.command, start.rate_integral
+    return Start(start.motion, *where(resting, (speeds, commands, integral), recorded))
 
 
 def trim_speeds(vehicle: Vehicle, *, gravity: float = GRAVITY) -> PerRotor:

@@ -91,14 +91,11 @@ def with_gains_of(controller: Controller, vehicle: Vehicle) -> Controller:
     effects: parameters that were changed since, or scaled by an autotune or by the battery (PX4
     MC_BAT_SCALE_EN).
     """
-    across, about = (vehicle.effects.get(f"rate_gain_{axis}") for axis in ("roll_pitch", "yaw"))
-    if across is None and about is None:
+    gains = [vehicle.effects.get(f"rate_gain_{axes}") for axes in ("roll_pitch", "yaw")]
+    if all(gain is None for gain in gains):
         return controller
+    across, about = (1.0 if gain is None else gain for gain in gains)
     k = controller.rate.k
-    x, y, z = k.x, k.y, k.z
-    if across is not None:
-        x, y = x * across, y * across
-    if about is not None:
-        z = z * about
-    changed: Controller = eqx.tree_at(lambda c: c.rate.k, controller, Vec3(x, y, z))
+    k = Vec3(k.x * across, k.y * across, k.z * about)
+    changed: Controller = eqx.tree_at(lambda c: c.rate.k, controller, k)
     return changed

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 
 from sim_jax.control.gains import AttitudeGains, PositionGains
 from sim_jax.numeric import Scalar, safe_divide, safe_sqrt, saturate
-from sim_jax.rotation import Matrix3, Quaternion
+from sim_jax.rotation import Quaternion
+from sim_jax.trees import where
 from sim_jax.vector import Vec3
 
 CONTROLLER_GRAVITY = 9.8
@@ -24,20 +23,20 @@ class ReferencePoint(eqx.Module):
     acceleration: Vec3
 
 
-def _unit(vector: Vec3, otherwise: Vec3) -> Vec3:
-    """Return the direction of a vector, or another one where it has none."""
+def _direction(vector: Vec3) -> Vec3:
+    """Return the direction of a vector; upward where it has none."""
     length = vector.norm()
     has = length > 0
     scale = 1.0 / jnp.where(has, length, 1.0)
-    return Vec3(
-        jnp.where(has, vector.x * scale, otherwise.x),
-        jnp.where(has, vector.y * scale, otherwise.y),
-        jnp.where(has, vector.z * scale, otherwise.z),
-    )
+    return where(has, vector * scale, Vec3.upward(vector.z))
 
 
-def axes_from_acceleration(acceleration: Vec3, heading: Vec3) -> Matrix3:
-    """Return body axes of which z lies along an acceleration and x is near the heading.
+def attitude_from_acceleration(acceleration: Vec3, heading: Vec3) -> Quaternion:
+    """Return the attitude of which z lies along an acceleration and x is near a heading.
+
+    Up to the sign of all four numbers: a turn to the heading, then a roll about x and a pitch about
+    y that bring z where it belongs, the product of three quaternions with one axis each, which
+    spares a matrix and its branches.
 
     Parameters
     ----------
@@ -49,52 +48,36 @@ def axes_from_acceleration(acceleration: Vec3, heading: Vec3) -> Matrix3:
     Where there is no acceleration the attitude is upright; where it lies along the heading, the y
     axis stays level, left of the heading. (The original gives not-a-number in both.)
     """
-    z_axis = _unit(acceleration, Vec3.upward(acceleration.z))
-    y_axis = _unit(z_axis.cross(heading), Vec3(-heading.y, heading.x, heading.z))
-    return Matrix3(y_axis.cross(z_axis), y_axis, z_axis)
-
-
-def attitude_from_acceleration(acceleration: Vec3, heading: Vec3) -> Quaternion:
-    """Return the attitude of `axes_from_acceleration`, up to the sign of all four numbers.
-
-    A turn to the heading, then a roll about x and a pitch about y that bring z where it belongs:
-    the product of three quaternions with one axis each, which spares the matrix and its branches.
-    """
-    z_axis = _unit(acceleration, Vec3.upward(acceleration.z))
+    z_axis = _direction(acceleration)
     ahead = heading.x * z_axis.x + heading.y * z_axis.y
     left = heading.x * z_axis.y - heading.y * z_axis.x
     level = safe_sqrt(left * left + z_axis.z * z_axis.z)
     rolls = level > 0
     scale = 1.0 / jnp.where(rolls, level, 1.0)
     cosine = jnp.where(rolls, z_axis.z * scale, 1.0)
-    roll = _half_angle(cosine, -left * scale)
-    pitch = _half_angle(level, ahead)
-    yaw = _half_angle(heading.x, heading.y)
+    roll_cos, roll_sin = _half_angle(cosine, -left * scale)
+    pitch_cos, pitch_sin = _half_angle(level, ahead)
+    yaw_cos, yaw_sin = _half_angle(heading.x, heading.y)
     tilt = Quaternion(
-        roll.cosine * pitch.cosine,
-        roll.sine * pitch.cosine,
-        roll.cosine * pitch.sine,
-        roll.sine * pitch.sine,
+        roll_cos * pitch_cos, roll_sin * pitch_cos, roll_cos * pitch_sin, roll_sin * pitch_sin
     )
     return Quaternion(
-        yaw.cosine * tilt.w - yaw.sine * tilt.z,
-        yaw.cosine * tilt.x - yaw.sine * tilt.y,
-        yaw.cosine * tilt.y + yaw.sine * tilt.x,
-        yaw.cosine * tilt.z + yaw.sine * tilt.w,
+        yaw_cos * tilt.w - yaw_sin * tilt.z,
+        yaw_cos * tilt.x - yaw_sin * tilt.y,
+        yaw_cos * tilt.y + yaw_sin * tilt.x,
+        yaw_cos * tilt.z + yaw_sin * tilt.w,
     )
 
 
-class _Angle(NamedTuple):
-    cosine: Scalar
-    sine: Scalar
+def _half_angle(cosine: Scalar, sine: Scalar) -> tuple[Scalar, Scalar]:
+    """Return cosine and sine of half an angle, up to half a turn, from those of the whole.
 
-
-def _half_angle(cosine: Scalar, sine: Scalar) -> _Angle:
-    """Halve an angle, up to half a turn: the larger number by a root, the other by division."""
+    The larger number by a root, the other by division.
+    """
     ahead = cosine >= 0
     larger = jnp.sqrt(0.5 + 0.5 * jnp.where(ahead, cosine, -cosine))
     other = 0.5 * sine / larger
-    return _Angle(jnp.where(ahead, larger, other), jnp.where(ahead, other, larger))
+    return jnp.where(ahead, larger, other), jnp.where(ahead, other, larger)
 
 
 def feedback_acceleration(
@@ -145,10 +128,8 @@ def wanted_acceleration(
         World vector (cos ψ, sin ψ, 0), which turns the axes of the reference's drag.
     """
     up = Vec3.upward(position.z, CONTROLLER_GRAVITY)
-    along_reference = axes_from_acceleration(reference.acceleration + up, heading)
-    drag = along_reference.to_world(
-        gains.reference_drag.scaled_by(along_reference.to_body(reference.velocity))
-    )
+    wanted = attitude_from_acceleration(reference.acceleration + up, heading)
+    drag = wanted.to_world(gains.reference_drag.scaled_by(wanted.to_body(reference.velocity)))
     feedback = feedback_acceleration(gains, reference, position, velocity)
     return feedback + reference.acceleration - drag + up
 

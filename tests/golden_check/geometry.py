@@ -20,8 +20,9 @@ def quaternion_operations(table: Table) -> list[Deviation]:
     columns = [Vec3(*(getattr(row, axis) for row in rows)) for axis in "xyz"]
     # Ours is made for unit quaternions; the original's grows with the squared norm of others.
     square = q.w**2 + q.x**2 + q.y**2 + q.z**2
-    matrix = q.normalized().matrix()
-    scaled = [axis * square for axis in (matrix.x_axis, matrix.y_axis, matrix.z_axis)]
+    zero, one = jnp.zeros_like(q.w), jnp.ones_like(q.w)
+    axes = Vec3(one, zero, zero), Vec3(zero, one, zero), Vec3(zero, zero, one)
+    scaled = [q.normalized().to_world(axis) * square for axis in axes]
     return [
         deviation("product", q.product(p), table.quaternion("qp"), EXACT),
         deviation("matrix", scaled, columns, EXACT),

@@ -8,7 +8,6 @@ from jax import Array
 
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench
-from sim_jax.rotation import Matrix3
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.vector import Vec3
@@ -66,7 +65,6 @@ def motor_model(table: Table) -> list[Deviation]:
 def _motor_model(table: Table) -> list[Deviation]:
     spin = int(table.only("dir"))
     attitude = table.quaternion("rotor_q")
-    axes = attitude.matrix()
     through_air = table.vector("v") - table.vector("wind_")
     speed = table.column("omega_signed")
     # A reversible rotor pushes the other way when it turns backwards; all else is the same.
@@ -105,14 +103,19 @@ def _motor_model(table: Table) -> list[Deviation]:
 
     return [
         deviation("thrust, rotor axes", pushed.force, table.vector("rel_force_"), EXACT),
-        deviation("thrust", _world(axes, pushed.force), table.vector("thrust_world_"), EXACT),
-        deviation("rotor drag", _world(axes, dragged.force), table.vector("drag_world_"), EXACT),
+        deviation("thrust", attitude.to_world(pushed.force), table.vector("thrust_world_"), EXACT),
         deviation(
-            "rolling moment", _world(axes, rolled.moment), table.vector("rolling_world_"), EXACT
+            "rotor drag", attitude.to_world(dragged.force), table.vector("drag_world_"), EXACT
+        ),
+        deviation(
+            "rolling moment",
+            attitude.to_world(rolled.moment),
+            table.vector("rolling_world_"),
+            EXACT,
         ),
         deviation(
             "all moments",
-            _world(axes, everything.moment),
+            attitude.to_world(everything.moment),
             table.vector("torque_world_total_"),
             EXACT,
         ),
@@ -124,10 +127,6 @@ def _motor_model(table: Table) -> list[Deviation]:
             EXACT,
         ),
     ]
-
-
-def _world(axes: Matrix3, vector: Vec3) -> Vec3:
-    return axes.to_world(vector)
 
 
 def _motor(**known: Array) -> Motor:

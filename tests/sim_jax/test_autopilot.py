@@ -75,7 +75,7 @@ def test_the_body_rate_is_what_was_read_turned_and_scaled_back():
     np.testing.assert_allclose(gyro.body_rate(gyro.reading(rate)).stacked(), rate.stacked())
     read = gyro_of(craft_with({"autopilot_tilt_x": 0.02})).reading(vec(0.0, 0.0, 1.0))
     np.testing.assert_allclose(read.stacked(), [0.0, np.sin(0.02), np.cos(0.02)], atol=1e-14)
-    assert gyro_of(vehicle()) is None
+    assert gyro_of(vehicle()).reading(rate) is rate
 
 
 def test_neutral_values_change_nothing_of_a_flight_and_each_other_value_does():

@@ -85,14 +85,6 @@ def test_a_crashed_vehicle_stays_where_it_crashed(batch: Rollout) -> None:
     assert np.ptp(x[:at]) > 0.1
 
 
-def test_a_horizon_flies_the_beginning() -> None:
-    whole = eqx.filter_jit(fly)(jnp.asarray([0.5]))
-    part = eqx.filter_jit(fly)(jnp.asarray([0.5]), horizon=jnp.asarray(25))
-    for got, want in zip(jax.tree.leaves(part.log), jax.tree.leaves(whole.log), strict=True):
-        np.testing.assert_allclose(got[:25], want[:25], rtol=1e-12, atol=1e-12)
-        assert not np.any(got[25:])
-
-
 @pytest.mark.parametrize("log_rate", [50, 400])
 def test_logging_more_or_less_often_changes_nothing(log_rate: int) -> None:
     usual = eqx.filter_jit(fly)(jnp.asarray([0.5])).log

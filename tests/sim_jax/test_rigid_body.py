@@ -38,7 +38,7 @@ def fly(advance: Step, count: int, duration: float = 1.0, wrench: Callable = not
 def angular_momentum(motion: Motion) -> Vec3:
     rate = motion.body_rate
     body = Vec3(BODY.inertia_xx * rate.x, BODY.inertia_yy * rate.y, BODY.inertia_zz * rate.z)
-    return motion.attitude.matrix().to_world(body)
+    return motion.attitude.to_world(body)
 
 
 def spin_energy(motion: Motion) -> float:

@@ -113,8 +113,8 @@ def test_turned_to_the_next_rotor_but_one_the_airframe_is_the_same(count: int) -
     here = fly(craft, ActuatorInlet(commands), start).log.motion
     there = fly(craft, ActuatorInlet((*commands[-2:], *commands[:-2])), start).log.motion
     seen = Vec3(here.position.x, here.position.y, here.position.z)
-    assert apart(there.position, turn.matrix().to_world(seen)) < 1e-9
-    assert apart(there.body_rate, turn.matrix().to_world(here.body_rate)) < 1e-9
+    assert apart(there.position, turn.to_world(seen)) < 1e-9
+    assert apart(there.body_rate, turn.to_world(here.body_rate)) < 1e-9
     assert float(jnp.max(jnp.abs(here.body_rate.x))) > 0.01
 
 

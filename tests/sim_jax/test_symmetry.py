@@ -39,10 +39,9 @@ SAMPLES = 500
 
 
 def seen_from_elsewhere(motion: Motion, turn: Quaternion) -> Motion:
-    axes = turn.matrix()
     return Motion(
-        axes.to_world(motion.position),
-        axes.to_world(motion.velocity),
+        turn.to_world(motion.position),
+        turn.to_world(motion.velocity),
         turn.product(motion.attitude),
         motion.body_rate,
     )
@@ -84,7 +83,7 @@ def test_quarter_turn_of_the_airframe_changes_nothing() -> None:
             motion.position,
             motion.velocity,
             motion.attitude.product(turn),
-            turn.matrix().to_body(motion.body_rate),
+            turn.to_body(motion.body_rate),
         )
 
     turned_start = Start(

@@ -101,3 +101,10 @@ def test_a_rotor_speed_has_one_command(quadratic):
     motor = replace(vehicle().motor, quadratic=jnp.asarray(quadratic))
     for command in map(jnp.asarray, (0.2, 0.5, 0.8)):
         assert command_of(motor, reference_speed(motor, command)) == pytest.approx(command)
+
+
+def test_a_hover_has_the_command_that_its_motors_turn_the_rotors_by():
+    motor = replace(vehicle().motor, quadratic=jnp.asarray(-150.0), input_offset=jnp.asarray(0.05))
+    start = hover(replace(vehicle(), motor=motor), vec(0.0, 0.0, 1.0))
+    asked = [reference_speed(motor, command) for command in start.command]
+    np.testing.assert_allclose(asked, start.rotor_speed, rtol=1e-12)

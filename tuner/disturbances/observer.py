@@ -15,7 +15,6 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
-from sim_jax.autopilot import gyro_rate
 from sim_jax.crash import AIRBORNE
 from sim_jax.disturbance import Disturbance
 from sim_jax.markers import markers_of
@@ -197,14 +196,11 @@ class Observer(eqx.Module):
 
     def seen(self, state: State, tick: Array) -> dict[str, Array]:
         """Return channel -> (c, F), what a recording would hold."""
-        motion, markers = state.motion, markers_of(self.plant.vehicle)
-        position, attitude = motion.position, motion.attitude
-        if markers is not None:
-            position, attitude = markers.recorded(motion)
+        position, attitude = markers_of(self.plant.vehicle).recorded(state.motion)
         command = state.command
         if "command" in self.channels:
             command = self.plant.inlet.next_command(self.plant, state, self._step(tick)).command
-        rate = gyro_rate(self.plant.vehicle, motion.body_rate)
+        rate = self.plant.senses.reading(state.motion.body_rate)
         signals = {
             "position": (position.x, position.y, position.z),
             "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from sim_jax.autopilot import gyro_of, gyro_rate
+from sim_jax.autopilot import gyro_of
 from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet
 from sim_jax.markers import markers_of
@@ -51,11 +51,9 @@ def recorded_of(
     channels
         Which are asked for.
     """
-    motion, markers = log.motion, markers_of(model.vehicle)
-    position, attitude = motion.position, motion.attitude
-    if markers is not None:
-        position, attitude = markers.recorded(motion)
-    rate = gyro_rate(model.vehicle, motion.body_rate)
+    motion = log.motion
+    position, attitude = markers_of(model.vehicle).recorded(motion)
+    rate = gyro_of(model.vehicle).reading(motion.body_rate)
     logged = {
         "position": (position.x, position.y, position.z),
         "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
@@ -99,12 +97,9 @@ def beginning_of(
         Name, of `tuner.vehicle.conditions` -> what surrounds each segment, in its unit.
     """
     start, inlet = segments.start, segments.inlet
-    gyro, markers = gyro_of(model.vehicle), markers_of(model.vehicle)
-    if gyro is not None:
-        true = gyro.body_rate(start.motion.body_rate)
-        start = replace(start, motion=replace(start.motion, body_rate=true))
-    if markers is not None:
-        start = markers.start(start, segments.resting, model.controller.sees_markers)
+    true = gyro_of(model.vehicle).body_rate(start.motion.body_rate)
+    start = replace(start, motion=replace(start.motion, body_rate=true))
+    start = markers_of(model.vehicle).start(start, segments.resting, model.controller.sees_markers)
     environment = environment_of(model, segments, conditions)
     exponent = model.vehicle.effects.get("battery_exponent")
     factor = environment.speed_factor(exponent, jnp.asarray(0), schedule)

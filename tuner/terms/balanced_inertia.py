@@ -338,9 +338,9 @@ def with_inputs_balanced(
     segments = objective.segments
     model = objective.tunable.at(np.asarray(fitted.point.coefficients))
     frames = markers_of(model.vehicle), gyro_of(model.vehicle)
-    moved = bool(objective.conditions) or any(frame is not None for frame in frames)
     if (
-        moved
+        objective.conditions
+        or jax.tree.leaves(frames)
         or job.accelerations is not None
         or any(inlet != "rotor_speed" for inlet in job.inlets)
     ):

@@ -331,7 +331,7 @@ def _recorded(
 ) -> Measured | None:
     """Return the steps of a recording, of the centre of mass in body axes through the air."""
     known = {"position", "attitude", "body_rate", "rotor_speed"} <= set(flight.series)
-    if known and markers_of(model.vehicle) is not None:
+    if known:
         flight = replace(flight, series={**flight.series, **_of_body(flight.series, model)})
     steps = measured(flight)
     return None if steps is None else _through_air(steps, conditions, number)
@@ -340,13 +340,12 @@ def _recorded(
 def _of_body(series: Mapping[str, Series], model: Model) -> dict[str, Series]:
     """Return pose and velocity of the centre of mass, in body axes, from those of markers."""
     markers = markers_of(model.vehicle)
-    assert markers is not None
     attitude, position = series["attitude"], series["position"]
-    turned = Rotation.from_quat(attitude.values, scalar_first=True)
+    turned, moved = Rotation.from_quat(attitude.values, scalar_first=True), {}
     if markers.turn is not None:
         tilt = Rotation.from_quat(np.array(markers.turn.stacked()), scalar_first=True)
         turned = turned * tilt.inv()
-    moved = {"attitude": Series(attitude.time, turned.as_quat(scalar_first=True))}
+        moved["attitude"] = Series(attitude.time, turned.as_quat(scalar_first=True))
     if markers.offset is not None:
         offset = np.array(markers.offset.stacked())  # SciPy takes no array that is read-only
         arm = Series(attitude.time, turned.apply(offset))
