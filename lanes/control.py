@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import prod
+from operator import or_
 from typing import Any
 
 import numpy as np
@@ -16,134 +17,98 @@ from lanes.dependence import dependent, dependent_in_scan, dependent_in_while
 from lanes.lowering import CONTROL, I64, SPILLED, Lowering, dtype_of, shape_of
 from lanes.rules import constant, is_bool, type_of
 from lanes.values import (
-    Deferred,
-    Element,
+    OF_LANE,
+    Elements,
     Memory,
     UnsupportedError,
     Value,
     array_of,
     is_vector,
+    kind_of,
+    parts_of,
 )
 
 Bound = Mapping[Any, Memory]
 
 
-def _parts(value: Value) -> list[ir.Value]:
-    """Return the LLVM values that an array in registers consists of."""
-    assert isinstance(value, np.ndarray)
-    return [x for e in value.ravel() for x in (e if isinstance(e, tuple) else (e,))]
-
-
-def _is_lanes(value: Value) -> bool:
-    if isinstance(value, Memory):
-        return value.storage.lane_stride is not None
-    if isinstance(value, Deferred):
-        return any(map(_is_lanes, value.sources))
-    return any(map(is_vector, _parts(value)))
-
-
-def _is_tangent(value: Value) -> bool:
-    if isinstance(value, Memory):
-        return value.storage.column_stride is not None
-    if isinstance(value, Deferred):
-        return any(map(_is_tangent, value.sources))
-    return any(isinstance(e, tuple) for e in value.ravel())
-
-
-def _flags(found: Sequence[int]) -> list[bool]:
-    return list(map(bool, found))
-
-
-def _rebuilt(value: Value, parts: Sequence[ir.Value]) -> Value:
-    """Return an array in registers with other LLVM values, in the order of `_parts`."""
-    assert isinstance(value, np.ndarray)
-    left, elements = iter(parts), []
-    for e in value.ravel():
-        new: Element = tuple(next(left) for _ in e) if isinstance(e, tuple) else next(left)
-        elements.append(new)
-    return array_of(elements, value.shape)
+def _rebuilt(value: Elements, left: Iterator[ir.Value]) -> Elements:
+    """Return an array in registers with the LLVM values that come next."""
+    return array_of(
+        [
+            tuple(next(left) for _ in e) if isinstance(e, tuple) else next(left)
+            for e in value.ravel()
+        ],
+        value.shape,
+    )
 
 
 class _Carry:
-    """Values that a loop carries, as the φ-nodes of its head."""
+    """Values that a loop carries: LLVM values, and arrays that it changes in memory."""
 
     def __init__(
         self,
         lower: Lowering,
         values: Sequence[Value],
-        kinds: Sequence[tuple[bool, bool]],
+        kinds: Sequence[int],
         read: Sequence[Value] = (),
     ) -> None:
-        """Lay values out, each of every lane or not and with columns or not.
+        """Lay values out, each of its kind.
 
         What the loop also reads as it was before, ``read``, is carried as a copy.
         """
         self.lower, self.kinds = lower, list(kinds)
         self._taken = {id(v.storage.pointer) for v in read if isinstance(v, Memory)}
-        self.values = [
-            self._laid(value, lane=lane, column=column)
-            for value, (lane, column) in zip(values, self.kinds, strict=True)
-        ]
-        self.nodes: list[list[ir.PhiInstr]] = []
+        self.values = [self._laid(*each) for each in zip(values, self.kinds, strict=True)]
 
-    def _laid(self, value: Value, *, lane: bool, column: bool) -> Value:
-        lower = self.lower
+    def _laid(self, value: Value, kind: int) -> Elements | Memory:
         if isinstance(value, Memory) and value.storage.writable:
-            same = _is_lanes(value) or not lane, _is_tangent(value) or not column
-            if all(same) and id(value.storage.pointer) not in self._taken:
+            alike = not kind & ~kind_of(value) and value.version == value.storage.version
+            if alike and id(value.storage.pointer) not in self._taken:
                 self._taken.add(id(value.storage.pointer))
                 return value
         if prod(value.shape) > SPILLED:
-            return lower.spilled(value, lane=lane, column=column)
-        return self._promoted(value, lane=lane, column=column)
+            return self.lower.spilled(value, kind)
+        return self.lower.promoted(value, kind)
 
-    def _promoted(self, given: Value, *, lane: bool, column: bool) -> Value:
-        elements = self.lower.elements(given)
-        promoted = [self.lower.promoted(e, lane=lane, column=column) for e in elements.ravel()]
-        return array_of(promoted, elements.shape)
+    def parts(self, values: Sequence[Value]) -> list[ir.Value]:
+        """Return what is carried of values as LLVM values."""
+        return [x for v in values if isinstance(v, np.ndarray) for x in parts_of(v.ravel())]
 
-    def enter(self, before: ir.Block) -> list[Value]:
-        """Write the φ-nodes; return what the body is given."""
-        b = self.lower.b
-        inside: list[Value] = []
-        for value in self.values:
-            if isinstance(value, Memory):
-                self.nodes.append([])
-                inside.append(value)
-                continue
-            nodes = []
-            for part in _parts(value):
-                node = b.phi(part.type)
-                node.add_incoming(part, before)
-                nodes.append(node)
-            self.nodes.append(nodes)
-            inside.append(_rebuilt(value, nodes))
-        return inside
+    def rebuilt(self, parts: Sequence[ir.Value]) -> list[Value]:
+        """Return the carried values with other LLVM values, in the order of `parts`."""
+        left = iter(parts)
+        return [
+            Memory(value.storage, value.shape, value.storage.version)
+            if isinstance(value, Memory)
+            else _rebuilt(value, left)
+            for value in self.values
+        ]
 
-    def again(self, outs: Sequence[Value]) -> list[Value]:
-        """Return what the body gives as what it is given, before the jump back is written."""
+    def handed_on(self, outs: Sequence[Value]) -> list[Value]:
+        """Return what one turn gives as what the next one is given."""
         following: list[Value] = []
-        for value, out, (lane, column) in zip(self.values, outs, self.kinds, strict=True):
+        for value, out, kind in zip(self.values, outs, self.kinds, strict=True):
             if isinstance(value, Memory):
                 if not isinstance(out, Memory) or out.storage is not value.storage:
                     self.lower.store_rows(value, None, self.lower.elements(out))
                     value.storage.version += 1
                 following.append(value)
             else:
-                following.append(self._promoted(out, lane=lane, column=column))
+                following.append(self.lower.promoted(out, kind))
         return following
 
-    def close(self, following: Sequence[Value], end: ir.Block) -> list[Value]:
-        """Complete the φ-nodes; return the carried values after the loop."""
-        results: list[Value] = []
-        for value, nodes, out in zip(self.values, self.nodes, following, strict=True):
-            if isinstance(value, Memory):
-                results.append(Memory(value.storage, value.shape, value.storage.version))
-                continue
-            for node, part in zip(nodes, _parts(out), strict=True):
-                node.add_incoming(part, end)
-            results.append(_rebuilt(value, nodes))
-        return results
+    def loop(
+        self,
+        goes_on: Callable[[list[Value]], ir.Value],
+        turn: Callable[[list[Value]], Sequence[Value]],
+    ) -> list[Value]:
+        """Write a loop; return the carried values after it."""
+        nodes = self.lower.loop(
+            self.parts(self.values),
+            lambda nodes: goes_on(self.rebuilt(nodes)),
+            lambda nodes: self.parts(turn(self.rebuilt(nodes))),
+        )
+        return self.rebuilt(nodes)
 
 
 def _row(lower: Lowering, value: Value, number: ir.Value) -> Value:
@@ -171,15 +136,10 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     fixed = [_laid_before(lower, v, indexed=False) for v in operands[:consts]]
     rows = [_laid_before(lower, v, indexed=not once) for v in operands[consts + carried :]]
     given = [*fixed, *operands[consts : consts + carried], *rows]
-    lanes = _flags(dependent_in_scan(p, [_is_lanes(v) for v in given]))
-    columns = _flags(dependent_in_scan(p, [_is_tangent(v) for v in given]))
+    kinds = dependent_in_scan(p, [*map(kind_of, given)])
     into = [
-        bound[var]
-        if var in bound
-        else lower.local(shape_of(var), type_of(dtype_of(var)), lane=lane, column=column)
-        for var, lane, column in zip(
-            eqn.outvars[carried:], lanes[carried:], columns[carried:], strict=True
-        )
+        bound[var] if var in bound else lower.local(shape_of(var), type_of(dtype_of(var)), kind)
+        for var, kind in zip(eqn.outvars[carried:], kinds[carried:], strict=True)
     ]
 
     # short rows are collected, and several of them laid at once
@@ -212,75 +172,56 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     start = operands[consts : consts + carried]
     if once:
         return [*turn(constant(I64, 0), start), *into]
-    kinds = list(zip(lanes[:carried], columns[:carried], strict=True))
-    carry = _Carry(lower, start, kinds, [*fixed, *rows])
-    size = lower.size(length)
-    end = _counted(lower, size, carry, turn)
+    first, size = array_of([constant(I64, 0)], ()), lower.size(length)
+    carry = _Carry(lower, [first, *start], [0, *kinds[:carried]], [*fixed, *rows])
+
+    def again(inside: list[Value]) -> list[Value]:
+        number = lower.elements(inside[0])[()]
+        outs = turn(number, inside[1:])
+        return carry.handed_on([array_of([b.add(number, constant(I64, 1))], ()), *outs])
+
+    _, *end = carry.loop(
+        lambda inside: b.icmp_signed("<", lower.elements(inside[0])[()], size), again
+    )
     for count in together:
         lay(size, count, b.urem(size, constant(I64, count)))
     return [*end, *into]
 
 
-def _counted(
-    lower: Lowering,
-    length: ir.Value,
-    carry: _Carry,
-    turn: Callable[[ir.Value, Sequence[Value]], Sequence[Value]],
-) -> list[Value]:
-    """Write a loop of so many turns."""
-    b = lower.b
-    before, head = b.block, b.function.append_basic_block("loop")
-    body, after = (b.function.append_basic_block(name) for name in ("turn", "after"))
-    b.branch(head)
-    b.position_at_end(head)
-    number = b.phi(I64)
-    number.add_incoming(constant(I64, 0), before)
-    inside = carry.enter(before)
-    b.cbranch(b.icmp_signed("<", number, length), body, after)
-    b.position_at_end(body)
-    following = carry.again(turn(number, inside))
-    number.add_incoming(b.add(number, constant(I64, 1)), b.block)
-    results = carry.close(following, b.block)
-    b.branch(head)
-    b.position_at_end(after)
-    return results
-
-
 def _while(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> list[Value]:
-    p, b = eqn.params, lower.b
+    p = eqn.params
     conds, consts = p["cond_nconsts"], p["body_nconsts"]
     operands = [
         *(_laid_before(lower, v, indexed=False) for v in operands[: conds + consts]),
         *operands[conds + consts :],
     ]
     of_cond, of_body = operands[:conds], operands[conds : conds + consts]
-    lanes = _flags(dependent_in_while(p, [_is_lanes(v) for v in operands]))
-    columns = _flags(dependent_in_while(p, [_is_tangent(v) for v in operands]))
-    kinds = list(zip(lanes, columns, strict=True))
+    kinds = dependent_in_while(p, [*map(kind_of, operands)])
     carry = _Carry(lower, operands[conds + consts :], kinds, operands[: conds + consts])
-    before, head = b.block, b.function.append_basic_block("while")
-    body, after = (b.function.append_basic_block(name) for name in ("turn", "after"))
-    b.branch(head)
-    b.position_at_end(head)
-    inside = carry.enter(before)
-    goes_on = lower.run(p["cond_jaxpr"].jaxpr, p["cond_jaxpr"].consts, [*of_cond, *inside])
-    flag = lower.elements(goes_on[0])[()]
-    if any(isinstance(value, Memory) for value in inside) and is_vector(flag):
-        raise UnsupportedError("a loop that each lane ends for itself and that carries an array")
-    b.cbranch(lower.e.any_lane(flag), body, after)
-    b.position_at_end(body)
-    outs = lower.run(p["body_jaxpr"].jaxpr, p["body_jaxpr"].consts, [*of_body, *inside])
-    following = carry.again(outs)
-    if is_vector(flag):  # lanes that have ended stay as they are
-        following = [
-            lower.elementwise("select_n", {}, [goes_on[0], old, new], new.shape)
-            for old, new in zip(inside, following, strict=True)
-        ]
-        following = carry.again(following)
-    results = carry.close(following, b.block)
-    b.branch(head)
-    b.position_at_end(after)
-    return results
+    going: list[Value] = []
+
+    def goes_on(inside: list[Value]) -> ir.Value:
+        going[:] = lower.run(p["cond_jaxpr"].jaxpr, p["cond_jaxpr"].consts, [*of_cond, *inside])
+        flag = lower.elements(going[0])[()]
+        if any(isinstance(value, Memory) for value in inside) and is_vector(flag):
+            what = "a loop that each lane ends for itself and that carries an array"
+            raise UnsupportedError(what)
+        return lower.e.any_lane(flag)
+
+    def turn(inside: list[Value]) -> list[Value]:
+        outs = lower.run(p["body_jaxpr"].jaxpr, p["body_jaxpr"].consts, [*of_body, *inside])
+        following = carry.handed_on(outs)
+        if not kind_of(going[0]):
+            return following
+        # lanes that have ended stay as they are
+        return carry.handed_on(
+            [
+                lower.elementwise("select_n", {}, [going[0], old, new], new.shape)
+                for old, new in zip(inside, following, strict=True)
+            ]
+        )
+
+    return carry.loop(goes_on, turn)
 
 
 def _cond(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> list[Value]:
@@ -289,20 +230,15 @@ def _cond(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> li
     rest = operands[1:]
     if is_vector(which):  # what one lane changes in place would change for all
         rest = [_laid_before(lower, v, indexed=False) for v in rest]
-    lanes = [False] * len(eqn.outvars)
-    columns = [False] * len(eqn.outvars)
+    kinds = [OF_LANE * is_vector(which)] * len(eqn.outvars)
     for branch in branches:
-        by_lane = _flags(dependent(branch.jaxpr, [_is_lanes(v) for v in rest]))
-        by_column = _flags(dependent(branch.jaxpr, [_is_tangent(v) for v in rest]))
-        lanes = [a or b for a, b in zip(lanes, by_lane, strict=True)]
-        columns = [a or b for a, b in zip(columns, by_column, strict=True)]
-    lanes = [lane or is_vector(which) for lane in lanes]
-    kinds = list(zip(lanes, columns, strict=True))
+        kinds = list(map(or_, kinds, dependent(branch.jaxpr, [*map(kind_of, rest)])))
 
     def result_of(branch: Any) -> list[Value]:
         outs = lower.run(branch.jaxpr, branch.consts, rest)
         return [
-            _uniform(lower, out, lane=k[0], column=k[1]) for out, k in zip(outs, kinds, strict=True)
+            out if isinstance(out, Memory) and out.storage.writable else lower.promoted(out, kind)
+            for out, kind in zip(outs, kinds, strict=True)
         ]
 
     if isinstance(which, ir.Constant) and not is_vector(which):
@@ -332,31 +268,29 @@ def _branched(
 ) -> list[Value]:
     """Compute one of two lists of values of the same kinds, by a branch."""
     b = lower.b
-    blocks = [b.function.append_basic_block(name) for name in ("yes", "no", "end")]
-    b.cbranch(flag, *blocks[:2])
     before = [storage.version for storage in lower.storages]
     ends: list[_End] = []
-    for block, compute in zip(blocks[:2], (yes, no), strict=True):
-        for storage, version in zip(lower.storages, before, strict=False):
-            storage.version = version
-        b.position_at_end(block)
-        found = compute()
-        ends.append(_End(found, b.block, [storage.version for storage in lower.storages]))
+    with b.if_else(flag) as branches:
+        for branch, compute in zip(branches, (yes, no), strict=True):
+            for storage, version in zip(lower.storages, before, strict=False):
+                storage.version = version
+            with branch:
+                found = compute()
+                ends.append(_End(found, b.block, [s.version for s in lower.storages]))
     stays = [
         isinstance(x, Memory) and isinstance(y, Memory) and x.storage is y.storage
         for x, y in zip(ends[0].values, ends[1].values, strict=True)
     ]
     for end in ends:
-        b.position_at_end(end.block)
         for storage, version in zip(lower.storages, end.versions, strict=False):
             storage.version = version
-        for number, (value, stay) in enumerate(zip(end.values, stays, strict=True)):
-            if not stay:
-                end.values[number] = lower.elements(value)
-        b.branch(blocks[2])
+        with b.goto_block(end.block):
+            end.values = [
+                value if stay else lower.elements(value)
+                for value, stay in zip(end.values, stays, strict=True)
+            ]
     for storage, *versions in zip(lower.storages, ends[0].versions, ends[1].versions, strict=False):
         storage.version = max(versions)
-    b.position_at_end(blocks[2])
     return [
         _merged(lower, first, second, ends)
         for first, second in zip(ends[0].values, ends[1].values, strict=True)
@@ -376,8 +310,10 @@ def _merged(lower: Lowering, first: Value, second: Value, ends: Sequence[_End]) 
     """Return the value of one branch or the other, where both have ended."""
     if isinstance(first, Memory):
         return Memory(first.storage, first.shape, first.storage.version)
+    assert isinstance(first, np.ndarray)
+    assert isinstance(second, np.ndarray)
     nodes = []
-    for x, y in zip(_parts(first), _parts(second), strict=True):
+    for x, y in zip(parts_of(first.ravel()), parts_of(second.ravel()), strict=True):
         if x is y:
             nodes.append(x)
             continue
@@ -385,7 +321,7 @@ def _merged(lower: Lowering, first: Value, second: Value, ends: Sequence[_End]) 
         for value, end in zip((x, y), ends, strict=True):
             node.add_incoming(value, end.block)
         nodes.append(node)
-    return _rebuilt(first, nodes)
+    return _rebuilt(first, iter(nodes))
 
 
 def _selected(
@@ -419,15 +355,6 @@ def _is_number(lower: Lowering, which: ir.Value, number: int, count: int) -> ir.
     if number == 0:
         return lower.b.icmp_signed("<=", which, bound)
     return lower.b.icmp_signed(">=" if number == count - 1 else "==", which, bound)
-
-
-def _uniform(lower: Lowering, value: Value, *, lane: bool, column: bool) -> Value:
-    if isinstance(value, Memory) and value.storage.writable:
-        return value
-    elements = lower.elements(value)
-    return array_of(
-        [lower.promoted(e, lane=lane, column=column) for e in elements.ravel()], elements.shape
-    )
 
 
 CONTROL.update({"scan": _scan, "while": _while, "cond": _cond})

@@ -106,18 +106,15 @@ class Layout:
         kind = ir.FunctionType(ir.VoidType(), [bytes_of, bytes_of, whole, whole, whole, *[I64] * 5])
         function = ir.Function(module, kind, "run")
         ins, outs, lengths, segments, turns, lanes, blocks, passes, begin, end = function.args
-        entry, body, head, inside, after = (
-            function.append_basic_block(name)
-            for name in ("entry", "begin", "head", "block", "done")
-        )
+        entry, body = (function.append_basic_block(name) for name in ("entry", "begin"))
         stack = ir.IRBuilder(entry)
+        b.position_at_end(body)
 
         def allocate(stored: ir.Type, count: int) -> ir.Value:
             memory = stack.alloca(stored, ir.Constant(ir.IntType(32), count))
             memory.align = 64
             return memory
 
-        b.position_at_end(body)
         known = {
             stand_in: b.load(b.gep(lengths, [constant(I64, number)]))
             for number, stand_in in enumerate(self.lengths.values())
@@ -130,47 +127,42 @@ class Layout:
         taken = [
             _pointer_in(b, outs, number, shape.dtype) for number, shape in enumerate(self.outputs)
         ]
-        b.branch(head)
-        b.position_at_end(head)
-        block = b.phi(I64)
-        block.add_incoming(begin, body)
-        b.cbranch(b.icmp_signed("<", block, end), inside, after)
-        b.position_at_end(inside)
         at_once = constant(I64, width)
-        first_lane = b.mul(block, at_once)
 
-        def of_lanes(table: ir.Value) -> ir.Value:
-            place = b.bitcast(b.gep(table, [first_lane]), emitter.vector(I64).as_pointer())
-            found = b.load(place)
-            found.align = 8
-            return found
+        def compute(block: ir.Value) -> None:
+            first_lane = b.mul(block, at_once)
 
-        frame = _Frame(
-            given,
-            taken,
-            lanes,
-            b.mul(blocks, at_once),
-            passes,
-            first_lane,
-            b.mul(b.srem(block, blocks), at_once),
-            of_lanes(segments),
-            of_lanes(turns),
-        )
-        memories = self._results(lower, frame)
-        bound = {
-            var: memory
-            for var, memory in zip(closed.jaxpr.outvars, memories, strict=True)
-            if not isinstance(var, Literal)
-        }
-        taking = self._taken(lower, frame, closed.jaxpr.invars)
-        results = lower.run(closed.jaxpr, closed.consts, taking, bound)
-        for result, memory in zip(results, memories, strict=True):
-            if isinstance(result, Memory) and result.storage is memory.storage:
-                continue  # a loop has laid it there
-            lower.store_rows(memory, None, result)
-        block.add_incoming(b.add(block, constant(I64, 1)), b.block)
-        b.branch(head)
-        b.position_at_end(after)
+            def of_lanes(table: ir.Value) -> ir.Value:
+                place = b.bitcast(b.gep(table, [first_lane]), emitter.vector(I64).as_pointer())
+                found = b.load(place)
+                found.align = 8
+                return found
+
+            frame = _Frame(
+                given,
+                taken,
+                lanes,
+                b.mul(blocks, at_once),
+                passes,
+                first_lane,
+                b.mul(b.srem(block, blocks), at_once),
+                of_lanes(segments),
+                of_lanes(turns),
+            )
+            memories = self._results(lower, frame)
+            bound = {
+                var: memory
+                for var, memory in zip(closed.jaxpr.outvars, memories, strict=True)
+                if not isinstance(var, Literal)
+            }
+            taking = self._taken(lower, frame, closed.jaxpr.invars)
+            results = lower.run(closed.jaxpr, closed.consts, taking, bound)
+            for result, memory in zip(results, memories, strict=True):
+                if isinstance(result, Memory) and result.storage is memory.storage:
+                    continue  # a loop has laid it there
+                lower.store_rows(memory, None, result)
+
+        lower.count(begin, end, 1, compute)
         b.ret_void()
         stack.branch(body)
         return str(module)

@@ -32,6 +32,8 @@ from lanes.rules import (
     type_of,
 )
 from lanes.values import (
+    OF_COLUMN,
+    OF_LANE,
     Deferred,
     Element,
     Elements,
@@ -43,6 +45,8 @@ from lanes.values import (
     array_of,
     base,
     is_vector,
+    kind_of,
+    parts_of,
 )
 
 I64 = ir.IntType(64)
@@ -238,13 +242,20 @@ class Lowering:
         """Return a whole number as an index."""
         return converted(self.e, number, I64)
 
-    def promoted(self, element: Element, *, lane: bool, column: bool) -> Element:
-        """Return an element of every lane, or every column, if it is to be."""
-        if column and not isinstance(element, tuple):
-            element = (element,) * self.columns
-        if isinstance(element, tuple):
-            return tuple(self.promoted(x, lane=lane, column=False) for x in element)
-        return self.e.splat(element) if lane else element
+    def promoted(self, value: Value, kind: int) -> Elements:
+        """Return an array in registers, of every lane and of every column if it is to be."""
+
+        def of(element: Element) -> Element:
+            if isinstance(element, tuple):
+                return tuple(map(of, element))
+            return self.e.splat(element) if kind & OF_LANE else element
+
+        elements = self.elements(value)
+        wide = [
+            (e,) * self.columns if kind & OF_COLUMN and not isinstance(e, tuple) else e
+            for e in elements.ravel()
+        ]
+        return array_of([of(e) for e in wide], elements.shape)
 
     # memory
 
@@ -346,15 +357,11 @@ class Lowering:
         self, flag: ir.Value, yes: Callable[[], ir.Value], no: Callable[[], ir.Value]
     ) -> ir.Value:
         """Compute one of two values, by a branch."""
-        function = self.b.function
-        branches = [function.append_basic_block(n) for n in ("yes", "no", "end")]
-        self.b.cbranch(flag, *branches[:2])
         found = []
-        for block, compute in zip(branches[:2], (yes, no), strict=True):
-            self.b.position_at_end(block)
-            found.append((compute(), self.b.block))
-            self.b.branch(branches[2])
-        self.b.position_at_end(branches[2])
+        with self.b.if_else(flag) as branches:
+            for branch, compute in zip(branches, (yes, no), strict=True):
+                with branch:
+                    found.append((compute(), self.b.block))
         phi = self.b.phi(found[0][0].type)
         for value, block in found:
             phi.add_incoming(value, block)
@@ -547,8 +554,8 @@ class Lowering:
 
         together = self._side_by_side(stored)
         whole = self.b.and_(count, constant(I64, -together))
-        self._count(constant(I64, 0), whole, together, lambda place: lay(place, together))
-        self._count(whole, count, 1, lambda place: lay(place, 1))
+        self.count(constant(I64, 0), whole, together, lambda place: lay(place, together))
+        self.count(whole, count, 1, lambda place: lay(place, 1))
         self.b.ret_void()
         self.e.b = outside
         return function
@@ -582,21 +589,21 @@ class Lowering:
             rows, half = turned, half // 2
         return rows
 
-    def local(self, shape: tuple[int, ...], kind: ir.Type, *, lane: bool, column: bool) -> Memory:
-        """Return memory on the stack, uninitialised."""
+    def local(self, shape: tuple[int, ...], number: ir.Type, kind: int) -> Memory:
+        """Return memory on the stack, uninitialised, for numbers of a type."""
         if any(length in self.lengths for length in shape):
             raise UnsupportedError(f"an array of shape {shape} that is no output")
-        count, stored = prod(shape), ir.IntType(8) if kind == BOOL else kind
-        width = self.e.width if lane else 1
-        total = count * width * (self.columns if column else 1)
+        count, stored = prod(shape), ir.IntType(8) if number == BOOL else number
+        width = self.e.width if kind & OF_LANE else 1
+        total = count * width * (self.columns if kind & OF_COLUMN else 1)
         unit = constant(I64, width)
         storage = Storage(
             pointer=self._allocate(stored, total),
-            kind=kind,
+            kind=number,
             strides=self.row_major(shape, unit),
-            lane_stride=constant(I64, 1) if lane else None,
+            lane_stride=constant(I64, 1) if kind & OF_LANE else None,
             first_lane=None,
-            column_stride=constant(I64, count * width) if column else None,
+            column_stride=constant(I64, count * width) if kind & OF_COLUMN else None,
             writable=True,
         )
         self.storages.append(storage)
@@ -610,35 +617,26 @@ class Lowering:
             return self._laid_out(numbers, flat[0].type)
         return self.spilled(elements)
 
-    def spilled(self, value: Value, *, lane: bool = False, column: bool = False) -> Memory:
+    def spilled(self, value: Value, kind: int = 0) -> Memory:
         """Return an array as memory of this lowering's own, a copy of what lies elsewhere."""
         if not isinstance(value, np.ndarray):
-            return self._copied(value, lane=lane, column=column)
-        given = value
-        flat = [x for e in given.ravel() for x in (e if isinstance(e, tuple) else (e,))]
-        lane = lane or any(map(is_vector, flat))
-        column = column or any(isinstance(e, tuple) for e in given.ravel())
-        memory = self.local(given.shape, base(flat[0].type), lane=lane, column=column)
-        self.store_rows(memory, None, given)
+            return self._copied(value, kind)
+        (first, *_) = parts_of(value.ravel())
+        memory = self.local(value.shape, base(first.type), kind | kind_of(value))
+        self.store_rows(memory, None, value)
         return memory
 
-    def _copied(self, value: Memory | Deferred, *, lane: bool, column: bool) -> Memory:
+    def _copied(self, value: Memory | Deferred, kind: int) -> Memory:
         """Return memory that a loop fills with an array's elements."""
         copies: list[Memory] = []
 
         def copy(index: Index) -> None:
-            element = self.at(value, index)
-            parts = element if isinstance(element, tuple) else (element,)
+            element = array_of([self.at(value, index)], ())
             if not copies:
-                copies.append(
-                    self.local(
-                        value.shape,
-                        base(parts[0].type),
-                        lane=lane or any(map(is_vector, parts)),
-                        column=column or isinstance(element, tuple),
-                    )
-                )
-            self.store(copies[0], index, element)
+                (first, *_) = parts_of(element.ravel())
+                own = self.local(value.shape, base(first.type), kind | kind_of(element))
+                copies.append(own)
+            self.store(copies[0], index, element[()])
 
         self.for_each(value.shape, copy)
         return copies[0]
@@ -653,27 +651,42 @@ class Lowering:
                 number = self.b.udiv(number, constant(I64, length))
             body(index)
 
-        self._count(constant(I64, 0), constant(I64, prod(shape)), 1, at)
+        self.count(constant(I64, 0), constant(I64, prod(shape)), 1, at)
 
-    def _count(
+    def count(
         self, begin: ir.Value, end: ir.Value, step: int, body: Callable[[ir.Value], None]
     ) -> None:
         """Write a loop over numbers from one to before another."""
-        b = self.b
-        before = b.block
-        head, inside, after = (
-            b.function.append_basic_block(name) for name in ("count", "each", "after")
-        )
+
+        def turn(carried: Sequence[ir.Value]) -> list[ir.Value]:
+            body(carried[0])
+            return [self.b.add(carried[0], constant(I64, step))]
+
+        self.loop([begin], lambda carried: self.b.icmp_signed("<", carried[0], end), turn)
+
+    def loop(
+        self,
+        begin: Sequence[ir.Value],
+        goes_on: Callable[[Sequence[ir.Value]], ir.Value],
+        turn: Callable[[Sequence[ir.Value]], Sequence[ir.Value]],
+    ) -> list[ir.Value]:
+        """Write a loop that carries values, its head's φ-nodes; return them as it leaves them."""
+        b, nodes = self.b, []
+        before, head = b.block, b.append_basic_block("loop")
+        inside, after = (b.append_basic_block(name) for name in ("turn", "after"))
         b.branch(head)
         b.position_at_end(head)
-        number = b.phi(I64)
-        number.add_incoming(begin, before)
-        b.cbranch(b.icmp_signed("<", number, end), inside, after)
+        for value in begin:
+            nodes.append(b.phi(value.type))
+            nodes[-1].add_incoming(value, before)
+        b.cbranch(goes_on(nodes), inside, after)
         b.position_at_end(inside)
-        body(number)
-        number.add_incoming(b.add(number, constant(I64, step)), b.block)
+        following = turn(nodes)
+        for node, value in zip(nodes, following, strict=True):
+            node.add_incoming(value, b.block)
         b.branch(head)
         b.position_at_end(after)
+        return nodes
 
     def start_within(self, start: ir.Value, length: int, size: int) -> ir.Value:
         """Return where a slice begins, moved so that it lies in its array."""
@@ -900,12 +913,7 @@ def _dynamic_update_slice(lower: Lowering, _: JaxprEqn, operands: list[Value]) -
             changed[to] = update[place]
         return changed
     if not isinstance(value, Memory) or not value.storage.writable:
-        flat = [x for e in update.ravel() for x in (e if isinstance(e, tuple) else (e,))]
-        value = lower.spilled(
-            value,
-            lane=any(map(is_vector, flat)),
-            column=any(isinstance(e, tuple) for e in update.ravel()),
-        )
+        value = lower.spilled(value, kind_of(update))
     if any(map(is_vector, starts)):
         raise UnsupportedError("a change in place at an index of each lane's own")
     if value.version != value.storage.version:

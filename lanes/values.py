@@ -10,8 +10,10 @@ them, `Deferred` computes each when it is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
+from operator import or_
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -44,6 +46,29 @@ def is_vector(value: ir.Value) -> bool:
 def base(kind: ir.Type) -> ir.Type:
     """Return the type of one lane's number."""
     return kind.element if isinstance(kind, ir.VectorType) else kind
+
+
+OF_LANE, OF_COLUMN = 1, 2
+"""Bits of an array's kind: each lane has its own, each column of a tangent has."""
+
+
+def parts_of(elements: Iterable[Element]) -> list[ir.Value]:
+    """Return the LLVM values that elements consist of."""
+    return [x for e in elements for x in (e if isinstance(e, tuple) else (e,))]
+
+
+def kind_of(value: Value) -> int:
+    """Return the bits of an array's kind."""
+    if isinstance(value, Memory):
+        storage = value.storage
+        by_lane, by_column = storage.lane_stride is not None, storage.column_stride is not None
+    elif isinstance(value, Deferred):
+        return reduce(or_, map(kind_of, value.sources), 0)
+    else:
+        elements = value.ravel().tolist()
+        by_lane = any(map(is_vector, parts_of(elements)))
+        by_column = any(isinstance(e, tuple) for e in elements)
+    return OF_LANE * by_lane | OF_COLUMN * by_column
 
 
 @dataclass(eq=False)
