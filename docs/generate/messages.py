@@ -180,7 +180,7 @@ def _stage(code: Code) -> str:
 
 
 def _finding(code: Code) -> str:
-    line = IN_OTHER_WORDS.get(code) or f"{code.sentence} {code.remedy or NOTHING_TO_DO}"
+    line = IN_OTHER_WORDS.get(code) or f"{code.text} {code.remedy or NOTHING_TO_DO}"
     line = _shown(re.sub(r"\{[^}]*\}", UNKNOWN, line))
     return f'- <a id="{code}"></a>`{code}`: {line}'
 

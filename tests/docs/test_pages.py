@@ -113,7 +113,7 @@ def test_messages_are_grouped_by_stage_and_have_an_answer():
     groups = page.partition("## Findings of a run")[2].split("\n### ")[1:]
     assert [group.partition("\n")[0] for group in groups] == list(STAGES)
     assert all(group.count("<a id=") > 1 for group in groups)
-    assert set(IN_OTHER_WORDS) >= {c for c in Code if not isinstance(c.sentence, str)}
+    assert set(IN_OTHER_WORDS) >= {c for c in Code if not isinstance(c.text, str)}
     refusals = re.findall(r"^- (?:<a id=.*?</a>)?\*\*.*\*\*; (.*)$", page, flags=re.MULTILINE)
     assert len(refusals) > 300
     assert all(refusals)

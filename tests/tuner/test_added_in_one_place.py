@@ -33,14 +33,16 @@ from tuner.cli.options import EACH, EVERY
 from tuner.config import JobFile, settle
 from tuner.core import shipped
 from tuner.core.errors import ConfigError, ExportError
+from tuner.core.phrases import Worded
 from tuner.core.yaml_section import build, section_of
 from tuner.evaluate.write import write_flights
 from tuner.exporters.simulators import registered
 from tuner.exporters.target import Draft, Target, differences
-from tuner.findings.findings import Finding, Worded, brief, one_line
+from tuner.findings.findings import Finding, brief, one_line
 from tuner.options import FILES, Options
 from tuner.recordings.inspection import inspect_recordings
 from tuner.vehicle import (
+    COEFFICIENTS,
     EFFECTS,
     REGISTRY,
     Coefficient,
@@ -127,7 +129,7 @@ def test_an_option_is_one_field_for_the_command_line_python_the_job_file_and_htt
 @pytest.fixture
 def added(monkeypatch):
     """The row and the term, and nothing else."""
-    monkeypatch.setitem(REGISTRY, NAME, ROW)
+    monkeypatch.setitem(COEFFICIENTS, NAME, ROW)
     monkeypatch.setattr(total, "TERMS", (*total.TERMS, sail_drag))
 
 
@@ -192,7 +194,7 @@ def test_every_effect_of_the_registry_acts():
 
 
 def test_a_row_without_a_term_is_noticed(monkeypatch):
-    monkeypatch.setitem(REGISTRY, NAME, ROW)
+    monkeypatch.setitem(COEFFICIENTS, NAME, ROW)
     assert effects_that_do_nothing() == [NAME]
 
 

@@ -1,8 +1,25 @@
-"""Parts of sentences: lists of names, percentages, quantities with their units."""
+"""Parts of sentences: codes with their texts, lists of names, quantities with their units."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import StrEnum
+from typing import Any, Self
+
+
+class Worded(StrEnum):
+    """Codes, each with its text: what was noticed, and what to do about it."""
+
+    text: Any
+    remedy: Any
+
+    def __new__(cls, value: str, text: Any = None, remedy: Any = "") -> Self:
+        """Keep the texts beside the code."""
+        if text is None:
+            raise TypeError(f"{value} has no text")
+        code = str.__new__(cls, value)
+        code._value_, code.text, code.remedy = value, text, remedy
+        return code
 
 
 def listed(words: Sequence[str]) -> str:

@@ -182,36 +182,25 @@ def table_of(spans: Sequence[Span], seconds: float, processor: float) -> tuple[R
     Every instant counts for the innermost span that holds it, so that the rows' seconds, and
     processor seconds, sum up to those of the process, ``seconds`` and ``processor``.
     """
-    own = sorted((s for s in spans if not s.beside), key=lambda s: (s.begin, -s.end))
-    rows = {ELSEWHERE: Row(ELSEWHERE, processor=processor)}
-    open_: list[Span] = [Span(ELSEWHERE, 0.0, seconds)]
-    clock = 0.0
-
-    def stage() -> Row:
-        name = next(s.name for s in reversed(open_) if s.is_stage)
-        return rows.setdefault(name, Row(name))
-
-    def count_until(moment: float) -> None:
-        nonlocal clock
-        row = stage()
-        passed = max(0.0, moment - clock)
-        row.seconds += passed
-        if not open_[-1].is_stage:
-            row.jax[open_[-1].name] += passed
-        clock = max(clock, moment)
-
-    for current in own:
-        while len(open_) > 1 and open_[-1].end <= current.begin:
-            count_until(open_[-1].end)
+    whole = Span(ELSEWHERE, 0.0, seconds, processor=processor)
+    rows = {ELSEWHERE: Row(ELSEWHERE)}
+    open_: list[tuple[Span, Row]] = []
+    for each in [
+        whole,
+        *sorted((s for s in spans if not s.beside), key=lambda s: (s.begin, -s.end)),
+    ]:
+        while len(open_) > 1 and open_[-1][0].end <= each.begin:
             open_.pop()
-        count_until(current.begin)
-        stage().processor -= current.processor
-        open_.append(current)
-        stage().processor += current.processor
-        stage().programs += current.name == COMPILING
-    while open_:
-        count_until(min(open_[-1].end, seconds))
-        open_.pop()
+        outer = open_[-1:]
+        row = rows.setdefault(each.name, Row(each.name)) if each.is_stage else outer[0][1]
+        row.programs += each.name == COMPILING
+        spent = min(each.end, seconds) - each.begin
+        for (one, stage), sign in ((each, row), 1.0), *((around, -1.0) for around in outer):
+            stage.seconds += sign * spent
+            stage.processor += sign * each.processor
+            if not one.is_stage:
+                stage.jax[one.name] += sign * spent
+        open_.append((each, row))
     elsewhere = rows.pop(ELSEWHERE)
     return (*rows.values(), elsewhere)
 

@@ -6,10 +6,9 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from enum import StrEnum
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
-from tuner.core.phrases import as_sentence, listed, percent, shorten
+from tuner.core.phrases import Worded, as_sentence, listed, percent, shorten
 from tuner.findings import composed
 from tuner.vehicle.motor_orders import order_in_words
 
@@ -29,20 +28,6 @@ GIVE_VEHICLE = (
 
 CLAUSE = re.compile(r"[;.] | \(|, (?=and|as|at|or|if)|: (?!false|true)(?=[a-z0-9]+ )")
 """Where the first clause of a sentence ends; not before the value of a setting."""
-
-
-class Worded(StrEnum):
-    """Codes, each with what was noticed as a sentence, and what to do about it."""
-
-    sentence: Text
-    remedy: Text
-
-    def __new__(cls, value: str, sentence: Text, remedy: Text) -> Self:
-        """Keep the sentences beside the code."""
-        code = str.__new__(cls, value)
-        code._value_ = value
-        code.sentence, code.remedy = sentence, remedy
-        return code
 
 
 class Code(Worded):
@@ -527,7 +512,7 @@ class Finding:
 
 def sentence(finding: Finding) -> str:
     """Return what was noticed, as a sentence."""
-    return _worded(finding.code.sentence, finding)
+    return _worded(finding.code.text, finding)
 
 
 def remedy(finding: Finding) -> str:

@@ -4,24 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
-from tuner.core.phrases import listed
+from tuner.core.phrases import Worded, listed
 
 Kind = Literal["info", "warning"]
-
-
-class Worded(StrEnum):
-    """Codes, each with its text."""
-
-    text: str
-
-    def __new__(cls, value: str, text: str = "") -> Self:
-        """Keep the text beside the code."""
-        code = str.__new__(cls, value)
-        code._value_, code.text = value, text
-        return code
 
 
 class NoteCode(Worded):
@@ -309,7 +296,7 @@ PASSED_OVER = (NoteCode.LAYOUT_UNKNOWN, NoteCode.FIELD_MISSING)
 def reason_in_words(note: Note) -> str:
     """Return what was found or changed."""
     first, second, alike, *_ = (*note.names, "", "", "")
-    return note.code.text.format(
+    return str(note.code.text).format(
         **note.numbers,
         count=note.count,
         topic=note.topic,

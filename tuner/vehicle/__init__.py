@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tuner.vehicle.coefficient import EFFECTS, Coefficient, NotCarried, Written
+from tuner.vehicle.controller import ControllerFile, read_controller
 from tuner.vehicle.registry import (
     COEFFICIENTS,
     REGISTRY,
@@ -12,16 +13,17 @@ from tuner.vehicle.registry import (
     scale_group,
     term_groups,
 )
-
-from tuner.vehicle.controller import ControllerFile, read_controller  # isort: skip
-from tuner.vehicle.vehicle import (  # isort: skip
+from tuner.vehicle.vehicle import (
     VehicleFile,
     check_mixer,
+    check_names,
+    initial_values,
     read_vehicle,
+    values_of,
     vehicle_text,
+    with_values,
     write_vehicle,
 )
-from tuner.vehicle.vehicle import check_names, initial_values, values_of, with_values  # isort: skip
 
 __all__ = [
     "COEFFICIENTS",

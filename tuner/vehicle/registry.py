@@ -8,7 +8,8 @@ there lists the values of the coefficients of Gazebo's motor model.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections import ChainMap
+from collections.abc import Mapping
 
 from tuner.vehicle.coefficient import Coefficient, NotCarried, Scope, Written
 from tuner.vehicle.flight_conditions import SURROUNDING_ROWS
@@ -221,28 +222,12 @@ _ROWS = (
     *SURROUNDING_ROWS,
 )
 
-REGISTRY: dict[str, Coefficient] = {row.name: row for row in _ROWS}
-"""Name -> row, in the order in which tables list them."""
-
-
-class _OfVehicleFile(Mapping[str, Coefficient]):
-    """The registry's rows with a place in the vehicle file, as the registry stands now."""
-
-    def __getitem__(self, name: str) -> Coefficient:
-        row = REGISTRY[name]
-        if not row.place[1]:
-            raise KeyError(name)
-        return row
-
-    def __iter__(self) -> Iterator[str]:
-        return (name for name, row in REGISTRY.items() if row.place[1])
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-
-COEFFICIENTS: Mapping[str, Coefficient] = _OfVehicleFile()
+COEFFICIENTS: dict[str, Coefficient] = {row.name: row for row in _ROWS if row.place[1]}
 """Name -> row of every coefficient that a vehicle file can hold and a job can free."""
+REGISTRY: Mapping[str, Coefficient] = ChainMap(
+    {row.name: row for row in _ROWS if not row.place[1]}, COEFFICIENTS
+)
+"""Name -> row, in the order in which tables list them: what each flight has comes last."""
 
 
 def of_scope(scope: Scope) -> dict[str, Coefficient]:

@@ -26,10 +26,10 @@ from tuner.core.yaml_section import (
     read_model,
     refuse,
 )
-from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Coefficient
 from tuner.vehicle.controller import ControllerFile
 from tuner.vehicle.motor_orders import MotorOrder
+from tuner.vehicle.registry import COEFFICIENTS
 
 MASS, ARM = 2.079, 0.25
 """kg, and m from the middle to a rotor, of the vehicle that the registry's numbers are made for."""

@@ -27,7 +27,7 @@ from tuner.exporters.sdf.tags import carried_values, composite, values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.exporters.target import Choices, not_carried, target_of, write
 from tuner.exporters.targets.sdf import TARGET, snippet_draft
-from tuner.vehicle import REGISTRY, Written, values_of
+from tuner.vehicle import COEFFICIENTS, Written, values_of
 
 CLASSIC, GZ, TEMPLATE = (
     MODELS / "quad_x.sdf",
@@ -159,8 +159,8 @@ def test_a_model_that_lacks_a_tag_does_not_read_back(tag, vehicle, tmp_path):
 
 
 def test_a_coefficient_for_which_nothing_is_written_is_no_verified_export(vehicle, monkeypatch):
-    row = replace(REGISTRY["moment_constant"], exported_as={"sdf": Written("x", "joint")})
-    monkeypatch.setitem(REGISTRY, "moment_constant", row)
+    row = replace(COEFFICIENTS["moment_constant"], exported_as={"sdf": Written("x", "joint")})
+    monkeypatch.setitem(COEFFICIENTS, "moment_constant", row)
     with pytest.raises(ExportError, match="moment_constant is missing"):
         sdf_draft(CLASSIC, vehicle, "by a test")
 

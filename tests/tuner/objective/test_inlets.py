@@ -13,7 +13,7 @@ from tuner.objective.initial_conditions import STATES
 from tuner.objective.inlets import INLETS
 from tuner.recordings.inspector import inlets
 from tuner.search.inlet_choice import inlet_for
-from tuner.vehicle import COEFFICIENTS, REGISTRY
+from tuner.vehicle import COEFFICIENTS
 
 
 def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():
@@ -42,7 +42,7 @@ def test_what_an_inlet_silences_and_ignores_exists(inlet, flight):
 )
 def test_a_coefficients_row_says_which_inlets_say_nothing_of_it(part, without, monkeypatch):
     row = replace(COEFFICIENTS["mass"], name="gadget", part=part)
-    monkeypatch.setitem(REGISTRY, "gadget", row)
+    monkeypatch.setitem(COEFFICIENTS, "gadget", row)
     assert {name for name, inlet in INLETS.items() if "gadget" in inlet.bypasses} == without
 
 
