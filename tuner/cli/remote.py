@@ -55,6 +55,7 @@ def client_of(server: str | None, token: str | None) -> Iterator[Client]:
 def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> None:
     """Pass what happens to a job on to a listener, as a run on this machine does."""
     from tuner.search.iteration import Iteration, PointEstimate
+    from tuner.uncertainty.records import Refit
 
     for kind, content in events:
         if kind == "message":
@@ -65,17 +66,7 @@ def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> No
         elif kind == "estimates":
             listener.on_estimates([PointEstimate(**row) for row in content["estimates"]])
         elif kind == "folds":
-            listener.on_folds(_folds(content["folds"]))
-
-
-def _folds(rows: list[dict[str, Any]]) -> Any:
-    from tuner.evaluate.records import AxesRmse
-    from tuner.uncertainty.refits import Fold  # (jax)
-
-    return [
-        Fold(row["left_out"], {}, None if row["rmse"] is None else AxesRmse(**row["rmse"]))
-        for row in rows
-    ]
+            listener.on_folds([Refit(**row) for row in content["folds"]])
 
 
 def submit(

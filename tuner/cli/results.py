@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tuner.job.sensitivity import SensitivityResult
     from tuner.result import RunResult
     from tuner.search.iteration import PointEstimate
-    from tuner.uncertainty.refits import Fold
+    from tuner.uncertainty.records import Refit
 
 WIDTH, LINES = 100, 30
 """What a finished job takes of a terminal at most, without --verbose."""
@@ -226,11 +226,11 @@ def estimates_table(estimates: Sequence[PointEstimate]) -> object:
     return drawn(Table(columns, rows, words=("coefficient", "unit")))
 
 
-def folds_table(folds: Sequence[Fold]) -> object:
+def folds_table(folds: Sequence[Refit]) -> object:
     """Return how well each flight is predicted by the fit to the others."""
     rows = [
         (
-            fold.left_out,
+            fold.left_out or "",
             *(
                 "impossible"
                 if fold.rmse is None

@@ -16,7 +16,7 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_jax.constants import GRAVITY
+from sim_jax.state import hover_speed
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.core.numerics import errors_of
@@ -32,6 +32,7 @@ from tuner.search.job_flights import Recording
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import COEFFICIENTS, VehicleFile
+from tuner.vehicle.model import vehicle_of
 
 Array = NDArray[np.float64]
 
@@ -71,7 +72,7 @@ def signals_to_add(
     objective = fitted.objective
     silent = set.intersection(*(set(INLETS[inlet].silences) for inlet in inlets))
     fed = {name for inlet in inlets for name in INLETS[inlet].needs}
-    noise = {"rotor_speed": TACHOMETER * hover_speed(vehicle), **NOISE}
+    noise = {"rotor_speed": TACHOMETER * float(hover_speed(vehicle_of(vehicle))), **NOISE}
     missing = [n for n in noise if n not in objective.segments.measured and n not in silent | fed]
     before, proposals = errors_of(known), []
     for signal in missing:
@@ -101,12 +102,6 @@ def share_at_twice_the_rate(losses: Sequence[float]) -> float:
         return 1.0
     growth = more / lost if RANDOM <= more / lost <= SMOOTH else SMOOTH
     return float(np.sqrt(max(1.0 - lost / growth / losses[0], LEAST)))
-
-
-def hover_speed(vehicle: VehicleFile) -> float:
-    """Return the rotor speed in rad/s at which a vehicle hovers."""
-    thrust = vehicle.aerodynamics.motor_constant * len(vehicle.rotors)
-    return float(np.sqrt(vehicle.mass * GRAVITY / thrust))
 
 
 def beyond_noise(criterion: Criterion) -> float:

@@ -27,11 +27,12 @@ from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.core.numerics import log_determinant, scaled_inverse, unit_diagonal
 from tuner.design.proposals import Proposal, Proposals
-from tuner.objective.criterion import Criterion, Point
+from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.trajectory import Published, at_speed, published
+from tuner.search.progress import plain_criterion
 from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.verdict import Verdict
@@ -83,26 +84,21 @@ class Arena:
         return arena
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """A flight that could be flown, and its name: shape, size and speed in words."""
+def candidates(arena: Arena) -> dict[str, TrajectorySettings]:
+    """Return every shape that moves in two sizes and several speeds, and the yaw spins.
 
-    name: str
-    trajectory: TrajectorySettings
-
-
-def candidates(arena: Arena) -> tuple[Candidate, ...]:
-    """Return every shape that moves in two sizes and several speeds, and the yaw spins."""
-    flights: list[Candidate] = []
+    Shape, size and speed in words -> what would be flown.
+    """
+    flights: dict[str, TrajectorySettings] = {}
     for shape in shapes().values():
-        flights += [] if shape.spins else _moving(shape, arena)
+        flights |= dict(_moving(shape, arena))
         for rate in YAW_RATES if shape.spins else ():
             settings = TrajectorySettings(name=shape.name, yaw_rate=rate)
-            flights.append(Candidate(f"{_noun(shape)} at {rate:g} rad/s", settings))
-    return tuple(flights)
+            flights[f"{_noun(shape)} at {rate:g} rad/s"] = settings
+    return flights
 
 
-def _moving(shape: type[Shape], arena: Arena) -> Iterator[Candidate]:
+def _moving(shape: type[Shape], arena: Arena) -> Iterator[tuple[str, TrajectorySettings]]:
     walls = zip((arena.x, arena.y), shape.extent, strict=True)
     widest = [(wall / 2 - CLEARANCE) / extent for wall, extent in walls if extent]
     for share in (1.0, 0.5) if widest and shape.peak_speed else ():
@@ -111,7 +107,7 @@ def _moving(shape: type[Shape], arena: Arena) -> Iterator[Candidate]:
         for speed in SPEEDS:
             if shape.peak_acceleration * speed**2 / radius <= HARDEST:
                 name = f"{_noun(shape)} of {settings.radius:g} m radius at {speed:g} m/s"
-                yield Candidate(name, at_speed(settings, speed))
+                yield name, at_speed(settings, speed)
 
 
 def _noun(shape: type[Shape]) -> str:
@@ -120,7 +116,7 @@ def _noun(shape: type[Shape]) -> str:
 
 def candidate_problem(
     objective: Objective,
-    flights: Sequence[Candidate],
+    flights: Sequence[TrajectorySettings],
     *,
     seconds: float,
     spin_channels: Sequence[str],
@@ -140,15 +136,11 @@ def candidate_problem(
     """
     recorded, schedule = objective.segments, objective.schedule
     references = [
-        published(
-            flight.trajectory,
-            duration=seconds,
-            control_rate=schedule.position_control_rate,
-        )
+        published(flight, duration=seconds, control_rate=schedule.position_control_rate)
         for flight in flights
     ]
     starts: Vec3 = jax.tree.map(lambda *places: np.stack(places), *(r.start for r in references))
-    spins = np.array([shapes()[flight.trajectory.name].spins for flight in flights])
+    spins = np.array([shapes()[flight.name].spins for flight in flights])
     count = len(flights)
     segments = Segments(
         inlet=_laid(references, recorded),
@@ -248,26 +240,6 @@ def _sampled(
     return Measured(time=np.asarray(time), values=np.asarray(values), weight=np.asarray(weights))
 
 
-def candidate_point(
-    point: Point, criterion: Criterion, objective: Objective, *, seconds: float
-) -> tuple[Point, Criterion]:
-    """Return point and criterion of candidates of so many s, weighed as most recorded flights."""
-    count = objective.flights
-    offsets = np.zeros((np.asarray(point.offsets).shape[0], count))
-    reference_offset = np.zeros((np.asarray(criterion.reference_offset).shape[0], count))
-    scale = {
-        name: np.full(count, float(np.median(np.asarray(of_segment))))
-        for name, of_segment in criterion.scale.items()
-    }
-    return Point(point.coefficients, np.asarray(offsets)), Criterion(
-        horizon=np.asarray(round(seconds * objective.schedule.log_rate)),
-        scale=scale,
-        reference_offset=np.asarray(reference_offset),
-        huber=np.asarray(np.inf),
-        prior=criterion.prior,
-    )
-
-
 Array = NDArray[np.float64]
 
 
@@ -294,8 +266,8 @@ def rank_next_flights(
     spin_channels
         Channels that a yaw spin is compared by.
     """
-    full_problem = examination.full_problem
-    flights = candidates(arena)
+    full_problem, found = examination.full_problem, candidates(arena)
+    flights = [*found.values()]
     at_once = min(full_problem.objective.segments.count, len(flights))
     kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
     offsets_fitted = np.repeat(kinds[:, None], at_once, axis=1)
@@ -306,7 +278,12 @@ def rank_next_flights(
         objective = candidate_problem(
             full_problem.objective, some, seconds=seconds, spin_channels=spin_channels
         )
-        point, weights = candidate_point(full_problem.point, criterion, objective, seconds=seconds)
+        point = objective.start(full_problem.point.coefficients)
+        scales = {
+            name: np.full(at_once, float(np.median(scale)))
+            for name, scale in criterion.scale.items()
+        }
+        weights = plain_criterion(objective, objective.samples, scales)
         jacobian = objective.jacobian(point, weights)
         information = information_from_jacobian(
             objective, point, weights, jacobian, offsets_fitted=offsets_fitted
@@ -319,7 +296,7 @@ def rank_next_flights(
         examination,
         [
             (flight, gain)
-            for flight, gain, flies in zip(flights, gains, flown, strict=False)
+            for flight, gain, flies in zip(found.items(), gains, flown, strict=False)
             if flies
         ],
         now,
@@ -330,7 +307,7 @@ def rank_next_flights(
 
 def _ranked(
     examination: Examination,
-    flights: Sequence[tuple[Candidate, Array]],
+    flights: Sequence[tuple[tuple[str, TrajectorySettings], Array]],
     now: Array,
     *,
     arena: Arena,
@@ -351,12 +328,12 @@ def _ranked(
     targets = free or fixed or list(fitted.names)
     rows = [
         Proposal(
-            name=flight.name,
-            trajectory=flight.trajectory.model_dump(mode="json"),
+            name=flight,
+            trajectory=trajectory.model_dump(mode="json"),
             shrinks={name: _ratio(now, gain, names.index(name), count) for name in targets},
             volume=_volume(now, gain, count),
         )
-        for flight, gain in flights
+        for (flight, trajectory), gain in flights
     ]
     rows.sort(key=lambda row: (row.mean, row.name))
     return Proposals(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tuner.config import Settings
     from tuner.search.iteration import Iteration, PointEstimate
-    from tuner.uncertainty.refits import Fold
+    from tuner.uncertainty.records import Refit
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Listener:
     on_estimates: Callable[[Sequence[PointEstimate]], None] = lambda _: None
     on_message: Callable[[str], None] = lambda _: None
     on_stop: Callable[[str], None] = lambda _: None
-    on_folds: Callable[[Sequence[Fold]], None] = lambda _: None
+    on_folds: Callable[[Sequence[Refit]], None] = lambda _: None
 
 
 SILENT = Listener()

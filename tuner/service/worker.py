@@ -133,14 +133,8 @@ def _listener(channel: IO[str]) -> Any:
         say("estimates", estimates=[estimate.model_dump(mode="json") for estimate in estimates])
 
     def on_folds(folds: Sequence[Any]) -> None:
-        rows = [
-            {
-                "left_out": fold.left_out,
-                "rmse": None if fold.rmse is None else fold.rmse.model_dump(mode="json"),
-            }
-            for fold in folds
-        ]
-        say("folds", folds=rows)
+        without = {"coefficients"}
+        say("folds", folds=[fold.model_dump(mode="json", exclude=without) for fold in folds])
 
     return Listener(
         on_settings=on_settings,

@@ -6,8 +6,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
+from pydantic import Field
+
 from tuner.core.disk import write_text
 from tuner.core.files import FiniteOrNone, Part, ResultFile, csv_text
+from tuner.evaluate.records import AxesRmse
 from tuner.uncertainty.verdict import Direction, Reason, Verdict
 
 
@@ -50,6 +53,24 @@ class ErrorParts(Part):
     readings: FiniteOrNone = None
     lack: FiniteOrNone = None
     search: FiniteOrNone = None
+
+
+class Refit(Part):
+    """A fit to other flights, and how well it predicts one of them that it leaves out.
+
+    Attributes
+    ----------
+    left_out
+        That flight; None where none is to be predicted.
+    coefficients
+        Name -> value.
+    rmse
+        Of that flight, simulated with them; None where their inertia is no rigid body's.
+    """
+
+    left_out: str | None = None
+    coefficients: dict[str, float] = Field(default_factory=dict)
+    rmse: AxesRmse | None = None
 
 
 CONFLICT = 3.0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.files import csv_text
 from tuner.engine import Report, current
 from tuner.evaluate.held_out import best_values, comparison_of
-from tuner.evaluate.records import RMSE_UNITS, AxesRmse
+from tuner.evaluate.records import RMSE_UNITS
 from tuner.objective.normal import Objective
 from tuner.search.estimation import free_offsets
 from tuner.search.fitted import Fitted
@@ -24,6 +25,7 @@ from tuner.search.iteration import Iteration
 from tuner.search.optimiser import Free
 from tuner.search.polish import polished
 from tuner.search.problem import Job
+from tuner.uncertainty.records import Refit
 from tuner.vehicle import with_values
 
 
@@ -44,16 +46,6 @@ class Draw(NamedTuple):
     title: str
     counts: NDArray[np.float64]
     left_out: str | None = None
-
-
-class Refit(NamedTuple):
-    """Coefficient -> value, and the RMSE of the flight that was left out.
-
-    That is None where none is to be predicted, or the inertia is no rigid body's.
-    """
-
-    coefficients: dict[str, float]
-    rmse: AxesRmse | None
 
 
 def refits(
@@ -101,15 +93,12 @@ def _refit(task: tuple[Callable[[], tuple[Job, Fitted]], Draw], report: Report) 
         title=draw.title,
         on_progress=lambda progress: report(progress.iterations[-1].model_dump()),
     )
-    values = best_values(job, end)
-    if draw.left_out is None:
-        return Refit(values, None)
-    comparison = comparison_of(job, fitted)
-    try:
-        flown = comparison.fly(with_values(job.settings.vehicle, values))
-    except ConfigError:
-        return Refit(values, None)
-    return Refit(values, flown[draw.left_out].rmse)
+    values, rmse = best_values(job, end), None
+    if draw.left_out is not None:
+        with suppress(ConfigError):  # no rigid body has such an inertia
+            vehicle = with_values(job.settings.vehicle, values)
+            rmse = comparison_of(job, fitted).fly(vehicle)[draw.left_out].rmse
+    return Refit(left_out=draw.left_out, coefficients=values, rmse=rmse)
 
 
 def _counted(objective: Objective, counts: NDArray[np.float64]) -> Objective:
@@ -123,9 +112,10 @@ def _counted(objective: Objective, counts: NDArray[np.float64]) -> Objective:
     return changed if counts.max() <= 1.0 else replace(changed, multiplicity=counts)
 
 
-def coefficients_of(refits: Sequence[Mapping[str, float]]) -> dict[str, NDArray[np.float64]]:
+def coefficients_of(refits: Sequence[Refit]) -> dict[str, NDArray[np.float64]]:
     """Return coefficient -> its value in each refit."""
-    return {name: np.array([refit[name] for refit in refits]) for name in refits[0]}
+    names = refits[0].coefficients
+    return {name: np.array([refit.coefficients[name] for refit in refits]) for name in names}
 
 
 BOOTSTRAP_FILE = "bootstrap.csv"
@@ -166,11 +156,11 @@ def bootstrap(
     drawn = random.integers(len(names), size=(count, len(names)))
     counts = [np.bincount(row, minlength=len(names)) for row in drawn]
     draws = [Draw(f"draw {n}", row.astype(float)) for n, row in enumerate(counts, 1)]
-    found = [refit.coefficients for refit in refits(job, fitted, draws, on_iteration)]
+    found = refits(job, fitted, draws, on_iteration)
     by_name = coefficients_of(found)
     rows = (
-        [number, *row.tolist(), *values.values()]
-        for number, (row, values) in enumerate(zip(counts, found, strict=True), 1)
+        [number, *row.tolist(), *refit.coefficients.values()]
+        for number, (row, refit) in enumerate(zip(counts, found, strict=True), 1)
     )
     header = ("refit", *(f"drawn_{name}" for name in names), *by_name)
     write_text(folder / BOOTSTRAP_FILE, csv_text(header, rows))
@@ -180,28 +170,9 @@ def bootstrap(
 CROSS_VALIDATION_FILE = "cross_validation.csv"
 
 
-@dataclass(frozen=True)
-class Fold:
-    """The fit without one flight, and how well it predicts that flight.
-
-    Attributes
-    ----------
-    left_out
-        The flight.
-    coefficients
-        Name -> value fitted to the other flights.
-    rmse
-        Of the flight left out, simulated with them; None where their inertia is no rigid body's.
-    """
-
-    left_out: str
-    coefficients: dict[str, float]
-    rmse: AxesRmse | None
-
-
 def cross_validate(
     job: Job, fitted: Fitted, folder: Path, on_iteration: Callable[[Iteration], None]
-) -> tuple[Fold, ...]:
+) -> list[Refit]:
     """Leave each fitted flight out in turn, polish the fit to the others, and write the table.
 
     The engine in force computes the folds. Those side by side report each stage when it has ended.
@@ -216,13 +187,12 @@ def cross_validate(
         raise RecordingError("--cross-validate", "leaves no flight to fit", "give two or more")
     others = 1.0 - np.eye(len(names))
     draws = [Draw(f"without {n}", row, n) for n, row in zip(names, others, strict=True)]
-    found = zip(names, refits(job, fitted, draws, on_iteration), strict=True)
-    folds = tuple(Fold(name, *refit) for name, refit in found)
+    folds = refits(job, fitted, draws, on_iteration)
     write_cross_validation(folds, folder)
     return folds
 
 
-def jackknife_errors(folds: Sequence[Fold]) -> dict[str, float]:
+def jackknife_errors(folds: Sequence[Refit]) -> dict[str, float]:
     """Return each coefficient's standard error by the jackknife over flights.
 
     With F flights left out in turn, the square root of (F - 1)/F times the sum of squares about the
@@ -231,11 +201,11 @@ def jackknife_errors(folds: Sequence[Fold]) -> dict[str, float]:
     share = (len(folds) - 1) / len(folds)
     return {
         name: float(np.sqrt(share * np.sum((values - values.mean()) ** 2)))
-        for name, values in coefficients_of([fold.coefficients for fold in folds]).items()
+        for name, values in coefficients_of(folds).items()
     }
 
 
-def write_cross_validation(folds: Sequence[Fold], folder: Path) -> None:
+def write_cross_validation(folds: Sequence[Refit], folder: Path) -> None:
     """Write ``cross_validation.csv``: a row a flight left out, then the coefficients' spread.
 
     The last row holds the standard deviation of each column over the flights left out.

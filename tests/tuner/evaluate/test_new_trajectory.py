@@ -51,7 +51,7 @@ def test_a_new_trajectory_is_simulated_and_proposed(squircle, tmp_path, capsys):
     table = np.genfromtxt(out, delimiter=",", names=True)
     assert table["ref_x"][0] == pytest.approx(1.25)
     assert abs(table["x"] - table["ref_x"]).max() < 0.2
-    names = [flight.name for flight in candidates(Arena(8.0, 6.0, 3.0))]
+    names = [*candidates(Arena(8.0, 6.0, 3.0))]
     assert "a squircle of 2 m radius at 1.5 m/s" in names
     capsys.readouterr()
     assert main(["simulate", "--trajectory", "square", "--out", str(out)]) == 2

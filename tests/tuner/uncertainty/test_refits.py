@@ -9,7 +9,8 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.report.result_texts import refits_in_words
 from tuner.report.sections.tables import refits
-from tuner.uncertainty.refits import Fold, _counted, jackknife_errors
+from tuner.uncertainty.records import Refit
+from tuner.uncertainty.refits import _counted, jackknife_errors
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")
 
@@ -17,7 +18,7 @@ FREE = ("inertia_xx", "motor_constant", "estimate_latency")
 def test_the_jackknife_of_a_mean_is_its_standard_error():
     drawn = np.random.default_rng(1).normal(size=7)
     left_out = [np.delete(drawn, i).mean() for i in range(7)]
-    folds = [Fold(str(i), {"mass": mean}, None) for i, mean in enumerate(left_out)]
+    folds = [Refit(coefficients={"mass": mean}) for mean in left_out]
     assert jackknife_errors(folds) == {"mass": pytest.approx(np.std(drawn, ddof=1) / np.sqrt(7))}
 
 
