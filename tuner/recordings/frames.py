@@ -119,11 +119,12 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     q = on_clock(series, "attitude", clock)
     position = smooth(on_clock(series, "position", clock), 0.2)
     push = smooth(derivative(smooth(derivative(position), 0.2)), 0.2)
+    pull = push + np.array([0.0, 0.0, GRAVITY])
     gyro = on_clock(series, "body_rate", clock) if "body_rate" in series else None
     force = on_clock(series, "acceleration", clock) if "acceleration" in series else None
 
     def agreement(reading: Callable[[Array], Array]) -> tuple[float, float]:
-        """Return how well a reading fits the motion, and how upright it flies."""
+        """Return how well a reading fits the motion, and how far thrust carries the vehicle."""
         turned = reading(q)
         up = upward(turned)
         scores = []
@@ -135,9 +136,11 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
             in_flu = correlation(turning, smooth(gyro))
             in_frd = correlation(turning, smooth(_RATES[0].read(gyro)))
             scores.append(max(in_flu, in_frd - UNLIKELY))
-        carried = up if force is None else rotate(turned, force) / GRAVITY
-        upright = float(np.nanmean(carried[:, 2]))
-        return (min(scores) if scores else 1.0), upright
+        if force is None:  # thrust points where the motion and gravity ask for it
+            carried = (up * pull).sum(axis=1) / np.linalg.norm(pull, axis=1)
+        else:
+            carried = rotate(turned, force)[:, 2] / GRAVITY
+        return (min(scores) if scores else 1.0), float(np.nanmean(carried))
 
     fit, upright = agreement(lambda values: values)
     if fit > GOOD and upright > 0.5:

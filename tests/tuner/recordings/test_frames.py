@@ -19,7 +19,7 @@ from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
 from tuner.recordings import inspect_recordings
 from tuner.recordings.flight import Series
-from tuner.recordings.frames import contradiction, noted_contradiction
+from tuner.recordings.frames import contradiction, correct_frames, noted_contradiction
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
 from tuner.search.job_flights import load_flights, read_usable
@@ -154,6 +154,12 @@ def test_a_velocity_that_runs_backwards_is_certain_without_a_gyro() -> None:
 )
 def test_what_may_be_true_is_no_certainty(signals: Callable[[], dict[str, Any]]) -> None:
     assert contradiction(signals(), ALL) is None
+
+
+def test_a_vehicle_that_leans_by_more_than_60_degrees_is_not_doubted() -> None:
+    assert correct_frames(circle(speed=6.2), {})[1] == ()
+    (doubt,) = correct_frames(circle(np.pi / 2, speed=6.2), {})[1]
+    assert doubt.code is NoteCode.ATTITUDE_DOUBTED
 
 
 def test_a_moment_is_no_certainty() -> None:
