@@ -35,12 +35,12 @@ def main(folder: str) -> None:
         target = target_of(kind)
         simulator = target.simulator
         found = None if simulator is None else kept_effective(run, simulator)
-        vehicle = run.vehicle if found is None else found[0]
+        vehicle = run.vehicle if found is None else found.vehicle
         draft = target.draft(vehicle, "by a benchmark", Choices(simulator=target.simulator_name))
         with tempfile.TemporaryDirectory() as place:
             write(draft, Path(place) / f"x{target.suffix}")  # refused if it does not read back
         unfitted = (
-            PoseRmse(position=None, attitude=None) if found is None else found[1].rmse_unfitted
+            PoseRmse(position=None, attitude=None) if found is None else found.result.rmse_unfitted
         )
         own = over_flights(refly(run, draft.vehicle))
         there = "–" if draft.flier is None else over_flights(refly(run, draft.vehicle, draft.flier))

@@ -259,7 +259,6 @@ def export(run: Run | Named, format: str, **options: Any) -> Exported:  # noqa: 
         The file cannot be written.
     """
     configure()
-    from tuner.exporters.effective import kept_effective, refly  # noqa: PLC0415
     from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
     from tuner.exporters.export import export_draws, export_vehicle  # noqa: PLC0415
 
@@ -275,7 +274,7 @@ def export(run: Run | Named, format: str, **options: Any) -> Exported:  # noqa: 
     else:
         of = read_run(run)
     writes = export_run if asked.draws is None else export_draws
-    return writes(of, asked, refly=refly, today=today, refit=kept_effective)
+    return writes(of, asked, today=today)
 
 
 def text_of(named: Path | T) -> str | T:

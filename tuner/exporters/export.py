@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import date
@@ -14,8 +14,9 @@ from tuner.config.job import ExportSettings
 from tuner.core.disk import check_file, file_name, inside
 from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draws import draws_of, write_draws
+from tuner.exporters.effective import Effective, kept_effective, refly
 from tuner.exporters.gates import Refly, check, check_hover, check_in_simulator, not_flown
-from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
+from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.exporters.target import (
     Choices,
     Draft,
@@ -38,7 +39,7 @@ from tuner.result import (
     read_run,
 )
 from tuner.uncertainty.verdict_texts import judgement_in_words
-from tuner.vehicle import COEFFICIENTS, REGISTRY, VehicleFile, Written, read_vehicle, values_of
+from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of
 
 FOLDER = EXPORTS
 
@@ -66,9 +67,8 @@ def export(
     run: Run,
     asked: ExportOptions,
     *,
-    refly: Refly,
     today: date,
-    refit: Refit | None = None,
+    refly: Refly = refly,
     copies: Path | None = None,
 ) -> Exported:
     """Write a run's coefficients in a format, if they hold there.
@@ -81,13 +81,10 @@ def export(
     asked
         The format, and where to write. A reason to export in spite of gates that are not met goes
         into the provenance.
-    refly
-        Flies the run's flights with a vehicle.
     today
         For the provenance.
-    refit
-        Finds the effective coefficients for a simulator that lacks some of what acts; without it,
-        those for Gazebo stand in.
+    refly
+        Flies the run's flights with a vehicle.
     copies
         Folder for a copy of the model, which then stays as it is.
 
@@ -104,7 +101,7 @@ def export(
         check_file(out or into or inside(run.folder, own), folder_is_made=True)
     choices = Choices(into, asked.simulator)
     target = target.chosen(choices)
-    physical, (run, effective) = run, in_simulator(run, target, refit)
+    physical, (run, effective) = run, in_simulator(run, target)
     vehicle, decided = exported_vehicle(run, today)
     check_every_coefficient(physical.vehicle, target)
     line = provenance(run, today, asked.accept)
@@ -183,15 +180,14 @@ def export_draws(
     run: Run,
     asked: ExportOptions,
     *,
-    refly: Refly,
     today: date,
-    refit: Refit | None = None,
+    refly: Refly = refly,
 ) -> Exported:
     """Write draws of a run's joint posterior in a format, once the run itself may be exported.
 
     Parameters
     ----------
-    run, asked, refly, today, refit
+    run, asked, today, refly
         As of `export`; written into a folder, by default ``export/draws`` in the result folder.
 
     Raises
@@ -205,8 +201,8 @@ def export_draws(
     target = target_of(asked.format).chosen(Choices(simulator=asked.simulator))
     name = file_name(run.vehicle.name, target.suffix)
     first = replace(asked, out=inside(folder, name))
-    done = export(run, first, refly=refly, today=today, refit=refit)
-    flying, _ = in_simulator(run, target, refit)
+    done = export(run, first, today=today, refly=refly)
+    flying, _ = in_simulator(run, target)
     line = f"draw of the posterior; {provenance(run, today, asked.accept)}"
     notes = write_draws(draws, flying.vehicle, folder, target, line)
     return replace(done, path=folder, notes=(*done.notes, *notes))
@@ -262,9 +258,8 @@ def exports_of_job(
     folder: Path,
     wanted: ExportSettings,
     *,
-    refly: Refly,
     today: date,
-    refit: Refit | None = None,
+    refly: Refly = refly,
 ) -> Iterator[tuple[str, Path | InputError]]:
     """Write every format that a job asks for into its result folder.
 
@@ -276,7 +271,7 @@ def exports_of_job(
         A finished result folder.
     wanted
         Formats, and the model for ``sdf``, which stays as it is.
-    refly, today, refit
+    today, refly
         As of `export`.
 
     Yields
@@ -289,15 +284,11 @@ def exports_of_job(
         into = wanted.into if target_of(kind).patches else None
         try:
             asked, copies = ExportOptions(kind, into=into), folder / FOLDER
-            done = export(run, asked, refly=refly, today=today, refit=refit, copies=copies)
+            done = export(run, asked, today=today, refly=refly, copies=copies)
             yield kind, done.path
         except InputError as error:
             _record(folder, ExportRecord(format=kind, refused=str(error)))
             yield kind, error
-
-
-Refit = Callable[[Run, Simulator], tuple[VehicleFile, EffectiveResult] | None]
-"""Finds the vehicle with which a simulator flies most like a run's; None where it is that one."""
 
 
 def exported_vehicle(run: Run, today: date) -> tuple[VehicleFile, tuple[str, ...]]:
@@ -363,33 +354,25 @@ def _confidence(run: Run, name: str) -> dict[str, JsonValue]:
     return known
 
 
-def in_simulator(
-    run: Run, target: Target, refit: Refit | None
-) -> tuple[Run, EffectiveResult | None]:
+def in_simulator(run: Run, target: Target) -> tuple[Run, EffectiveResult | None]:
     """Return a run as a target's simulator flies it, and how that was found.
 
     The run itself where the simulator lacks nothing, where there is none, and where the job wants
-    physical coefficients. Without ``refit``, what was found for Gazebo stands in for others.
+    physical coefficients.
     """
     simulator, found = target.simulator, None
     job = run.result.settings.get("job")
     wanted = job.get("target") if isinstance(job, dict) else None
     if simulator is None or wanted == "physical":
         return run, None
-    effective, flying = run.result.effective, run.effective
-    if effective is not None and flying is not None:
-        lost = {name for term in effective.lost for name in term.names}
-        is_for = GAZEBO_CLASSIC.name if effective.target == "gazebo" else effective.target
-        if is_for == simulator.name or refit is None:
-            if all(isinstance(target.entry(REGISTRY[name]), Written) for name in lost):
-                return run, None
-            found = flying, effective
-    if found is None and refit is not None:
+    if simulator is GAZEBO_CLASSIC and run.effective is not None and run.result.effective:
+        found = Effective(run.effective, run.result.effective)
+    else:
         with suppress(InputError):  # recordings that are gone: the gate that flies them says so
-            found = refit(run, simulator)
+            found = kept_effective(run, simulator)
     if found is None:
         return run, None
-    flying, effective = found
+    effective = found.result
     lost = {name for term in effective.lost for name in term.names}
     coefficients = {
         name: row.model_copy(update={"best": effective.coefficients[name]})
@@ -406,4 +389,4 @@ def in_simulator(
         for flight in run.result.flights
     )
     result = run.result.model_copy(update={"coefficients": coefficients, "flights": flights})
-    return run.model_copy(update={"vehicle": flying, "result": result}), effective
+    return run.model_copy(update={"vehicle": found.vehicle, "result": result}), effective

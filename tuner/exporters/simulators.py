@@ -119,11 +119,15 @@ class Simulator:
 
     def flown(self, vehicle: VehicleFile) -> VehicleFile:
         """Return the vehicle as the simulator flies it, in a file that this project flies."""
-        vehicle = self.laws(vehicle)
-        flown = self.lacking(
+        vehicle = self.with_laws(vehicle)
+        return self.lacking(
             vehicle, [n for n in values_of(vehicle) if self.built_in(n) is not None]
         )
-        return flown.replace(aerodynamics=flown.aerodynamics.replace(reaction_torque="body"))
+
+    def with_laws(self, vehicle: VehicleFile) -> VehicleFile:
+        """Return the vehicle that its laws make of one; torques react about the body's axis."""
+        vehicle = self.laws(vehicle)
+        return vehicle.replace(aerodynamics=vehicle.aerodynamics.replace(reaction_torque="body"))
 
     def built_in(self, name: str) -> float | None:
         """Return the value that it flies in the place of a coefficient's; None where it has it."""

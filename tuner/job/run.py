@@ -23,6 +23,7 @@ from tuner.design.proposals import LogProposal
 from tuner.evaluate.comparison import table_of
 from tuner.evaluate.held_out import (
     Validation,
+    controller_flown,
     flights_not_flown,
     flights_worse,
     holding_better,
@@ -30,8 +31,9 @@ from tuner.evaluate.held_out import (
     vehicle_fitted,
 )
 from tuner.evaluate.predict import with_inputs_on_time
-from tuner.exporters.effective import Effective, effective_fit, kept_effective, refly
+from tuner.exporters.effective import Effective, effective_in
 from tuner.exporters.export import exports_of_job
+from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.findings.findings import Finding, remedy, sentence
 from tuner.job.accelerations import with_accelerations
 from tuner.job.check import check_information, check_recordings
@@ -45,7 +47,7 @@ from tuner.job.results import (
 )
 from tuner.report import render, write_search, write_traces
 from tuner.report.result_texts import export_sentence
-from tuner.result import BEST_FIT_FILE, RunResult
+from tuner.result import BEST_FIT_FILE, Run, RunResult
 from tuner.search.estimation import OnProgress, parameters_of
 from tuner.search.explanation import Explanation
 from tuner.search.findings import inputs_late, turning_unexplained, voltage_taken
@@ -150,17 +152,17 @@ def run(
             )
         return result
 
-    written()
+    physical = Run(folder=folder, result=written(), vehicle=vehicle)
     _write_flown(folder, validation, fitted)
+    flew = replace(job.settings, controller=controller_flown(job, fitted)), job.recordings
     effective = explanation.part(
         "effective coefficients",
-        lambda: effective_fit(
-            job,
-            fitted,
-            vehicle,
-            validation.best,
-            on_progress=_reporting(listener),
+        lambda: effective_in(
+            physical,
+            GAZEBO_CLASSIC,
+            lambda _: flew,
             on_message=listener.on_message,
+            on_progress=partial(_reporting(listener), job),
         ),
         None,
     )
@@ -330,10 +332,7 @@ def _write_flown(folder: Path, validation: Validation, fitted: Fitted) -> None:
 def _export(folder: Path, settings: Settings, listener: Listener) -> None:
     """Write the exports that the job asks for."""
     today = datetime.date.today()
-    exports = exports_of_job(
-        folder, settings.job.export, refly=refly, today=today, refit=kept_effective
-    )
-    for kind, outcome in exports:
+    for kind, outcome in exports_of_job(folder, settings.job.export, today=today):
         listener.on_message(export_sentence(kind, outcome))
 
 

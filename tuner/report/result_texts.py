@@ -117,7 +117,7 @@ def metres(value: float) -> str:
 
 def what_is_exported(effective: EffectiveResult, simulator: str) -> str:
     """Return, as a clause, what the numbers of an export for a simulator are."""
-    lost = listed([term.group if term.names else "other laws" for term in effective.lost])
+    lost = listed([term.group for term in effective.lost])
     return (
         f"effective coefficients, not physical ones: {simulator} lacks {lost}, and misses the "
         f"flights by {rmse_in_words(effective.rmse_effective)} where all terms miss them by "

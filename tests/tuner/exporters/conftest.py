@@ -2,10 +2,20 @@ from pathlib import Path
 
 import pytest
 
+from tuner.config import JobFile
 from tuner.core.shipped import configs_folder
+from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.records import AxesRmse
 from tuner.result import CoefficientResult, FlightResult, RunResult, SearchResult, read_run
-from tuner.vehicle import COEFFICIENTS, read_vehicle, values_of, with_values, write_vehicle
+from tuner.search.job_flights import Recording
+from tuner.vehicle import (
+    COEFFICIENTS,
+    ControllerFile,
+    read_vehicle,
+    values_of,
+    with_values,
+    write_vehicle,
+)
 
 MODELS = Path(__file__).resolve().parents[3] / "examples" / "models"
 
@@ -102,6 +112,70 @@ def make_run(tmp_path):
         return read_run(folder)
 
     return make
+
+
+@pytest.fixture
+def run(bag, flight, updated, tmp_path):
+    """A result folder that is true of one recording, which it held out."""
+    start = with_values(updated, {"rotor_drag_coefficient": 4e-4})
+    comparison = Comparison([Recording(flight)], ControllerFile())
+    coefficients = {
+        name: CoefficientResult(
+            unit=COEFFICIENTS[name].unit,
+            initial=value,
+            best=values_of(updated)[name],
+            fitted=name == "rotor_drag_coefficient",
+            identifiable=True,
+            verdict="well_known",
+            reason={"code": "interval"},
+        )
+        for name, value in values_of(start).items()
+    }
+    before, after = (comparison.fly(v)["small_circle"].rmse for v in (start, updated))
+    held_out = FlightResult(
+        name="small_circle",
+        path=str(bag),
+        sha256=flight.sha256,
+        split="holdout",
+        duration=flight.duration,
+        time_offset=0.0,
+        rmse_initial=before,
+        rmse_best=after,
+    )
+    result = RunResult(
+        schema_version=2,
+        status="converged",
+        seed=0,
+        versions={},
+        settings={
+            "controller": ControllerFile().model_dump(mode="json"),
+            "job": JobFile().model_dump(mode="json"),
+            "vehicle": start.model_dump(mode="json"),
+        },
+        coefficients=coefficients,
+        flights=(held_out,),
+        findings=(),
+        search=SearchResult(
+            method="gradient",
+            evaluations=1,
+            iterations=1,
+            wall_time=1.0,
+            cost_initial=1.0,
+            cost_best=0.0,
+            converged=True,
+            message="no_further_gain",
+        ),
+    )
+    result.write(tmp_path)
+    write_vehicle(updated, tmp_path / "best_fit.yaml")
+    return read_run(tmp_path)
+
+
+def as_fitted(run):
+    """Return a run that fitted the recording which it held out."""
+    (flight,) = run.result.flights
+    flights = (flight.model_copy(update={"split": "fit"}),)
+    return run.model_copy(update={"result": run.result.model_copy(update={"flights": flights})})
 
 
 def as_the_run_says(run, _vehicle):

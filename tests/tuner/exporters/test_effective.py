@@ -1,135 +1,119 @@
 """The second answer: what Gazebo lacks is made up for, or named, and nothing else moves."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from tests.tuner.terms.making import unfitted_with
-from tests.tuner.uncertainty.making import problem, vehicle_file, with_data
-from tuner.config import JobFile
+from tests.tuner.exporters.conftest import as_fitted
 from tuner.evaluate.records import AxesRmse
 from tuner.exporters.effective import (
     carried_terms,
-    effective_fit,
+    effective_in,
     lost_terms,
     pose_rmse,
-    refitted,
+    recordings_of,
 )
-from tuner.exporters.simulators import GAZEBO_CLASSIC
-from tuner.objective.criterion import Point
-from tuner.objective.normal import with_conditions
+from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.result import PoseRmse
-from tuner.terms.candidates import with_terms
-from tuner.vehicle import values_of
-
-DRAG = 0.04
+from tuner.vehicle import values_of, with_values
 
 
 def axes(*values):
     return AxesRmse(**dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), values, strict=True)))
 
 
-@pytest.fixture(scope="module")
-def fit():
-    """A base fit of flights that lack nothing, where it begins, and its job."""
-    return unfitted_with(0.0, seed=0, job=JobFile())
+def of_vehicle(run, **changes):
+    """Return a run of another vehicle."""
+    return run.model_copy(update={"vehicle": run.vehicle.replace(**changes)})
 
 
-def test_a_vehicle_of_which_gazebo_lacks_nothing_has_one_answer(fit):
-    job, fitted = fit
-    even = vehicle_file().replace(
-        effects={
-            "fuselage_drag": 0.0,
-            "center_of_mass_x": 0.004,
-            "rotor_thrust_scale_1": 1.02,
-            "marker_tilt_x": 0.01,
-        }
+def test_a_vehicle_of_which_gazebo_lacks_nothing_has_one_answer(make_run):
+    effects = {
+        "fuselage_drag": 0.0,
+        "center_of_mass_x": 0.004,
+        "rotor_thrust_scale_1": 1.02,
+        "marker_tilt_x": 0.01,
+    }
+    run = of_vehicle(make_run(), effects=effects)
+    assert lost_terms(run, GAZEBO_CLASSIC) == {}
+    assert carried_terms(GAZEBO_CLASSIC, run.vehicle) == (
+        "center_of_mass_x",
+        "rotor_thrust_scale_1",
     )
-    assert lost_terms(even, fitted) == {}
-    assert carried_terms(even) == ("center_of_mass_x", "rotor_thrust_scale_1")
 
     def fail(*_):
-        raise AssertionError("nothing is computed twice")
+        raise AssertionError("nothing is read")
 
-    answer = effective_fit(job, fitted, even, {}, on_progress=fail, on_message=fail)
-    assert answer is None
+    assert effective_in(run, GAZEBO_CLASSIC, fail, on_message=fail) is None
 
 
-def test_what_gazebo_lacks_is_named_by_groups_and_taken_away(fit):
-    _, fitted = fit
-    vehicle = vehicle_file().replace(
+def test_what_gazebo_lacks_is_named_by_groups_and_taken_away(make_run):
+    run = make_run()
+    run = of_vehicle(
+        run,
         effects={"linear_drag_x": 0.1, "linear_drag_z": 0.0, "rotor_drag_ratio_y": 1.0},
-        motor=vehicle_file().motor.replace(quadratic=-20.0),
+        motor=run.vehicle.motor.replace(quadratic=-20.0),
     )
-    lost = lost_terms(vehicle, fitted)
+    lost = lost_terms(run, GAZEBO_CLASSIC)
     assert lost == {"quadratic": ("quadratic",), "linear_drag": ("linear_drag_x",)}
-    bare = GAZEBO_CLASSIC.lacking(vehicle, ["quadratic", "linear_drag_x"])
+    bare = GAZEBO_CLASSIC.lacking(run.vehicle, ["quadratic", "linear_drag_x"])
     assert bare.motor.quadratic == 0.0
     assert set(bare.effects) == {"linear_drag_z", "rotor_drag_ratio_y"}
-    assert lost_terms(bare, fitted) == {}
+    assert lost_terms(run.model_copy(update={"vehicle": bare}), GAZEBO_CLASSIC) == {}
 
 
-def test_a_battery_that_declines_is_lost_and_wind_is_not(fit):
-    _, fitted = fit
-    objective, point = with_conditions(
-        fitted.objective, fitted.point, ("wind_x", "wind_y", "battery_decline")
+def test_laws_that_no_coefficient_says_are_lost_too(make_run):
+    run = make_run()
+    assert "other laws" in lost_terms(run, GZ_SIM)
+    turning = run.vehicle.aerodynamics.replace(reaction_torque="world")
+    run = of_vehicle(run, aerodynamics=turning)
+    assert lost_terms(run, GAZEBO_CLASSIC) == {"other laws": ()}
+
+
+def test_a_battery_that_declines_is_lost_and_wind_is_not(make_run):
+    around = {"wind_x": 1.0, "wind_y": 1.0, "battery_decline": -1.0}
+    run = make_run(flights={"circle": {"conditions": around}})
+    assert lost_terms(run, GAZEBO_CLASSIC) == {"battery_decline": ("battery_decline",)}
+
+
+def test_coefficients_stand_in_for_a_term_that_is_lost_and_the_set_up_stays(run):
+    """Two laws of drag: without one, the other grows by as much."""
+    true = values_of(run.vehicle)
+    speed = np.sqrt(true["mass"] * 9.81 / 4 / true["motor_constant"])
+    drag = 0.1  # of the body: four rotors at hover speed drag like 4·k·Ω
+    less = true["rotor_drag_coefficient"] - drag / (4 * speed)
+    vehicle = with_values(run.vehicle, {"rotor_drag_coefficient": less})
+    run = of_vehicle(
+        as_fitted(run),
+        aerodynamics=vehicle.aerodynamics,
+        effects={"linear_drag_x": drag, "linear_drag_y": drag},
     )
-    offsets = np.array(point.offsets)
-    offsets[-3:] = 1.0
-    around = replace(fitted, objective=objective, point=Point(point.coefficients, offsets))
-    assert lost_terms(vehicle_file(), around) == {"battery_decline": ("battery_decline",)}
+    said, progressed = [], []
+    found = effective_in(
+        run, GAZEBO_CLASSIC, recordings_of, on_message=said.append, on_progress=progressed.append
+    )
+    assert said[0].startswith("Gazebo cannot fly linear_drag: looking for the coefficients")
+    assert progressed[-1].iterations[-1].stage == "for Gazebo, polish again"
+    after = values_of(found.vehicle)
+    assert after["rotor_drag_coefficient"] == pytest.approx(
+        true["rotor_drag_coefficient"], rel=0.02
+    )
+    assert {n: after[n] for n in after if n != "rotor_drag_coefficient"} == {
+        n: true[n] for n in after if n != "rotor_drag_coefficient"
+    }
+    assert found.result.rmse_effective.position < 0.2 * found.result.rmse_unfitted.position
+    (lost,) = found.result.lost
+    assert lost.rmse_without == found.result.rmse_unfitted
 
 
-def test_coefficients_stand_in_for_a_term_that_is_lost_and_the_set_up_stays():
-    """Two laws of drag: without one, the other grows; without the ratio, it is about the mean."""
-    free = ("rotor_drag_coefficient", "motor_constant", "estimate_latency")
-    flown = problem((*free, "linear_drag_x", "linear_drag_y"))
-    values = {p.name: p.initial for p in flown.space.parameters}
-    values |= {"linear_drag_x": 0.3, "linear_drag_y": 0.3, "estimate_latency": 0.01}
-    start = flown.space.vector_of(values)
-    flown = with_data(flown, flown.start(start), noise=np.random.default_rng(0))
-    job, base = unfitted_with(0.0, seed=0, job=JobFile())
-    job = replace(job, space=flown.space, objective=flown)
-    fitted = replace(base, objective=flown, point=flown.start(start))
-    vehicle = vehicle_file().replace(
-        effects={"linear_drag_x": 0.3, "linear_drag_y": 0.3},
-        setup=vehicle_file().setup.replace(estimate_latency=0.01),
-    )
-    names = ("linear_drag_x", "linear_drag_y")
-    progressed = []
-    end, effective = refitted(
-        job,
-        fitted,
-        GAZEBO_CLASSIC.lacking(vehicle, names),
-        names,
-        lambda _, now: progressed.append(now),
-    )
-    before, after = values_of(vehicle), values_of(effective)
-    assert progressed
-    assert after["estimate_latency"] == before["estimate_latency"]
-    assert not set(names).intersection(after)
-    # four rotors at hover speed drag like 4·k·Ω
-    speed = np.sqrt(vehicle.mass * 9.81 / 4 / before["motor_constant"])
-    expected = before["rotor_drag_coefficient"] + 0.3 / (4 * speed)
-    assert after["rotor_drag_coefficient"] == pytest.approx(expected, rel=0.05)
-    assert after["motor_constant"] == pytest.approx(before["motor_constant"], rel=0.01)
-    np.testing.assert_array_equal(end.point.offsets, fitted.point.offsets)
-
-
-def test_nothing_free_is_nothing_refitted(fit):
-    job, fitted = fit
-    objective, point = with_terms(
-        fitted.objective, fitted.point, ("fuselage_drag",), job.settings.job
-    )
-    fitted = replace(fitted, objective=objective, point=point)
-    held = {name: name for name in objective.space.names}
-    vehicle = vehicle_file().replace(effects={"fuselage_drag": DRAG})
-    bare = GAZEBO_CLASSIC.lacking(vehicle, ["fuselage_drag"])
-    _, effective = refitted(
-        job, replace(fitted, held=held), bare, ("fuselage_drag",), lambda *_: None
-    )
-    assert effective == bare
+def test_nothing_free_is_nothing_refitted(run):
+    run = of_vehicle(as_fitted(run), effects={"fuselage_drag": 0.04})
+    fixed = {
+        name: row.model_copy(update={"fitted": False})
+        for name, row in run.result.coefficients.items()
+    }
+    result = run.result.model_copy(update={"coefficients": fixed})
+    found = effective_in(run.model_copy(update={"result": result}), GAZEBO_CLASSIC, recordings_of)
+    assert found.vehicle == GAZEBO_CLASSIC.lacking(run.vehicle, ["fuselage_drag"])
 
 
 def test_the_rmse_over_flights_is_of_distances_and_a_crash_stays_one():

@@ -6,6 +6,8 @@ import pytest
 from tests.tuner.exporters.conftest import MODELS, as_the_run_says, rmse
 from tuner.config.job import ExportSettings
 from tuner.core.errors import ExportError, InputError
+from tuner.exporters import export as exporting
+from tuner.exporters.effective import Effective
 from tuner.exporters.export import export, exports_of_job
 from tuner.exporters.gates import check
 from tuner.exporters.target import Draft, write
@@ -234,8 +236,12 @@ def in_both(run, _vehicle, flown=None):
 
 
 @pytest.mark.parametrize("kind", ["sdf", "px4"])
-def test_a_simulator_gets_the_effective_coefficients_and_the_file_says_so(make_run, kind):
+def test_a_simulator_gets_the_effective_coefficients_and_the_file_says_so(
+    make_run, kind, monkeypatch
+):
     run, flown = make_run(**DRAGGY, effective=EFFECTIVE), []
+    found = Effective(run.effective, EFFECTIVE)
+    monkeypatch.setattr(exporting, "kept_effective", lambda *_: found)
     done = exported(run, kind, refly=lambda r, v: in_both(r, v, flown))
     if kind == "sdf":
         assert flown[0].aerodynamics.rotor_drag_coefficient == 3e-4

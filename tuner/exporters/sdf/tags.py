@@ -9,9 +9,9 @@ import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
+from xml.etree import ElementTree
 
 import numpy as np
-from lxml import etree
 
 from tuner.core.errors import ExportError
 from tuner.exporters.sdf.model import Array, Inertial, Model, inertials, read_model, together
@@ -154,9 +154,8 @@ def values_in(text: str, path: Path, vehicle: VehicleFile) -> dict[str, float]:
     """
     rotors, motor_tags = len(vehicle.rotors), tags_in("motor")
     try:
-        parser = etree.XMLParser(resolve_entities=False, no_network=True)
-        tree = etree.fromstring(without_comments(text).encode(), parser)
-    except etree.XMLSyntaxError as error:
+        tree = ElementTree.fromstring(without_comments(text))
+    except ElementTree.ParseError as error:
         raise ExportError(path, f"is not well-formed XML ({error})", "correct it") from None
     ours = {str(number) for number in range(rotors)}
     plugins = [e for e in tree.iter("plugin") if _text(e, "motorNumber") in ours]
@@ -185,12 +184,12 @@ def values_in(text: str, path: Path, vehicle: VehicleFile) -> dict[str, float]:
     return read | {name: body[tag] for tag, name in tags.items() if tag in body}
 
 
-def _text(element: etree._Element, tag: str) -> str:
+def _text(element: ElementTree.Element, tag: str) -> str:
     return (element.findtext(tag) or "").strip()
 
 
 def _agreed(
-    elements: Iterable[etree._Element], tags: dict[str, str], path: Path
+    elements: Iterable[ElementTree.Element], tags: dict[str, str], path: Path
 ) -> dict[str, float]:
     """Return the values that elements share."""
     read: dict[str, float] = {}

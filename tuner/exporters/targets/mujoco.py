@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from lxml import etree
 from numpy.typing import NDArray
 
 from tuner.core.errors import ExportError
@@ -88,9 +88,7 @@ def _number(value: float) -> str:
 
 def read_mjcf(path: Path) -> dict[str, float]:
     """Return what a model that this target wrote holds, name -> number."""
-    root = etree.fromstring(
-        read_file(path).encode(), etree.XMLParser(resolve_entities=False, no_network=True)
-    )
+    root = ElementTree.fromstring(read_file(path))
     held: dict[str, float] = {}
     for element, keys in (
         ("inertial", ("mass", "diaginertia")),
