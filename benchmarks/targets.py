@@ -14,7 +14,7 @@ from pathlib import Path
 from tuner.core.runtime import configure
 from tuner.core.shipped import EXPORT_TARGETS
 from tuner.exporters.effective import kept_effective, pose_rmse, refly
-from tuner.exporters.target import Choices, target_of, write
+from tuner.exporters.target import target_of, write
 from tuner.report.result_texts import rmse_in_words
 from tuner.result import PoseRmse, read_run
 
@@ -33,10 +33,9 @@ def main(folder: str) -> None:
     print("|---|---|---|---|---|")
     for kind in EXPORT_TARGETS:
         target = target_of(kind)
-        simulator = target.simulator
-        found = None if simulator is None else kept_effective(run, simulator)
+        found = kept_effective(run, target.simulator) if target.simulator.name else None
         vehicle = run.vehicle if found is None else found.vehicle
-        draft = target.draft(vehicle, "by a benchmark", Choices(simulator=target.simulator_name))
+        draft = target.draft(vehicle, "by a benchmark", target.simulator, None)
         with tempfile.TemporaryDirectory() as place:
             write(draft, Path(place) / f"x{target.suffix}")  # refused if it does not read back
         unfitted = (

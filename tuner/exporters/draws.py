@@ -20,7 +20,7 @@ from tuner.core.errors import ConfigError, ExportError, InputError
 from tuner.core.files import csv_text
 from tuner.core.numerics import symmetric_eigen
 from tuner.exporters.simulators import ISAAC_LAB
-from tuner.exporters.target import Choices, Target, write
+from tuner.exporters.target import Target, write
 from tuner.exporters.targets.isaaclab import configuration, isaaclab_text
 from tuner.result import Run
 from tuner.uncertainty.records import Knowledge
@@ -179,11 +179,10 @@ def write_draws(
             continue
     rows = [(number + 1, *values_of(v).values()) for number, v in enumerate(vehicles)]
     write_text(folder / TABLE, csv_text(("draw", *values_of(base)), rows))
-    choices = Choices(simulator=target.simulator_name)
     for number, vehicle in enumerate(vehicles):
         name = f"draw_{number + 1:05d}"
         named = vehicle.replace(name=f"{base.name}_{name}")
-        draft = target.draft(named, f"{provenance}; {name}", choices)
+        draft = target.draft(named, f"{provenance}; {name}", target.simulator, None)
         write(draft, inside(folder, f"{name}{target.suffix}"))
     notes = [f"{len(vehicles)} draws of the joint posterior are in {folder / TABLE}"]
     if len(vehicles) < len(draws.values):

@@ -126,7 +126,7 @@ def effective_in(
         lacking = simulator.lacking(run.vehicle, members)
         return over_flights(flown(lacking if members else lawful, members))
 
-    lawful, flights = simulator.with_laws(run.vehicle), flown(vehicle, names)
+    lawful, flights = simulator.laws(run.vehicle), flown(vehicle, names)
     return Effective(
         vehicle,
         EffectiveResult(
@@ -158,7 +158,7 @@ def lost_terms(run: Run, simulator: Simulator) -> dict[str, tuple[str, ...]]:
         for name, value in flight.conditions.items():
             acting[name] = max(acting.get(name, 0.0), abs(value))
     lost = simulator.lost(acting)
-    there = simulator.with_laws(run.vehicle)
+    there = simulator.laws(run.vehicle)
     if there.aerodynamics != run.vehicle.aerodynamics or values_of(there) != values_of(run.vehicle):
         lost[LAWS] = ()
     return lost

@@ -16,9 +16,8 @@ from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draws import draws_of, write_draws
 from tuner.exporters.effective import Effective, kept_effective, refly
 from tuner.exporters.gates import Refly, check, check_hover, check_in_simulator, not_flown
-from tuner.exporters.simulators import GAZEBO_CLASSIC
+from tuner.exporters.simulators import GAZEBO_CLASSIC, THIS_PROJECT
 from tuner.exporters.target import (
-    Choices,
     Draft,
     Target,
     check_every_coefficient,
@@ -99,31 +98,29 @@ def export(
     own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
     if out is None or out.suffix:  # before anything is computed
         check_file(out or into or inside(run.folder, own), folder_is_made=True)
-    choices = Choices(into, asked.simulator)
-    target = target.chosen(choices)
+    target = target.chosen(asked.simulator, into)
     physical, (run, effective) = run, in_simulator(run, target)
     vehicle, decided = exported_vehicle(run, today)
     check_every_coefficient(physical.vehicle, target)
     line = provenance(run, today, asked.accept)
     if effective is not None:
-        assert target.simulator is not None
         line = f"{what_is_exported(effective, target.simulator.title)}; {line}"
         decided = (
             f"these are {what_is_exported(effective, target.simulator.title)}",
             *decided,
-            *what_is_lost(effective, target.entry, target.simulator.deviations),
+            *what_is_lost(effective, target.simulator.entry, target.simulator.deviations),
         )
-    draft = target.draft(vehicle, line, replace(choices, simulator=target.simulator_name))
+    draft = target.draft(vehicle, line, target.simulator, into)
     if into is not None and copies is not None and out is None:
         out = copies if draft.others else inside(copies, into.name)
     places = _places(draft, out or into or inside(run.folder, own), into)
     gates = (
         *draft.gates,
-        check_hover(target.flown(vehicle), draft.vehicle),
+        check_hover(target.simulator.flown(vehicle), draft.vehicle),
         *check(run, draft.vehicle, refly),
     )
     flown: tuple[str, ...] = ()
-    if draft.flier is not None and target.simulator is not None and run.result.flights:
+    if draft.flier is not None and run.result.flights:
         gate, sentence = check_in_simulator(run, draft, refly, target.simulator.title)
         gates, flown = (*gates, gate), (sentence,)
     refuse(run.folder, gates, asked.accept, "fit again")
@@ -158,20 +155,20 @@ def export_vehicle(file: Path, asked: ExportOptions, *, today: date) -> Exported
     ExportError, OutputError
         As of `export`.
     """
-    vehicle, choices = read_vehicle(file), Choices(asked.into, asked.simulator)
-    target = target_of(asked.format).chosen(choices)
+    vehicle = read_vehicle(file)
+    target = target_of(asked.format).chosen(asked.simulator, asked.into)
+    simulator = target.simulator
     check_every_coefficient(vehicle, target)
     line, sources = provenance_of_file(vehicle, file, today, asked.accept)
-    draft = target.draft(vehicle, line, replace(choices, simulator=target.simulator_name))
+    draft = target.draft(vehicle, line, simulator, asked.into)
     beside = file.with_name(f"{file.stem}{target.suffix}")
     if beside.name == file.name:
         beside = file.with_name(f"{file.stem}_exported{target.suffix}")
     places = _places(draft, asked.out or asked.into or beside, asked.into)
-    gates = (*draft.gates, check_hover(target.flown(vehicle), draft.vehicle), *not_flown())
+    gates = (*draft.gates, check_hover(simulator.flown(vehicle), draft.vehicle), *not_flown())
     refuse(file, gates, asked.accept, "correct the vehicle file or the model")
     write(draft, *places)
-    computed = () if target.simulator is None else target.simulator.deviations
-    lacks = tuple(f"{target.simulator_name} computes otherwise: {what}" for what in computed)
+    lacks = (f"{simulator.name} computes otherwise: {what}" for what in simulator.deviations)
     notes = (*sources, *draft.notes, *not_carried(vehicle, target), *lacks)
     return Exported(places[0], gates, notes)
 
@@ -198,7 +195,7 @@ def export_draws(
     assert asked.draws is not None
     folder = asked.out or run.folder / FOLDER / "draws"
     draws = draws_of(run, asked.draws)
-    target = target_of(asked.format).chosen(Choices(simulator=asked.simulator))
+    target = target_of(asked.format).chosen(asked.simulator)
     name = file_name(run.vehicle.name, target.suffix)
     first = replace(asked, out=inside(folder, name))
     done = export(run, first, today=today, refly=refly)
@@ -281,7 +278,7 @@ def exports_of_job(
     """
     run = read_run(folder)
     for kind in wanted.formats:
-        into = wanted.into if target_of(kind).patches else None
+        into = wanted.into if target_of(kind).detected else None
         try:
             asked, copies = ExportOptions(kind, into=into), folder / FOLDER
             done = export(run, asked, today=today, refly=refly, copies=copies)
@@ -363,7 +360,7 @@ def in_simulator(run: Run, target: Target) -> tuple[Run, EffectiveResult | None]
     simulator, found = target.simulator, None
     job = run.result.settings.get("job")
     wanted = job.get("target") if isinstance(job, dict) else None
-    if simulator is None or wanted == "physical":
+    if simulator is THIS_PROJECT or wanted == "physical":
         return run, None
     if simulator is GAZEBO_CLASSIC and run.effective is not None and run.result.effective:
         found = Effective(run.effective, run.result.effective)

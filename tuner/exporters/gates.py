@@ -35,9 +35,6 @@ OF_FLIGHTS = (
     "no coefficient sits on a bound",
 )
 
-POSITION = ("x", "y", "z")
-ATTITUDE = ("roll", "pitch", "yaw")
-
 
 def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
     """Check a run and the vehicle as exported against every condition."""
@@ -64,14 +61,17 @@ def check_in_simulator(
     objections = list(_crashes(there))
     for flight in run.result.flights:
         own, other = flight.rmse_best, there[flight.name]
-        for axes, slack, unit in ((POSITION, ELSEWHERE_M, "m"), (ATTITUDE, ELSEWHERE_DEG, "deg")):
-            expected, found = _length(own, axes), _length(other, axes)
+        for signal, slack, unit in (
+            ("position", ELSEWHERE_M, "m"),
+            ("attitude", ELSEWHERE_DEG, "deg"),
+        ):
+            expected, found = _missed(own, signal), _missed(other, signal)
             if math.isfinite(found) and found > expected * ELSEWHERE + slack:
                 objections.append(
                     f"{flight.name} is missed by {found:.3g} {unit}, expected {expected:.3g}"
                 )
     missed = "; ".join(
-        f"{name} {1000 * _length(rmse, POSITION):.3g} mm, {_length(rmse, ATTITUDE):.2g}°"
+        f"{name} {1000 * _missed(rmse, 'position'):.3g} mm, {_missed(rmse, 'attitude'):.2g}°"
         for name, rmse in there.items()
     )
     return Gate(f"{title} itself flies it so", tuple(objections)), f"flown in {title}: {missed}"
@@ -130,17 +130,17 @@ def _worse(run: Run) -> list[str]:
     for flight in run.result.flights:
         if flight.split != "holdout":
             continue
-        for what, axes, unit in (("position", POSITION, "m"), ("attitude", ATTITUDE, "degrees")):
-            before, after = _length(flight.rmse_initial, axes), _length(flight.rmse_best, axes)
+        for what, unit in (("position", "m"), ("attitude", "degrees")):
+            before, after = _missed(flight.rmse_initial, what), _missed(flight.rmse_best, what)
             if after > before * (1 + WORSE):
                 objections.append(f"{flight.name} {what} {after:.4g} {unit}, before {before:.4g}")
     return objections
 
 
-def _length(rmse: AxesRmse, axes: tuple[str, ...]) -> float:
-    """Return the RMSE over several axes together; infinite for a crash."""
-    values = [getattr(rmse, axis) for axis in axes]
-    return math.inf if None in values else math.hypot(*values)
+def _missed(rmse: AxesRmse, signal: str) -> float:
+    """Return the RMSE of a signal over its axes together; infinite for a crash."""
+    together = rmse.together(signal)
+    return math.inf if together is None else together
 
 
 def _on_bounds(run: Run) -> list[str]:

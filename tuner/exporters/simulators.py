@@ -78,6 +78,11 @@ Laws = Callable[[VehicleFile], VehicleFile]
 _OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
 
 
+def _torque_on_body(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose rotors' reaction torque acts about the body's z axis."""
+    return vehicle.replace(aerodynamics=vehicle.aerodynamics.replace(reaction_torque="body"))
+
+
 @dataclass(frozen=True)
 class Simulator:
     """A simulator that a vehicle is exported for.
@@ -111,7 +116,7 @@ class Simulator:
     source: str
     deviations: tuple[str, ...]
     entry: Callable[[Coefficient], Entry | None]
-    laws: Laws = lambda vehicle: vehicle
+    laws: Laws = _torque_on_body
     free: tuple[str, ...] = ()
     ties: tuple[tuple[str, ...], ...] = ()
     fixed: tuple[str, ...] = ()
@@ -119,15 +124,10 @@ class Simulator:
 
     def flown(self, vehicle: VehicleFile) -> VehicleFile:
         """Return the vehicle as the simulator flies it, in a file that this project flies."""
-        vehicle = self.with_laws(vehicle)
+        vehicle = self.laws(vehicle)
         return self.lacking(
             vehicle, [n for n in values_of(vehicle) if self.built_in(n) is not None]
         )
-
-    def with_laws(self, vehicle: VehicleFile) -> VehicleFile:
-        """Return the vehicle that its laws make of one; torques react about the body's axis."""
-        vehicle = self.laws(vehicle)
-        return vehicle.replace(aerodynamics=vehicle.aerodynamics.replace(reaction_torque="body"))
 
     def built_in(self, name: str) -> float | None:
         """Return the value that it flies in the place of a coefficient's; None where it has it."""
@@ -303,7 +303,7 @@ def _between_whole_speeds(vehicle: VehicleFile) -> VehicleFile:
         input_scaling=high - low, zero_position_armed=low, input_offset=0.0, quadratic=0.0
     )
     fastest = max(motor.max_rotor_velocity, high)
-    return vehicle.replace(motor=motor.replace(max_rotor_velocity=fastest))
+    return _torque_on_body(vehicle.replace(motor=motor.replace(max_rotor_velocity=fastest)))
 
 
 # simulators
@@ -361,7 +361,9 @@ SIH = Simulator(
         "one damping of rotation about all axes",
     ),
     entry=registered("px4"),
-    laws=lambda vehicle: _one_damping(_same_drag(_mean_lag(linear_in(vehicle, idle=False)))),
+    laws=lambda vehicle: _one_damping(
+        _same_drag(_mean_lag(linear_in(_torque_on_body(vehicle), idle=False)))
+    ),
     free=("linear_drag_x", "linear_drag_y", "linear_drag_z"),
     ties=(("linear_drag_x", "linear_drag_y", "linear_drag_z"),),
     fixed=("input_scaling", "zero_position_armed", "time_constant_up", "time_constant_down"),
@@ -405,14 +407,14 @@ def _entries(title: str, *groups: tuple[str, ...], **keys: str) -> Callable[...,
 
 
 def _about_centre(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle whose rotor positions count from its centre of mass."""
+    """Return a vehicle whose rotor positions count from its centre of mass, and torques' axis."""
     offset = [vehicle.effects.get(name, 0.0) for name in _CENTRE]
     effects = {name: value for name, value in vehicle.effects.items() if name not in _CENTRE}
     rotors = tuple(
         rotor.replace(position=tuple(at - o for at, o in zip(rotor.position, offset, strict=True)))
         for rotor in vehicle.rotors
     )
-    return vehicle.replace(effects=effects, rotors=rotors)
+    return _torque_on_body(vehicle.replace(effects=effects, rotors=rotors))
 
 
 def _square_x(vehicle: VehicleFile) -> VehicleFile:
@@ -426,9 +428,18 @@ def _square_x(vehicle: VehicleFile) -> VehicleFile:
         rotor.replace(position=(side(rotor.position[0]), side(rotor.position[1]), 0.0))
         for rotor in vehicle.rotors
     )
-    return vehicle.replace(rotors=rotors)
+    return _torque_on_body(vehicle.replace(rotors=rotors))
 
 
+THIS_PROJECT = Simulator(
+    name="",
+    title="this project",
+    version="",
+    source="sim_jax",
+    deviations=(),
+    entry=lambda row: Written(".".join(row.place)),
+    laws=lambda vehicle: vehicle,
+)
 MUJOCO = Simulator(
     name="mujoco",
     title="MuJoCo",

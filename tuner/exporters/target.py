@@ -16,7 +16,7 @@ from tuner.core.disk import make_folder, whole_file
 from tuner.core.errors import ConfigError, ExportError, did_you_mean
 from tuner.core.files import read_bytes
 from tuner.exporters import targets
-from tuner.exporters.simulators import Entry, Simulator
+from tuner.exporters.simulators import THIS_PROJECT, Simulator
 from tuner.result import Gate
 from tuner.vehicle import COEFFICIENTS, Coefficient, NotCarried, VehicleFile, values_of
 
@@ -38,7 +38,7 @@ class Draft:
     notes
         What was done, and what the format has no place for.
     faults
-        Given the file as it stands on the disk, and others that stand in for theirs, what is wrong
+        Given the file as it stands on the disk, and which others stand in for theirs, what is wrong
         with the numbers in it.
     gates
         Conditions of the format's own.
@@ -52,7 +52,7 @@ class Draft:
     text: str
     vehicle: VehicleFile
     notes: tuple[str, ...]
-    faults: Callable[..., Sequence[str]]
+    faults: Callable[[Path, Mapping[Path, Path]], Sequence[str]]
     gates: tuple[Gate, ...] = ()
     others: Mapping[Path, str] = field(default_factory=dict)
     flier: Callable[..., Any] | None = None
@@ -109,8 +109,7 @@ def write(draft: Draft, path: Path, others: Mapping[Path, Path] | None = None) -
             file: written((others or {}).get(file, file), text)
             for file, text in draft.others.items()
         }
-        wrong = draft.faults(first, instead) if instead else draft.faults(first)
-        if wrong:
+        if wrong := draft.faults(first, instead):
             raise ExportError(
                 path, f"would not read back: {'; '.join(wrong)}", "report this; nothing was written"
             )
@@ -133,22 +132,6 @@ def read_file(path: Path) -> str:
 
 
 @dataclass(frozen=True)
-class Choices:
-    """What a user can choose about the file.
-
-    Attributes
-    ----------
-    into
-        The model to patch; None for a file of its own.
-    simulator
-        Which of a format's simulators it is for; empty for its usual one.
-    """
-
-    into: Path | None = None
-    simulator: str = ""
-
-
-@dataclass(frozen=True)
 class Target:
     """A format that a vehicle can be exported in.
 
@@ -159,36 +142,25 @@ class Target:
     suffix
         Of its files.
     draft
-        Vehicle, provenance in one line and choices -> the file before it is written, which knows
-        how it is read back.
-    entry
-        Where the target holds a coefficient, or why it has no place for it; None for a coefficient
-        about which nothing is registered.
-    patches
-        Whether it can go into a model that exists.
+        Vehicle, provenance in one line, simulator, and the model to patch, or None for a file of
+        its own -> the file before it is written, which knows how it is read back.
     simulator
-        Who flies what it holds; None for this project.
+        Who flies what it holds.
     others
         Further simulators that read the format.
     detected
-        A model to patch -> the name of the simulator that it is for.
+        A model to patch -> the name of the simulator that it is for; None for a format that goes
+        into no model that exists.
     """
 
     name: str
     suffix: str
-    draft: Callable[[VehicleFile, str, Choices], Draft]
-    entry: Callable[[Coefficient], Entry | None]
-    patches: bool = False
-    simulator: Simulator | None = None
+    draft: Callable[[VehicleFile, str, Simulator, Path | None], Draft]
+    simulator: Simulator = THIS_PROJECT
     others: tuple[Simulator, ...] = ()
     detected: Callable[[Path], str] | None = None
 
-    @property
-    def simulator_name(self) -> str:
-        """Of who flies it; empty for this project."""
-        return "" if self.simulator is None else self.simulator.name
-
-    def chosen(self, choices: Choices) -> Target:
+    def chosen(self, simulator: str = "", into: Path | None = None) -> Target:
         """Return the target for the simulator that is asked for, or that a model is for.
 
         Raises
@@ -196,31 +168,26 @@ class Target:
         ExportError
             It patches no model, has nothing for that simulator, or the model is for another one.
         """
-        if choices.into is not None and not self.patches:
-            raise ExportError("--into", f"does not go with --format {self.name}", "leave it out")
-        known = {s.name: s for s in (self.simulator, *self.others) if s is not None}
+        known = {s.name: s for s in (self.simulator, *self.others) if s.name}
         is_for = ""
-        if choices.into is not None and self.detected is not None:
-            is_for = self.detected(choices.into)
-        for what, name in (("--simulator", choices.simulator), (str(choices.into), is_for)):
+        if into is not None:
+            if self.detected is None:
+                raise ExportError(
+                    "--into", f"does not go with --format {self.name}", "leave it out"
+                )
+            is_for = self.detected(into)
+        for what, name in (("--simulator", simulator), (str(into), is_for)):
             if name and name not in known:
                 raise ExportError(
                     what,
                     f"--format {self.name} is not for {name}",
-                    f"it is for {' or '.join(known) or 'this project'}",
+                    f"it is for {' or '.join(known) or THIS_PROJECT.title}",
                 )
-        if is_for and choices.simulator and choices.simulator != is_for:
+        if is_for and simulator and simulator != is_for:
             raise ExportError(
-                str(choices.into), f"is a model for {is_for}", f"leave --simulator {is_for} out"
+                str(into), f"is a model for {is_for}", f"leave --simulator {is_for} out"
             )
-        simulator = known.get(is_for or choices.simulator)
-        if simulator is None or simulator is self.simulator:
-            return self
-        return replace(self, simulator=simulator, entry=simulator.entry)
-
-    def flown(self, vehicle: VehicleFile) -> VehicleFile:
-        """Return the vehicle as whoever reads the file flies it."""
-        return vehicle if self.simulator is None else self.simulator.flown(vehicle)
+        return replace(self, simulator=known.get(is_for or simulator, self.simulator))
 
 
 def target_of(name: str) -> Target:
@@ -249,7 +216,7 @@ def check_every_coefficient(vehicle: VehicleFile, target: Target) -> None:
     """
     for name, value in values_of(vehicle).items():
         row = COEFFICIENTS[name]
-        if target.entry(row) is None and value != row.neutral:
+        if target.simulator.entry(row) is None and value != row.neutral:
             raise ExportError(
                 vehicle.name,
                 f"{name} is {quantity(value, row)}, which --format {target.name} can neither write "
@@ -263,7 +230,7 @@ def not_carried(vehicle: VehicleFile, target: Target) -> tuple[str, ...]:
     sentences = []
     for name, value in values_of(vehicle).items():
         row = COEFFICIENTS[name]
-        entry = target.entry(row)
+        entry = target.simulator.entry(row)
         if isinstance(entry, NotCarried) and value not in (row.neutral, entry.built_in):
             sentences.append(f"{name} {quantity(value, row)} is not exported: {entry.reason}")
     return tuple(sentences)

@@ -183,7 +183,7 @@ def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
 
 def test_a_file_that_would_not_read_back_is_not_written(tmp_path, make_run):
     (tmp_path / "a.txt").write_text("before")
-    draft = Draft("text", make_run().vehicle, (), lambda path: [f"{path.read_text()} is wrong"])
+    draft = Draft("text", make_run().vehicle, (), lambda path, _: [f"{path.read_text()} is wrong"])
     with pytest.raises(ExportError, match=r"a\.txt: would not read back: text is wrong"):
         write(draft, tmp_path / "a.txt")
     assert (tmp_path / "a.txt").read_text() == "before"

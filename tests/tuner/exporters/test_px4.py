@@ -3,8 +3,8 @@ import math
 import pytest
 
 from tuner.core.errors import ExportError
-from tuner.exporters.simulators import GZ_SIM
-from tuner.exporters.target import Choices, write
+from tuner.exporters.simulators import GZ_SIM, SIH
+from tuner.exporters.target import write
 from tuner.exporters.targets.px4 import (
     outside_range,
     parameters,
@@ -14,7 +14,7 @@ from tuner.exporters.targets.px4 import (
 
 
 def test_rotors_are_in_px4s_frame_forward_right_down(vehicle):
-    values = parameters(vehicle)
+    values = parameters(vehicle, SIH)
     places = [[values[f"CA_ROTOR{i}_{axis}"] for axis in ("PX", "PY", "PZ")] for i in range(4)]
     assert places == [
         [0.17678, 0.17678, -0.06],
@@ -27,17 +27,17 @@ def test_rotors_are_in_px4s_frame_forward_right_down(vehicle):
 
 
 def test_full_thrust_and_torque(vehicle):
-    values = parameters(vehicle)
+    values = parameters(vehicle, SIH)
     thrust = 1.45e-5 * 1050**2
     assert values["CA_ROTOR0_CT"] == pytest.approx(thrust, rel=1e-6)
     assert values["SIH_T_MAX"] == pytest.approx(thrust, rel=1e-6)
     assert values["SIH_Q_MAX"] == pytest.approx(thrust * 0.033, rel=1e-6)
     limited = vehicle.replace(motor=vehicle.motor.replace(max_rotor_velocity=1000.0))
-    assert parameters(limited)["SIH_T_MAX"] == pytest.approx(14.5, rel=1e-6)
+    assert parameters(limited, SIH)["SIH_T_MAX"] == pytest.approx(14.5, rel=1e-6)
 
 
 def test_the_simulation_in_hardware_gets_the_body(vehicle):
-    values = parameters(vehicle)
+    values = parameters(vehicle, SIH)
     assert (values["SIH_MASS"], values["SIH_IXX"], values["SIH_IYY"], values["SIH_IZZ"]) == (
         2.243,
         0.028,
@@ -51,7 +51,7 @@ def test_the_simulation_in_hardware_gets_the_body(vehicle):
 
 
 def test_the_hover_is_that_of_the_simulator_in_the_file(vehicle):
-    sih = parameters(vehicle)  # whose thrust is linear in the command
+    sih = parameters(vehicle, SIH)  # whose thrust is linear in the command
     assert 4 * sih["SIH_T_MAX"] * sih["MPC_THR_HOVER"] == pytest.approx(2.243 * 9.81, rel=1e-6)
     assert not any(name.startswith("SIM_GZ") for name in sih)
     gz = parameters(vehicle, GZ_SIM)
@@ -63,11 +63,13 @@ def test_the_hover_is_that_of_the_simulator_in_the_file(vehicle):
 
 
 def test_angular_drag_is_written_and_none_is_zero(vehicle):
-    assert parameters(vehicle)["SIH_KDW"] == 0.0  # PX4's default damps
+    assert parameters(vehicle, SIH)["SIH_KDW"] == 0.0  # PX4's default damps
     damped = vehicle.replace(effects={f"angular_drag_{axis}": 0.01 for axis in "xyz"})
-    assert parameters(damped)["SIH_KDW"] == pytest.approx(0.01)
+    assert parameters(damped, SIH)["SIH_KDW"] == pytest.approx(0.01)
     dragging = vehicle.replace(effects={"linear_drag_x": 0.1, "linear_drag_y": 0.1})
-    assert parameters(dragging)["SIH_KDV"] == pytest.approx(parameters(vehicle)["SIH_KDV"] + 0.1)
+    assert parameters(dragging, SIH)["SIH_KDV"] == pytest.approx(
+        parameters(vehicle, SIH)["SIH_KDV"] + 0.1
+    )
 
 
 def test_what_px4_does_not_accept_is_a_gate(vehicle):
@@ -77,18 +79,18 @@ def test_what_px4_does_not_accept_is_a_gate(vehicle):
     assert outside_range({"SIH_KDW": -1.0, "SIH_IXY": -1.0}) == (
         "SIH_KDW -1: PX4 accepts at least 0",
     )
-    heavy = px4_draft(vehicle.replace(mass=5.8), "", Choices())
+    heavy = px4_draft(vehicle.replace(mass=5.8), "", SIH)
     (gate, _) = heavy.gates
     assert gate.objections[0].startswith("MPC_THR_HOVER 0.8")
-    assert px4_draft(vehicle, "", Choices()).gates[0].passed
+    assert px4_draft(vehicle, "", SIH).gates[0].passed
 
 
 def test_the_sih_of_another_airframe_is_a_gate(vehicle):
     rotors = list(vehicle.rotors)
     rotors[0] = rotors[0].replace(position=(0.2, -0.17678, 0.06))
-    (_, gate) = px4_draft(vehicle.replace(rotors=tuple(rotors)), "", Choices()).gates
+    (_, gate) = px4_draft(vehicle.replace(rotors=tuple(rotors)), "", SIH).gates
     assert "along x" in gate.objections[0]
-    (_, gate) = px4_draft(vehicle, "", Choices(simulator="gz-sim")).gates
+    (_, gate) = px4_draft(vehicle, "", GZ_SIM).gates
     assert gate.passed
 
 
@@ -101,7 +103,7 @@ def test_hover_command_carries_the_weight(vehicle):
 def test_speeds_beyond_px4s_range_are_scaled(vehicle):
     values = parameters(vehicle, GZ_SIM)
     assert (values["SIM_GZ_EC_MIN1"], values["SIM_GZ_EC_MAX1"]) == (95, 1000)
-    draft = px4_draft(vehicle, "", Choices(simulator="gz-sim"))
+    draft = px4_draft(vehicle, "", GZ_SIM)
     assert any("scaled by 0.952381" in note for note in draft.notes)
     assert draft.vehicle.motor.input_scaling == pytest.approx(950, rel=1e-3)
     assert draft.vehicle.aerodynamics.motor_constant == 1.45e-5
@@ -116,29 +118,29 @@ def test_the_gz_bridge_gets_whole_speeds(vehicle):
 
 def test_a_vehicle_too_heavy_to_hover_is_refused(vehicle):
     with pytest.raises(ExportError, match="cannot hover"):
-        px4_draft(vehicle.replace(mass=20.0), "", Choices())
+        px4_draft(vehicle.replace(mass=20.0), "", SIH)
 
 
 def test_the_file_is_what_ground_stations_load(vehicle, tmp_path):
     path = tmp_path / "x.params"
-    draft = px4_draft(vehicle, "by a test", Choices())
+    draft = px4_draft(vehicle, "by a test", SIH)
     write(draft, path)
     lines = path.read_text().splitlines()
     assert lines[0] == "# by a test"
     assert "1\t1\tSIH_MASS\t2.243\t9" in lines
     assert "1\t1\tCA_ROTOR_COUNT\t4\t6" in lines
     again = read_parameters(path)
-    assert set(again) == set(parameters(vehicle))
+    assert set(again) == set(parameters(vehicle, SIH))
     assert again["SIH_MASS"] == 2.243
 
 
 def test_a_changed_file_does_not_read_back(vehicle, tmp_path):
     path = tmp_path / "x.params"
-    draft = px4_draft(vehicle, "by a test", Choices())
+    draft = px4_draft(vehicle, "by a test", SIH)
     path.write_text(draft.text.replace("2.243", "2.244"))
-    assert draft.faults(path) == ["SIH_MASS is 2.244, not 2.243"]
+    assert draft.faults(path, {}) == ["SIH_MASS is 2.244, not 2.243"]
     path.write_text(draft.text.replace("1\t1\tSIH_MASS\t2.243\t9\n", ""))
-    assert draft.faults(path) == ["SIH_MASS is None, not 2.243"]
+    assert draft.faults(path, {}) == ["SIH_MASS is missing"]
     path.write_text("1 1 SIH_MASS\n")
     with pytest.raises(ExportError, match="SIH_MASS"):
-        draft.faults(path)
+        draft.faults(path, {})

@@ -25,8 +25,8 @@ from tuner.exporters.sdf.spans import (
 )
 from tuner.exporters.sdf.tags import carried_values, composite, values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
-from tuner.exporters.target import Choices, not_carried, target_of, write
-from tuner.exporters.targets.sdf import TARGET, snippet_draft
+from tuner.exporters.target import not_carried, target_of, write
+from tuner.exporters.targets.sdf import TARGET
 from tuner.vehicle import COEFFICIENTS, Written, values_of
 
 CLASSIC, GZ, TEMPLATE = (
@@ -141,12 +141,12 @@ def test_what_was_written_is_read_back(path, vehicle, tmp_path):
     target = tmp_path / path.name
     draft = sdf_draft(path, vehicle, "by a test")
     write(draft, target)
-    assert draft.faults(target) == []
+    assert draft.faults(target, {}) == []
     other = draft.text.replace("0.000145", "0.000146").replace("0.00015225", "0.00015226")
     target.write_text(other, encoding="utf-8")
-    assert any("rotor_drag_coefficient" in fault for fault in draft.faults(target))
+    assert any("rotor_drag_coefficient" in fault for fault in draft.faults(target, {}))
     target.write_text(draft.text.replace("2.204", "2.205"), encoding="utf-8")
-    assert any(fault.startswith("mass is 2.24") for fault in draft.faults(target))
+    assert any(fault.startswith("mass is 2.24") for fault in draft.faults(target, {}))
 
 
 @pytest.mark.parametrize("tag", ["momentConstant", "input_scaling"])
@@ -154,7 +154,7 @@ def test_a_model_that_lacks_a_tag_does_not_read_back(tag, vehicle, tmp_path):
     draft = sdf_draft(CLASSIC, vehicle, "by a test")
     target = tmp_path / "model.sdf"
     target.write_text(re.sub(rf" *<{tag}>.*\n", "", draft.text), encoding="utf-8")
-    (fault,) = draft.faults(target)
+    (fault,) = draft.faults(target, {})
     assert fault.endswith(" is missing")
 
 
@@ -295,7 +295,7 @@ def test_blanking_a_template_keeps_every_place():
 
 @pytest.mark.parametrize("simulator", [GAZEBO_CLASSIC, GZ_SIM], ids=lambda s: s.name)
 def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
-    draft = snippet_draft(vehicle, simulator, "by a test")
+    draft = TARGET.draft(vehicle, "by a test", simulator, None)
     path = tmp_path / "snippet.sdf"
     write(draft, path)
     model = f"<model><link name='base_link'>{draft.text}</link></model>"
@@ -307,7 +307,7 @@ def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
     assert draft.text.count("<channel ") == (4 if classic else 0)
     other = draft.text.replace("1.45e-05", "1.46e-05").replace("1.598625e-05", "1.6e-05")
     path.write_text(other, encoding="utf-8")
-    assert draft.faults(path)
+    assert draft.faults(path, {})
 
 
 UNEVEN = {f"rotor_thrust_scale_{n + 1}": scale for n, scale in enumerate((1.02, 0.985, 0.99))}
@@ -346,10 +346,10 @@ def test_centre_of_mass_and_uneven_rotors_are_in_the_model(path, vehicle, tmp_pa
     first = f"<motorConstant>{constants[0]:.12g}<"
     assert first in draft.text
     again.write_text(draft.text.replace(first, "<motorConstant>1.47e-05<"), encoding="utf-8")
-    assert any("motor_constant of rotor_0" in fault for fault in draft.faults(again))
+    assert any("motor_constant of rotor_0" in fault for fault in draft.faults(again, {}))
     unmoved = re.sub(r"(</inertia>)\s*<pose>[^<]*</pose>", r"\1", draft.text, count=1)
     again.write_text(unmoved, encoding="utf-8")
-    assert any("center_of_mass_x" in fault for fault in draft.faults(again))
+    assert any("center_of_mass_x" in fault for fault in draft.faults(again, {}))
 
 
 def test_rotors_that_differ_need_plugins_of_their_own(vehicle, tmp_path):
@@ -370,13 +370,13 @@ def test_a_centre_of_mass_needs_rotors_to_count_from(vehicle, tmp_path):
 
 
 def test_a_snippet_holds_centre_of_mass_and_uneven_rotors(vehicle, tmp_path):
-    draft = snippet_draft(uneven(vehicle), GZ_SIM, "by a test")
+    draft = TARGET.draft(uneven(vehicle), "by a test", GZ_SIM, None)
     assert "<pose>0.003 -0.002 0.015 0 0 0</pose>" in draft.text
     flown = GZ_SIM.flown(uneven(vehicle))
     assert values_of(draft.vehicle) == pytest.approx(values_of(flown), rel=1e-11)
     path = tmp_path / "snippet.sdf"
     write(draft, path)
-    assert draft.faults(path) == []
+    assert draft.faults(path, {}) == []
 
 
 def test_a_model_for_another_vehicle_is_a_gate(vehicle, tmp_path):
@@ -396,18 +396,18 @@ def test_gz_sim_is_flown_by_its_own_laws(vehicle):
     assert flown.aerodynamics.max_relative_airspeed > 1e5
     assert flown.aerodynamics.rolling_moment_coefficient == 0
     assert sdf_draft(CLASSIC, vehicle, "by a test").vehicle.aerodynamics == vehicle.aerodynamics
-    notes = " / ".join(not_carried(vehicle, TARGET.chosen(Choices(GZ))))
+    notes = " / ".join(not_carried(vehicle, TARGET.chosen(into=GZ)))
     assert "thrust in gz-sim does not depend on the airspeed" in notes
 
 
 def test_format_and_model_agree_about_the_simulator():
-    assert TARGET.chosen(Choices(GZ)).simulator is GZ_SIM
-    assert TARGET.chosen(Choices(simulator="gz-sim")).simulator is GZ_SIM
-    assert TARGET.chosen(Choices()).simulator is GAZEBO_CLASSIC
+    assert TARGET.chosen(into=GZ).simulator is GZ_SIM
+    assert TARGET.chosen("gz-sim").simulator is GZ_SIM
+    assert TARGET.chosen().simulator is GAZEBO_CLASSIC
     with pytest.raises(ExportError, match="is a model for gz-sim"):
-        TARGET.chosen(Choices(GZ, "gazebo-classic"))
+        TARGET.chosen("gazebo-classic", GZ)
     with pytest.raises(ExportError, match="--format gz-sim is not for gazebo-classic"):
-        target_of("gz-sim").chosen(Choices(CLASSIC))
+        target_of("gz-sim").chosen(into=CLASSIC)
 
 
 def solid_box(mass, pose, sides):

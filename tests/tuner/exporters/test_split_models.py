@@ -76,7 +76,7 @@ def test_numbers_are_written_where_they_live(vehicle, tmp_path):
     assert {**again.others} == {file: file.read_text() for file in again.others}
     base = tmp_path / "base" / "model.sdf"
     base.write_text(base.read_text().replace("2.204", "2.205"))
-    assert any(fault.startswith("mass is ") for fault in draft.faults(path))
+    assert any(fault.startswith("mass is ") for fault in draft.faults(path, {}))
 
 
 def test_a_copy_is_written_beside_and_the_model_stays(vehicle, tmp_path):

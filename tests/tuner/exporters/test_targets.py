@@ -12,8 +12,8 @@ from tuner.core.shipped import EXPORT_TARGETS, configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.exporters.export import export_vehicle
 from tuner.exporters.flier import flier
-from tuner.exporters.simulators import SIMULATORS, hover_command, thrust_to_weight
-from tuner.exporters.target import Choices, target_of, write
+from tuner.exporters.simulators import MUJOCO, SIMULATORS, hover_command, thrust_to_weight
+from tuner.exporters.target import target_of, write
 from tuner.options import ExportOptions
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, write_vehicle
@@ -25,14 +25,14 @@ EVERY = pytest.mark.parametrize("kind", EXPORT_TARGETS)
 @EVERY
 def test_what_is_written_is_read_back_and_a_changed_number_is_seen(kind, vehicle, tmp_path):
     target = target_of(kind)
-    draft = target.draft(vehicle, "by a test", Choices())
+    draft = target.draft(vehicle, "by a test", target.simulator, None)
     path = tmp_path / f"x{target.suffix}"
     write(draft, path)
     text = path.read_text()
     assert "by a test" in text
     assert "2.243" in text
     path.write_text(text.replace("2.243", "2.244"))
-    assert draft.faults(path)
+    assert draft.faults(path, {})
 
 
 @EVERY
@@ -42,13 +42,13 @@ def test_laws_applied_twice_change_nothing(kind, vehicle):
         effects={"linear_drag_x": 0.1, "fuselage_drag": 0.02, "angular_drag_z": 0.01},
         motor=vehicle.motor.replace(quadratic=-20.0, input_offset=0.01),
     )
-    once = target.flown(vehicle)
-    assert values_of(target.flown(once)) == pytest.approx(values_of(once), rel=1e-12)
+    once = target.simulator.flown(vehicle)
+    assert values_of(target.simulator.flown(once)) == pytest.approx(values_of(once), rel=1e-12)
 
 
 @EVERY
 def test_thrust_and_hover_are_carried(kind, vehicle):
-    flown = target_of(kind).flown(vehicle)
+    flown = target_of(kind).simulator.flown(vehicle)
     assert thrust_to_weight(flown) == pytest.approx(thrust_to_weight(vehicle), rel=1e-9)
     if kind != "px4":  # whose thrust is linear in the command
         assert hover_command(flown) == pytest.approx(hover_command(vehicle), abs=1e-3)
@@ -123,7 +123,7 @@ def test_another_simulators_body_is_what_moves(flight, updated):
 def test_mujoco_itself_flies_what_is_written_for_it(flight, updated):
     pytest.importorskip("mujoco", reason="MuJoCo is not installed: the extra simulators")
 
-    draft = target_of("mujoco").draft(updated, "by a test", Choices())
+    draft = target_of("mujoco").draft(updated, "by a test", MUJOCO, None)
     comparison = Comparison([Recording(flight)], ControllerFile())
     own = comparison.fly(draft.vehicle)["small_circle"].rmse
     there = comparison.fly(draft.vehicle, flier=draft.flier)["small_circle"].rmse
@@ -132,7 +132,7 @@ def test_mujoco_itself_flies_what_is_written_for_it(flight, updated):
     for axis in ("roll", "pitch", "yaw"):
         assert getattr(there, axis) == pytest.approx(getattr(own, axis), abs=0.3)
     heavy = draft.vehicle.replace(mass=1.3 * draft.vehicle.mass)
-    wrong = target_of("mujoco").draft(heavy, "by a test", Choices())
+    wrong = target_of("mujoco").draft(heavy, "by a test", MUJOCO, None)
     worse = comparison.fly(draft.vehicle, flier=wrong.flier)["small_circle"].rmse
     assert worse.z > there.z + 0.01
 
@@ -140,6 +140,6 @@ def test_mujoco_itself_flies_what_is_written_for_it(flight, updated):
 @pytest.mark.parametrize("kind", ["mujoco", "rotorpy", "isaaclab"])
 def test_rotors_are_placed_about_the_centre_of_mass(kind, vehicle):
     off = vehicle.replace(effects={"center_of_mass_x": 0.004, "center_of_mass_z": -0.02})
-    flown = target_of(kind).flown(off)
+    flown = target_of(kind).simulator.flown(off)
     assert flown.rotors[0].position == pytest.approx((0.17278, -0.17678, 0.08))
     assert not any(name.startswith("center_of_mass") for name in flown.effects)

@@ -79,9 +79,10 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
         )
     patched = _patched(pieces, edits, model, provenance)
 
-    def read(file: Path, instead: Mapping[Path, Path] | None = None) -> str:
-        standing = {path: file, **(instead or {})}
-        return assembled(path, lambda p: read_file(standing.get(p, p)), rendered).text
+    def faults(file: Path, instead: Mapping[Path, Path]) -> list[str]:
+        standing = {**instead, path: file}
+        text = assembled(path, lambda p: read_file(standing.get(p, p)), rendered).text
+        return differences(wanted, values_in(text, path, vehicle))
 
     final = assembled(path, lambda p: patched.get(p) or read_file(p), rendered).text
     wanted = tags.carried_values(vehicle, channels=bool(whole.channels()))
@@ -95,9 +96,7 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
         patched.pop(path, pieces.files[path]),
         with_speeds_in(there, 1.0 / unit),
         tuple(_notes(whole, asked, vehicle, base, unit)),
-        lambda file, instead=None: differences(
-            wanted, values_in(read(file, instead), path, vehicle)
-        ),
+        faults,
         gates=(Gate("rotors sit and turn there as the vehicle's do", geometry),),
         others=patched,
     )

@@ -16,7 +16,7 @@ from tuner.core.disk import file_name
 from tuner.core.yaml_document import commented
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import DRONE_MODELS, rotor_speed, thrust_at
-from tuner.exporters.target import Choices, Draft, Target, differences, read_file
+from tuner.exporters.target import Draft, Target, differences, read_file
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
@@ -66,13 +66,13 @@ def flattened(content: dict[str, Any]) -> dict[str, float]:
     return numbers
 
 
-def drone_models_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+def drone_models_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
     """Return a table to put into drone-models' ``data/params.toml``."""
     flown = DRONE_MODELS.flown(vehicle)
     wanted, key = params(flown), file_name(vehicle.name, "")
     lines = "".join(f"{name} = {value!r}\n" for name, value in wanted.items())
 
-    def faults(path: Path) -> list[str]:
+    def faults(path: Path, _: object) -> list[str]:
         return differences(flattened(wanted), flattened(tomllib.loads(read_file(path))[key]))
 
     text = f'{commented(provenance)}["{key}"]\n{lines}'
@@ -146,6 +146,4 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
     return flier(Flying)
 
 
-TARGET = Target(
-    "drone-models", ".toml", drone_models_draft, DRONE_MODELS.entry, simulator=DRONE_MODELS
-)
+TARGET = Target("drone-models", ".toml", drone_models_draft, DRONE_MODELS)

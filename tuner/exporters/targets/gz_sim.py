@@ -11,10 +11,6 @@ from tuner.exporters.targets.sdf import TARGET as SDF
 TARGET: Target = replace(
     SDF,
     name="gz-sim",
-    draft=lambda vehicle, provenance, choices: SDF.draft(
-        vehicle, provenance, replace(choices, simulator=GZ_SIM.name)
-    ),
-    entry=GZ_SIM.entry,
     simulator=GZ_SIM,
     others=(),
 )

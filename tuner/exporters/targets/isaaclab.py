@@ -8,7 +8,7 @@ from typing import Any
 
 from tuner.core.yaml_document import commented
 from tuner.exporters.simulators import ISAAC_LAB, hover_speed, rotor_speed, thrust_at
-from tuner.exporters.target import Choices, Draft, Target, assigned, differences
+from tuner.exporters.target import Draft, Target, assigned, differences
 from tuner.exporters.targets.drone_models import flattened
 from tuner.vehicle import VehicleFile
 
@@ -88,15 +88,15 @@ def isaaclab_text(content: dict[str, dict[str, Any]], provenance: str) -> str:
     return commented(provenance) + "\n".join(pieces) + _USE
 
 
-def isaaclab_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+def isaaclab_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
     """Return arguments of ``ThrusterCfg`` and ``MultirotorCfg`` for a vehicle."""
     flown = ISAAC_LAB.flown(vehicle)
     wanted = configuration(flown)
 
-    def faults(path: Path) -> list[str]:
+    def faults(path: Path, _: object) -> list[str]:
         return differences(_numbers(wanted), _numbers(assigned(path)))
 
     return Draft(isaaclab_text(wanted, provenance), flown, (), faults)
 
 
-TARGET = Target("isaaclab", "_isaaclab.py", isaaclab_draft, ISAAC_LAB.entry, simulator=ISAAC_LAB)
+TARGET = Target("isaaclab", "_isaaclab.py", isaaclab_draft, ISAAC_LAB)

@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 
 from tuner.exporters.simulators import full_thrust, hover_command, hover_speed, thrust_to_weight
-from tuner.exporters.target import Choices, Draft, Target, differences, read_file
-from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of
+from tuner.exporters.target import Draft, Target, differences, read_file
+from tuner.vehicle import COEFFICIENTS, VehicleFile, values_of
 
 
-def json_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+def json_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
     """Return coefficients with units, rotors (forward, left, up; m), and thrust and hover."""
     values = values_of(vehicle) | {"max_rotor_velocity": vehicle.motor.max_rotor_velocity}
     content = {
@@ -31,11 +31,11 @@ def json_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
         },
     }
 
-    def faults(path: Path) -> list[str]:
+    def faults(path: Path, _: object) -> list[str]:
         return differences(values, json.loads(read_file(path))["coefficients"])
 
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     return Draft(text, vehicle, (), faults)
 
 
-TARGET = Target("json", ".json", json_draft, lambda row: Written(".".join(row.place)))
+TARGET = Target("json", ".json", json_draft)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tuner.core.errors import ExportError
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import MUJOCO, drag_at_hover, full_thrust, rotor_speed, thrust_at
-from tuner.exporters.target import Choices, Draft, Target, differences, read_file
+from tuner.exporters.target import Draft, Target, differences, read_file
 from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ def read_mjcf(path: Path) -> dict[str, float]:
     return held
 
 
-def mujoco_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+def mujoco_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
     """Return a model; the gate flies it in MuJoCo where that is installed."""
     flown = MUJOCO.flown(vehicle)
     inertia = flown.inertia
@@ -126,7 +126,7 @@ def mujoco_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
         text,
         flown,
         (),
-        lambda path: differences(wanted, read_mjcf(path)),
+        lambda path, _: differences(wanted, read_mjcf(path)),
         flier=_flier(text, flown),
     )
 
@@ -171,4 +171,4 @@ def _flier(text: str, vehicle: VehicleFile) -> Callable[..., Any] | None:
     return flier(Flying)
 
 
-TARGET = Target("mujoco", ".xml", mujoco_draft, MUJOCO.entry, simulator=MUJOCO)
+TARGET = Target("mujoco", ".xml", mujoco_draft, MUJOCO)

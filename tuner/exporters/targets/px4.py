@@ -27,20 +27,20 @@ from tuner.exporters.simulators import (
     hover_speed,
     rotor_speed,
 )
-from tuner.exporters.target import Choices, Draft, Target, read_file
+from tuner.exporters.target import Draft, Target, differences, read_file
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
-DIGITS = 1e-8
-"""To how many digits a file holds a number."""
 PLACES_AGREE = 0.005
 """m within which rotors count as sitting symmetrically."""
 INT32, FLOAT = 6, 9
 """MAVLink's numbers of parameter types, as ground stations write them."""
 
 
-def parameters(vehicle: VehicleFile, simulator: Simulator = SIH) -> dict[str, float | int]:
+def parameters(vehicle: VehicleFile, simulator: Simulator) -> dict[str, float | int]:
     """Return the vehicle's parameters for a simulator that reads them: an int is an INT32.
+
+    Floats have nine digits, as a file holds them.
 
     Raises
     ------
@@ -57,7 +57,8 @@ def parameters(vehicle: VehicleFile, simulator: Simulator = SIH) -> dict[str, fl
             "check mass, motor_constant and input_scaling",
         )
     own = _sih(flown) if simulator is SIH else _speeds(flown)
-    return {**_allocation(flown), **own, "MPC_THR_HOVER": hover}
+    exact = {**_allocation(flown), **own, "MPC_THR_HOVER": hover}
+    return {n: v if isinstance(v, int) else float(f"{v:.9g}") for n, v in exact.items()}
 
 
 def _allocation(vehicle: VehicleFile) -> dict[str, float | int]:
@@ -111,7 +112,7 @@ def _speeds(vehicle: VehicleFile) -> dict[str, float | int]:
     }
 
 
-def px4_draft(vehicle: VehicleFile, provenance: str, choices: Choices) -> Draft:
+def px4_draft(vehicle: VehicleFile, provenance: str, simulator: Simulator, *_: object) -> Draft:
     """Return a ``.params`` file of a vehicle.
 
     Raises
@@ -119,25 +120,16 @@ def px4_draft(vehicle: VehicleFile, provenance: str, choices: Choices) -> Draft:
     ExportError
         The vehicle cannot hover.
     """
-    simulator = GZ_SIM if choices.simulator == GZ_SIM.name else SIH
-    wanted = parameters(vehicle, simulator)
     flown = simulator.flown(vehicle)
+    wanted = parameters(vehicle, simulator)
     notes = _notes(vehicle, flown, simulator)
-
-    def faults(path: Path) -> list[str]:
-        there = read_parameters(path)
-        return [
-            f"{name} is {there.get(name)}, not {value}"
-            for name, value in wanted.items()
-            if not math.isclose(there.get(name, math.nan), value, rel_tol=DIGITS)
-        ]
 
     header = f"{provenance}\nfor {simulator.title} ({simulator.version})"
     return Draft(
         parameters_text(wanted, "\n".join((header, *notes))),
         flown,
         notes,
-        faults,
+        lambda path, _: differences(wanted, read_parameters(path)),
         gates=(
             Gate("PX4 accepts every parameter", outside_range(wanted)),
             Gate("the simulator has such rotors", _other_rotors(vehicle, simulator)),
@@ -193,14 +185,13 @@ RANGES = {
     r"CA_ROTOR\d+_CT": (0.0, 100.0),
     r"CA_ROTOR\d+_KM": (-1.0, 1.0),
     r"MPC_THR_HOVER": (0.1, 0.8),
-    r"SIH_(MASS|I[XYZ]{2}|T_MAX|Q_MAX|L_ROLL|L_PITCH|KDV|KDW)": (0.0, math.inf),
+    r"SIH_(MASS|IXX|IYY|IZZ|T_MAX|Q_MAX|L_ROLL|L_PITCH|KDV|KDW)": (0.0, math.inf),
     r"SIM_GZ_EC_(MIN|MAX)\d+": (0, 1000),
 }
 """What PX4 accepts of the parameters that are written, by name.
 
 Source: module.yaml of control_allocator, mc_pos_control, simulator_sih and gz_bridge, PX4 1.16.
 """
-_SIGNED = re.compile(r"SIH_I(XY|XZ|YZ)")
 
 
 def outside_range(parameters: Mapping[str, float | int]) -> tuple[str, ...]:
@@ -208,8 +199,7 @@ def outside_range(parameters: Mapping[str, float | int]) -> tuple[str, ...]:
     clauses = []
     for name, value in parameters.items():
         for pattern, (low, high) in RANGES.items():
-            known = re.fullmatch(pattern, name) and not _SIGNED.match(name)
-            if known and not low <= value <= high:
+            if re.fullmatch(pattern, name) and not low <= value <= high:
                 limit = f"{low:g} to {high:g}" if math.isfinite(high) else f"at least {low:g}"
                 clauses.append(f"{name} {value:.4g}: PX4 accepts {limit}")
     return tuple(clauses)
@@ -246,4 +236,4 @@ def read_parameters(path: Path) -> dict[str, float | int]:
     return parameters
 
 
-TARGET = Target("px4", ".params", px4_draft, SIH.entry, simulator=SIH, others=(GZ_SIM,))
+TARGET = Target("px4", ".params", px4_draft, SIH, others=(GZ_SIM,))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tuner.core.yaml_document import commented
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import ROTORPY, rotor_speed
-from tuner.exporters.target import Choices, Draft, Target, assigned, differences
+from tuner.exporters.target import Draft, Target, assigned, differences
 from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ def quad_params(vehicle: VehicleFile) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def rotorpy_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+def rotorpy_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
     """Return a Python module that RotorPy's ``Multirotor`` takes ``quad_params`` from."""
     flown = ROTORPY.flown(vehicle)
     params = quad_params(flown)
@@ -63,7 +63,7 @@ def rotorpy_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
         text,
         flown,
         (),
-        lambda path: differences(wanted, assigned(path).get("_P", {})),
+        lambda path, _: differences(wanted, assigned(path).get("_P", {})),
         flier=_flier(params),
     )
 
@@ -105,4 +105,4 @@ def _flier(params: dict[str, Any]) -> Callable[..., Any] | None:
     return flier(Flying)
 
 
-TARGET = Target("rotorpy", "_params.py", rotorpy_draft, ROTORPY.entry, simulator=ROTORPY)
+TARGET = Target("rotorpy", "_params.py", rotorpy_draft, ROTORPY)

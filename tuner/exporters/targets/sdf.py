@@ -10,32 +10,21 @@ from tuner.exporters.sdf import tags
 from tuner.exporters.sdf.patch import sdf_draft, simulator_of
 from tuner.exporters.sdf.tags import values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM, Simulator, gz_unit, with_speeds_in
-from tuner.exporters.target import Choices, Draft, Target, differences, read_file
+from tuner.exporters.target import Draft, Target, differences, read_file
 from tuner.vehicle import VehicleFile
 
 TEMPLATE = Path(__file__).parents[1] / "sdf" / "snippet.sdf.jinja"
 
 
-def sdf_or_snippet(vehicle: VehicleFile, provenance: str, choices: Choices) -> Draft:
-    """Return a model with a vehicle's numbers, or the tags alone; a model says whose it is."""
-    if choices.into is None:
-        simulator = GZ_SIM if choices.simulator == GZ_SIM.name else GAZEBO_CLASSIC
-        return snippet_draft(vehicle, simulator, provenance)
-    return sdf_draft(choices.into, vehicle, provenance)
+def sdf_or_snippet(
+    vehicle: VehicleFile, provenance: str, simulator: Simulator, into: Path | None
+) -> Draft:
+    """Return a model with a vehicle's numbers, or the tags alone.
 
-
-def snippet_draft(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> Draft:
-    """Return inertial, motor plugins and, for Gazebo classic, control channels of a vehicle.
-
-    Parameters
-    ----------
-    vehicle
-        Whose coefficients.
-    simulator
-        Whose plugins.
-    provenance
-        One line that says where they come from.
+    These are inertial, motor plugins and, for Gazebo classic, control channels.
     """
+    if into is not None:
+        return sdf_draft(into, vehicle, provenance)
 
     def held_by(text: str, path: Path) -> dict[str, float]:
         model = f"<model><link name='base_link'>{text}</link></model>"
@@ -51,7 +40,7 @@ def snippet_draft(vehicle: VehicleFile, simulator: Simulator, provenance: str) -
         text,
         with_speeds_in(tags.as_flown(vehicle, wanted | held_by(text, TEMPLATE)), 1.0 / unit),
         notes,
-        lambda path: differences(wanted, held_by(read_file(path), path)),
+        lambda path, _: differences(wanted, held_by(read_file(path), path)),
     )
 
 
@@ -90,8 +79,6 @@ TARGET = Target(
     "sdf",
     ".sdf",
     sdf_or_snippet,
-    GAZEBO_CLASSIC.entry,
-    patches=True,
     simulator=GAZEBO_CLASSIC,
     others=(GZ_SIM,),
     detected=simulator_of,

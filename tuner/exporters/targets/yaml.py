@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tuner.exporters.target import Choices, Draft, Target
-from tuner.vehicle import VehicleFile, Written, read_vehicle, vehicle_text
+from tuner.exporters.target import Draft, Target
+from tuner.vehicle import VehicleFile, read_vehicle, vehicle_text
 
 
-def yaml_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+def yaml_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
     """Return a vehicle file that ``tune --vehicle`` reads.
 
     Parameters
@@ -19,10 +19,10 @@ def yaml_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
         One line for the top of the file.
     """
 
-    def faults(path: Path) -> list[str]:
+    def faults(path: Path, _: object) -> list[str]:
         return [] if read_vehicle(path) == vehicle else ["it holds another vehicle"]
 
     return Draft(vehicle_text(vehicle, header=provenance), vehicle, (), faults)
 
 
-TARGET = Target("yaml", ".yaml", yaml_draft, lambda row: Written(".".join(row.place)))
+TARGET = Target("yaml", ".yaml", yaml_draft)
