@@ -16,7 +16,7 @@ import numpy as np
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import ExportError
 from tuner.exporters.sdf.model import Array, Inertial, Model, inertials, read_model, together
-from tuner.exporters.sdf.spans import Element, assembled, number, rendered
+from tuner.exporters.sdf.spans import Element, assembled, rendered
 from tuner.exporters.target import read_file
 from tuner.exporters.targets.px4 import outside_range, read_parameters
 from tuner.result import Run
@@ -84,8 +84,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     ExportError
         A file cannot be read, or is no multirotor's.
     """
-    text = assembled(path, read_file, rendered).text
-    model = read_model(text, path, MOST_ROTORS)
+    model = read_model(assembled(path, read_file, rendered), MOST_ROTORS)
     rotors = _rotors(model)
     if not rotors:
         raise ExportError(path, "has no motor with a link and a number", "give each motor its own")
@@ -110,19 +109,18 @@ def _rotors(model: Model) -> list[Rotor]:
     for index, (link, turns) in sorted(links.items()):
         numbers = {}
         for child in motors[index].children:
-            value = number(child, model.text)
-            if value is not None:
-                numbers[child.tag] = value
+            if child.number is not None:
+                numbers[child.tag] = child.number
         place = model.pose_of_link(link).position
-        rotors.append(Rotor(index, place, turns, numbers, _radius(link, model.text)))
+        rotors.append(Rotor(index, place, turns, numbers, _radius(link)))
     return rotors
 
 
-def _radius(link: Element, text: str) -> float | None:
+def _radius(link: Element) -> float | None:
     """Return the radius in m of a rotor's collision disc."""
     for collision in link.all("collision"):
         for radius in collision.all("radius"):
-            return number(radius, text)
+            return radius.number
     return None
 
 
@@ -229,7 +227,7 @@ def _speeds(
     """Return the rotor speeds in rad/s at no and at full command; None where nothing says them."""
     limit = min((r.numbers.get("maxRotVelocity", math.inf) for r in rotors), default=math.inf)
     for channel in model.channels():
-        numbers = {child.tag: number(child, model.text) for child in channel.children}
+        numbers = {child.tag: child.number for child in channel.children}
         scaling, zero = numbers.get("input_scaling"), numbers.get("zero_position_armed")
         if scaling is not None and zero is not None:
             low = (numbers.get("input_offset") or 0.0) * scaling + zero

@@ -15,10 +15,10 @@ from tuner.exporters.sdf.model import Inertial, Pose, base_for, pose_of, read_mo
 from tuner.exporters.sdf.patch import sdf_draft
 from tuner.exporters.sdf.spans import (
     Edit,
+    Source,
     append_child,
     apply,
     blanked,
-    number,
     parse,
     rendered,
     set_value,
@@ -116,7 +116,7 @@ def test_a_variable_that_several_rotors_use_is_set_once(vehicle, tmp_path):
 @ALL
 def test_links_together_weigh_and_turn_like_the_vehicle(path, vehicle):
     draft = sdf_draft(path, vehicle, "by a test")
-    whole = composite(read_model(rendered(draft.text, path), path, 4))
+    whole = composite(read_model(parse(rendered(draft.text, path), path), 4))
     assert whole.mass == pytest.approx(2.243, rel=1e-11)
     np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
     assert any("'base_link' gets 2.204 kg" in note and "rotor_3" in note for note in draft.notes)
@@ -220,7 +220,7 @@ def test_poses_of_links_and_inertials_count(vehicle, tmp_path):
         "<pose degrees='true'>0 0.01 0 0 0 30</pose>",
     ).replace("<pose>0 0 0 0 0 0</pose>", "<pose>0 0 0.2 0 0 0.3</pose>", 1)
     draft = patched(tmp_path, vehicle, text)
-    whole = composite(read_model(draft.text, CLASSIC, 4))
+    whole = composite(read_model(parse(draft.text, CLASSIC), 4))
     np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
     assert any("rotor_0 sits" in objection for objection in draft.gates[0].objections)
 
@@ -301,7 +301,7 @@ def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
     model = f"<model><link name='base_link'>{draft.text}</link></model>"
     classic = simulator is GAZEBO_CLASSIC
     if classic:
-        assert values_in(model, path, vehicle) == carried_values(vehicle, channels=True)
+        assert values_in(parse(model, path), vehicle) == carried_values(vehicle, channels=True)
     flown = simulator.flown(vehicle)
     assert values_of(draft.vehicle) == pytest.approx(values_of(flown), rel=1e-11)
     assert draft.text.count("<channel ") == (4 if classic else 0)
@@ -321,10 +321,10 @@ def uneven(vehicle, **effects):
 @pytest.mark.parametrize("path", [CLASSIC, GZ], ids=lambda path: path.name)
 def test_centre_of_mass_and_uneven_rotors_are_in_the_model(path, vehicle, tmp_path):
     draft = sdf_draft(path, uneven(vehicle), "by a test")
-    whole = composite(read_model(draft.text, path, 4))
+    whole = composite(read_model(parse(draft.text, path), 4))
     rotors = np.array([rotor.position for rotor in vehicle.rotors])
-    links = {link.attributes.get("name"): link for link in read_model(draft.text, path, 4).links}
-    model = read_model(draft.text, path, 4)
+    model = read_model(parse(draft.text, path), 4)
+    links = {link.attributes.get("name"): link for link in model.links}
     places = np.array([model.pose_of_link(links[f"rotor_{n}"]).position for n in range(4)])
     arms = places - whole.pose.position
     np.testing.assert_allclose(
@@ -480,7 +480,7 @@ PATH = Path("model.sdf")
 
 def changed(text, tag, value):
     element = next(parse(text, PATH).all(tag))
-    return apply(text, [set_value(element, text, value)])
+    return apply(text, [set_value(element, value)])
 
 
 def test_places_are_places_in_the_text_whatever_characters_stand_before():
@@ -491,8 +491,8 @@ def test_places_are_places_in_the_text_whatever_characters_stand_before():
     assert text[b.content : b.content_end] == "1.5"
     assert text[c.start : c.end] == "<c/>"
     assert (root.start, root.end) == (0, len(text))
-    assert number(b, text) == 1.5
-    assert number(c, text) is None
+    assert b.number == 1.5
+    assert c.number is None
 
 
 def test_a_value_changes_and_nothing_else():
@@ -507,12 +507,10 @@ def test_a_value_changes_and_nothing_else():
 
 def test_a_new_child_stands_like_the_last():
     text = "<a>\n  <b>1</b>\n</a>"
-    edit = append_child(parse(text, PATH), text, "c", "2")
+    edit = append_child(parse(text, PATH), "c", "2")
     assert apply(text, [edit]) == "<a>\n  <b>1</b>\n  <c>2</c>\n</a>"
     flat = "<a><b>1</b></a>"
-    assert apply(flat, [append_child(parse(flat, PATH), flat, "c", "2")]) == (
-        "<a><b>1</b><c>2</c></a>"
-    )
+    assert apply(flat, [append_child(parse(flat, PATH), "c", "2")]) == ("<a><b>1</b><c>2</c></a>")
 
 
 @given(
@@ -547,8 +545,9 @@ def test_every_element_is_cut_out_whole(tree):
 
 
 def test_edits_that_overlap_are_our_mistake():
+    source = Source(PATH, "abcd", "abcd")
     with pytest.raises(ValueError, match="overlap"):
-        apply("abcd", [Edit(0, 2, ""), Edit(1, 3, "")])
+        apply("abcd", [Edit(source, 0, 2, ""), Edit(source, 1, 3, "")])
 
 
 @pytest.mark.parametrize("text", ["<a>", "", "<a></b>", "words", "<a>&bomb;</a>"])

@@ -54,7 +54,7 @@ def split(folder):
 
 
 def whole_of(path, rotors=4):
-    return read_model(assembled(path, read_file, rendered).text, path, rotors)
+    return read_model(assembled(path, read_file, rendered), rotors)
 
 
 def test_numbers_are_written_where_they_live(vehicle, tmp_path):
@@ -77,6 +77,21 @@ def test_numbers_are_written_where_they_live(vehicle, tmp_path):
     base = tmp_path / "base" / "model.sdf"
     base.write_text(base.read_text().replace("2.204", "2.205"))
     assert any(fault.startswith("mass is ") for fault in draft.faults(path, {}))
+
+
+def test_what_is_included_lies_where_the_include_puts_it(tmp_path):
+    path = split(tmp_path)
+    alone, raised = (
+        composite(whole_of(tmp_path / name / "model.sdf")).pose.position
+        for name in ("motors", "camera")
+    )
+    np.testing.assert_allclose(raised - alone, [0.0, 0.0, 0.3], atol=1e-12)
+    base = tmp_path / "base" / "model.sdf"
+    base.write_text(
+        base.read_text().replace("name='base'>", "name='base'><pose>1 0 0 0 0 0</pose>")
+    )
+    moved = composite(whole_of(path)).pose.position
+    np.testing.assert_allclose(moved - raised, [1.0, 0.0, 0.0], atol=1e-12)
 
 
 def test_a_copy_is_written_beside_and_the_model_stays(vehicle, tmp_path):

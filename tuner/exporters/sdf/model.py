@@ -16,10 +16,7 @@ from tuner.core.errors import ExportError
 from tuner.exporters.sdf.spans import (
     MERGED,
     Element,
-    content,
     model_in,
-    number,
-    parse,
     pose_numbers,
 )
 
@@ -143,8 +140,6 @@ class Model:
 
     Attributes
     ----------
-    path, text
-        The file.
     root
         Its ``<model>``.
     base
@@ -153,11 +148,14 @@ class Model:
         How many rotors the vehicle has.
     """
 
-    path: Path
-    text: str
     root: Element
     base: Element
     rotors: int
+
+    @property
+    def path(self) -> Path:
+        """The file that is not included in others."""
+        return self.root.source.path
 
     @property
     def links(self) -> list[Element]:
@@ -168,7 +166,7 @@ class Model:
     def included(self) -> list[str]:
         """What the model includes from other files, whose mass we cannot see."""
         uris = (include.find("uri") for include in self.root.all("include"))
-        return [content(uri, self.text) for uri in uris if uri is not None]
+        return [uri.value for uri in uris if uri is not None]
 
     @property
     def is_gz(self) -> bool:
@@ -185,9 +183,9 @@ class Model:
         for motor in self.motors():
             number = self.motor_number(motor)
             named, turns = (motor.find(tag) for tag in ("linkName", "turningDirection"))
-            link = links.get(content(named, self.text)) if named else None
+            link = links.get(named.value) if named else None
             if number is not None and link is not None:
-                rotors[number] = (link, content(turns, self.text) if turns else "")
+                rotors[number] = (link, turns.value if turns else "")
         return rotors
 
     def motors(self) -> list[Element]:
@@ -216,7 +214,7 @@ class Model:
             for channel in parent.children:
                 index = self._number_in(channel, "input_index")
                 kind = channel.find("joint_control_type")
-                drives = kind is None or content(kind, self.text).startswith("velocity")
+                drives = kind is None or kind.value.startswith("velocity")
                 if (
                     channel.tag == "channel"
                     and drives
@@ -242,7 +240,7 @@ class Model:
 
     def _written(self, element: Element) -> Pose:
         """Return an element's ``<pose>`` as it is written, in whatever frame it counts from."""
-        pose, numbers = element.find("pose"), pose_numbers(element, self.text, self.path)
+        pose, numbers = element.find("pose"), pose_numbers(element)
         if pose is None or not numbers:
             return IDENTITY
         if pose.attributes.get("rotation_format", "euler_rpy") != "euler_rpy":
@@ -275,7 +273,7 @@ class Model:
 
     def _number_in(self, element: Element, tag: str) -> float | None:
         child = element.find(tag)
-        return None if child is None else number(child, self.text)
+        return None if child is None else child.number
 
 
 def _named(plugin: Element) -> str:
@@ -284,15 +282,15 @@ def _named(plugin: Element) -> str:
     return names.replace("MulticopterMotorModel", _GZ_MOTOR)
 
 
-def read_model(text: str, path: Path, rotors: int) -> Model:
-    """Take a model file apart.
+def read_model(root: Element, rotors: int) -> Model:
+    """Take a model apart that was read from a file.
 
     Raises
     ------
     ExportError
         It holds no model, no link, or no motor plugin.
     """
-    element = model_in(parse(text, path), path)
+    element, path = model_in(root), root.source.path
     links = [member for member, _ in _inside(element, IDENTITY) if member.tag == "link"]
     missing = [include for include in element.all("include") if include.attributes.get("merge")]
     if not links:
@@ -300,7 +298,7 @@ def read_model(text: str, path: Path, rotors: int) -> Model:
         if missing:
             remedy = "put the folders of the models that it includes beside its own"
         raise ExportError(path, "has no <link>", remedy)
-    model = Model(path, text, element, _base(element, links), rotors)
+    model = Model(element, _base(element, links), rotors)
     if not model.motors():
         raise ExportError(
             path,
@@ -316,7 +314,7 @@ def _inside(parent: Element, frame: Pose) -> Iterator[tuple[Element, Pose]]:
     for child in parent.children:
         if child.tag == MERGED:
             numbers = [float(word) for word in child.attributes["at"].split()]
-            yield from _inside(child, frame @ pose_of(numbers))
+            yield from _inside(child.children[0], frame @ pose_of(numbers))
         else:
             yield child, frame
 
@@ -335,7 +333,7 @@ def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
         inertial = link.find("inertial")
         if inertial is None:
             continue
-        values = {child.tag: number(child, model.text) for child in reversed(inertial.children)}
+        values = {child.tag: child.number for child in reversed(inertial.children)}
         mass = values.get("mass")
         if mass is None:
             raise ExportError(
@@ -344,11 +342,7 @@ def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
                 "write it as one",
             )
         tensor = inertial.find("inertia")
-        given = (
-            {c.tag: number(c, model.text) or 0.0 for c in reversed(tensor.children)}
-            if tensor
-            else {}
-        )
+        given = {c.tag: c.number or 0.0 for c in reversed(tensor.children)} if tensor else {}
         matrix = np.array(
             [[given.get(f"i{min(a, b)}{max(a, b)}", 0.0) for b in "xyz"] for a in "xyz"]
         )

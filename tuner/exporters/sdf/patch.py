@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from tuner.core.errors import ExportError
 from tuner.exporters.sdf import spans, tags
 from tuner.exporters.sdf.model import Inertial, Model, base_for, inertials, read_model, together
-from tuner.exporters.sdf.spans import MERGED, Edit, Element, Whole, assembled, blanked, rendered
+from tuner.exporters.sdf.spans import MERGED, Edit, Element, assembled, blanked, rendered
 from tuner.exporters.sdf.tags import rotor_origin, values_in
 from tuner.exporters.simulators import (
     FASTEST_GZ,
@@ -54,12 +54,9 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     ExportError
         The model cannot be understood, or would not come out with the wanted numbers.
     """
-    pieces = assembled(path, read_file, lambda text, _: blanked(text))
-    text, blank = pieces.raw, pieces.text
     rotors = len(vehicle.rotors)
-    model = read_model(blank, path, rotors)
-    before = assembled(path, read_file, rendered).text
-    whole = read_model(before, path, rotors)
+    model = read_model(assembled(path, read_file, lambda text, _: blanked(text)), rotors)
+    whole = read_model(assembled(path, read_file, rendered), rotors)
     simulator = GZ_SIM if whole.is_gz else GAZEBO_CLASSIC
     flown = simulator.flown(vehicle)
     unit = gz_unit(flown) if whole.is_gz else 1.0
@@ -68,32 +65,31 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     edits = [*_inertial_edits(model, base), *_motor_edits(model, vehicle)]
     if tags.center_of_mass(vehicle) is not None:
         edits += _pose_edits(model, whole, base)
-    edits = [_through_variable(text, blank, edit, path) for edit in edits]
-    edits = list(dict.fromkeys(edits))
-    places = [(edit.start, edit.end) for edit in edits if edit.end > edit.start]
+    edits = list(dict.fromkeys(map(_through_variable, edits)))
+    places = [(edit.source, edit.start, edit.end) for edit in edits if edit.end > edit.start]
     if len(set(places)) < len(places):
         raise ExportError(
             path,
             "sets the motorConstant of all rotors at once, and this vehicle's differ",
             "give each rotor's plugin a number of its own",
         )
-    patched = _patched(pieces, edits, model, provenance)
+    patched = _patched(model, edits, provenance)
 
     def faults(file: Path, instead: Mapping[Path, Path]) -> list[str]:
         standing = {**instead, path: file}
-        text = assembled(path, lambda p: read_file(standing.get(p, p)), rendered).text
-        return differences(wanted, values_in(text, path, vehicle))
+        root = assembled(path, lambda p: read_file(standing.get(p, p)), rendered)
+        return differences(wanted, values_in(root, vehicle))
 
-    final = assembled(path, lambda p: patched.get(p) or read_file(p), rendered).text
+    final = assembled(path, lambda p: patched.get(p) or read_file(p), rendered)
     wanted = tags.carried_values(vehicle, channels=bool(whole.channels()))
-    written_values = values_in(final, path, vehicle)
+    written_values = values_in(final, vehicle)
     wrong = differences(wanted, written_values)
     if wrong:
         raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
     geometry = _other_rotors(whole, vehicle, base)
-    there = placed(read_model(final, path, rotors), tags.as_flown(vehicle, written_values))
+    there = placed(read_model(final, rotors), tags.as_flown(vehicle, written_values))
     return Draft(
-        patched.pop(path, pieces.files[path]),
+        patched.pop(path, model.root.source.raw),
         with_speeds_in(there, 1.0 / unit),
         tuple(_notes(whole, asked, vehicle, base, unit)),
         faults,
@@ -110,24 +106,20 @@ def simulator_of(path: Path) -> str:
     ExportError
         It is no model of a multirotor.
     """
-    text = assembled(path, read_file, rendered).text
-    return (GZ_SIM if read_model(text, path, MOST_ROTORS).is_gz else GAZEBO_CLASSIC).name
+    model = read_model(assembled(path, read_file, rendered), MOST_ROTORS)
+    return (GZ_SIM if model.is_gz else GAZEBO_CLASSIC).name
 
 
-def _patched(
-    pieces: Whole, edits: Sequence[Edit], model: Model, provenance: str
-) -> dict[Path, str]:
+def _patched(model: Model, edits: Sequence[Edit], provenance: str) -> dict[Path, str]:
     """Return each file that changes -> its new text, with a comment where its model begins."""
-    comments = {}
-    for element in (*model.root.all(MERGED), model.root):  # the outermost of a file is the last
-        place = element.children[0].start
-        ((path, _),) = pieces.by_file([Edit(place, place, "")]).items()
-        comments[path] = element
-    by_file, patched = pieces.by_file(edits), {}
-    for path in by_file if len(pieces.files) > 1 else pieces.files:
-        text = pieces.files[path]
-        edit = _provenance_edit(pieces, comments[path], provenance, text)
-        patched[path] = spans.apply(text, [*by_file.get(path, ()), edit])
+    merged = (include.children[0] for include in model.root.all(MERGED))
+    begins = {element.source: element for element in (*merged, model.root)}
+    patched = {}
+    for source, element in begins.items():
+        of_file = [edit for edit in edits if edit.source == source]
+        if of_file or len(begins) == 1:
+            comment = _provenance_edit(element, provenance)
+            patched[source.path] = spans.apply(source.raw, [*of_file, comment])
     return patched
 
 
@@ -170,16 +162,14 @@ def _inertial_edits(model: Model, base: Inertial) -> Iterator[Edit]:
             f"base link '{model.base.attributes.get('name')}' has no <inertial> with <inertia>",
             "give it one, its numbers do not matter",
         )
-    yield from _set(inertial, model.text, {"mass": base.mass})
+    yield from _set(inertial, {"mass": base.mass})
     entries = base.inertia
-    yield from _set(
-        tensor, model.text, {"ixx": entries[0, 0], "iyy": entries[1, 1], "izz": entries[2, 2]}
-    )
+    yield from _set(tensor, {"ixx": entries[0, 0], "iyy": entries[1, 1], "izz": entries[2, 2]})
     products = {"ixy": entries[0, 1], "ixz": entries[0, 2], "iyz": entries[1, 2]}
     for tag, value in products.items():
         none = abs(value) < NO_PRODUCT * np.trace(entries)
         if not none or tensor.find(tag) is not None:
-            yield from _set(tensor, model.text, {tag: 0.0 if none else value})
+            yield from _set(tensor, {tag: 0.0 if none else value})
 
 
 def _pose_edits(model: Model, whole: Model, base: Inertial) -> Iterator[Edit]:
@@ -193,12 +183,12 @@ def _pose_edits(model: Model, whole: Model, base: Inertial) -> Iterator[Edit]:
     inertial = model.base.find("inertial")
     assert inertial is not None, "its mass was set"
     pose = inertial.find("pose")
-    angles = spans.content(pose, model.text).split()[3:] if pose else ["0", "0", "0"]
+    angles = pose.value.split()[3:] if pose else ["0", "0", "0"]
     written = " ".join([*(repr(float(number)) for number in place), *(angles or ["0", "0", "0"])])
     if pose is None:
-        yield spans.append_child(inertial, model.text, "pose", written)
-    elif spans.content(pose, model.text) != written:
-        yield spans.set_value(pose, model.text, written)
+        yield spans.append_child(inertial, "pose", written)
+    elif pose.value != written:
+        yield spans.set_value(pose, written)
 
 
 def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
@@ -214,56 +204,53 @@ def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
                     "give each rotor a plugin of its own",
                 )
             wanted[tags.MOTOR_CONSTANT] = uneven[tags.of_rotor(index)]
-        yield from _set(motor, model.text, wanted)
+        yield from _set(motor, wanted)
     for channel in model.channels():
-        yield from _set(channel, model.text, tags.values(vehicle, "channel"))
+        yield from _set(channel, tags.values(vehicle, "channel"))
 
 
-def _set(parent: Element, text: str, values: dict[str, float]) -> Iterator[Edit]:
+def _set(parent: Element, values: dict[str, float]) -> Iterator[Edit]:
     """Yield the edits that give children values; those that have them already stay untouched."""
     for tag, value in values.items():
         child = parent.find(tag)
         if child is None:
-            yield spans.append_child(parent, text, tag, tags.as_text(value))
+            yield spans.append_child(parent, tag, tags.as_text(value))
         else:
-            now = spans.number(child, text)
+            now = child.number
             if now is None or tags.as_text(now) != tags.as_text(value):
-                yield spans.set_value(child, text, tags.as_text(value))
+                yield spans.set_value(child, tags.as_text(value))
 
 
-def _through_variable(text: str, blank: str, edit: Edit, path: Path) -> Edit:
+def _through_variable(edit: Edit) -> Edit:
     """Return an edit of a ``{{ variable }}`` as an edit of the number it is set to."""
-    old = text[edit.start : edit.end]
-    if old == blank[edit.start : edit.end]:
+    source, place = edit.source, slice(edit.start, edit.end)
+    old = source.raw[place]
+    if old == source.text[place]:
         return edit
     name = re.fullmatch(r"\s*\{\{-?\s*(\w+)\s*-?\}\}\s*", old)
     settings = (
-        re.finditer(rf"\{{%-?\s*set\s+{name.group(1)}\s*=\s*([-+.\deE]+)\s*-?%\}}", text)
+        re.finditer(rf"\{{%-?\s*set\s+{name.group(1)}\s*=\s*([-+.\deE]+)\s*-?%\}}", source.raw)
         if name
         else iter(())
     )
     assignments = list(settings)
     if len(assignments) != 1:
         raise ExportError(
-            path,
+            source.path,
             f"has the expression {old.strip()} where a number of ours belongs",
             "write a number there, or set its variable to a number once",
         )
-    return Edit(assignments[0].start(1), assignments[0].end(1), edit.text)
+    return Edit(source, assignments[0].start(1), assignments[0].end(1), edit.text)
 
 
-def _provenance_edit(pieces: Whole, element: Element, provenance: str, text: str) -> Edit:
+def _provenance_edit(model: Element, provenance: str) -> Edit:
     """Return the edit of a file that puts our comment first in a model, or for an earlier one."""
     comment = f"<!-- {PROVENANCE}: {provenance.replace('--', '- -')} -->"
-    earlier = re.search(rf"<!-- {PROVENANCE}: .*?-->", text, re.DOTALL)
+    earlier = re.search(rf"<!-- {PROVENANCE}: .*?-->", model.source.raw, re.DOTALL)
     if earlier:
-        return Edit(earlier.start(), earlier.end(), comment)
-    whole, first = pieces.raw, element.children[0].start
-    before = whole[whole.rfind("\n", 0, first) + 1 : first]
-    indent = "\n" + before if not before.strip() else ""
-    place = Edit(element.content, element.content, indent + comment)
-    ((edit,),) = pieces.by_file([place]).values()
-    return edit
+        return Edit(model.source, earlier.start(), earlier.end(), comment)
+    first = spans.indent_of(model.children[0])
+    return Edit(model.source, model.content, model.content, first + comment)
 
 
 def _notes(
@@ -302,7 +289,7 @@ def _notes(
 
 def _other_rotors(model: Model, vehicle: VehicleFile, base: Inertial) -> tuple[str, ...]:
     """Return how the model's rotors are others than the vehicle file's, a clause each."""
-    count = len(read_model(model.text, model.path, MOST_ROTORS).rotor_links())
+    count = len(read_model(model.root, MOST_ROTORS).rotor_links())
     clauses = []
     if count > len(vehicle.rotors):
         clauses.append(f"the model has {count} rotors, the vehicle {len(vehicle.rotors)}")

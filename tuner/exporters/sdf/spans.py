@@ -1,9 +1,9 @@
 """XML with the place of every element in its text, and edits of the text by place.
 
 Jinja templates of models are read with their expressions blanked out, or rendered. A model that is
-split over files is one text, each ``<include merge="true">`` in its place: simulators take what it
-names into the model itself. Includes are followed within the folder tree that holds the model's own
-folder; what lies elsewhere is left as it stands.
+split over files is one tree. In it each ``<include merge="true">`` holds the model that it names:
+simulators take that into the model itself. Includes are followed within the folder tree that holds
+the model's own folder; what lies elsewhere is left as it stands.
 """
 
 from __future__ import annotations
@@ -21,12 +21,23 @@ _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 _FILLER = "J"
 
 
+@dataclass(frozen=True)
+class Source:
+    """A file of a model: its text as it stands, and as it was prepared to be taken apart."""
+
+    path: Path
+    raw: str
+    text: str
+
+
 @dataclass
 class Element:
     """An element and where it lies.
 
     Attributes
     ----------
+    source
+        Its file, ``text`` of which is meant below.
     tag, attributes
         As written.
     start, end
@@ -37,6 +48,7 @@ class Element:
         Elements directly inside.
     """
 
+    source: Source
     tag: str
     attributes: Mapping[str, str]
     start: int
@@ -45,12 +57,29 @@ class Element:
     end: int = 0
     children: list[Element] = field(default_factory=list)
 
+    @property
+    def value(self) -> str:
+        """What it holds, without comments and surrounding space."""
+        return _COMMENT.sub("", self.source.text[self.content : self.content_end]).strip()
+
+    @property
+    def number(self) -> float | None:
+        """The number that it holds, None if it holds something else."""
+        try:
+            return float(self.value)
+        except ValueError:
+            return None
+
     def all(self, tag: str) -> Iterator[Element]:
         """Yield every element of a tag inside, at any depth, in the order of the text."""
         for child in self.children:
             if child.tag == tag:
                 yield child
             yield from child.all(tag)
+
+    def first(self, tag: str) -> Element | None:
+        """Return the first element of a tag inside, at any depth; None without one."""
+        return next(self.all(tag), None)
 
     def find(self, tag: str) -> Element | None:
         """Return the first element of a tag directly inside; None without one."""
@@ -59,14 +88,15 @@ class Element:
 
 @dataclass(frozen=True)
 class Edit:
-    """A piece of text to put in the place of another."""
+    """A text to put in the place of another in a file."""
 
+    source: Source
     start: int
     end: int
     text: str
 
 
-def parse(text: str, path: Path) -> Element:
+def parse(text: str, path: Path, raw: str | None = None) -> Element:
     """Return the root element of an XML text.
 
     Parameters
@@ -74,7 +104,9 @@ def parse(text: str, path: Path) -> Element:
     text
         Characters; places count in them.
     path
-        For error messages.
+        Its file.
+    raw
+        The file as it stands, where the text was made from it.
 
     Raises
     ------
@@ -84,12 +116,13 @@ def parse(text: str, path: Path) -> Element:
     # One byte a character, so that the parser's byte places are places in the text.
     plain = re.sub(r"[^\x00-\x7f]", "x", without_comments(text))
     parser = expat.ParserCreate("utf-8")
-    top = Element("", {}, 0, 0)
+    source = Source(path, text if raw is None else raw, text)
+    top = Element(source, "", {}, 0, 0)
     open_elements = [top]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         place = parser.CurrentByteIndex
-        element = Element(tag, attributes, place, _after_tag(plain, place))
+        element = Element(source, tag, attributes, place, _after_tag(plain, place))
         open_elements[-1].children.append(element)
         open_elements.append(element)
 
@@ -133,40 +166,33 @@ def _after_tag(text: str, start: int) -> int:
     return len(text)
 
 
-def content(element: Element, text: str) -> str:
-    """Return what an element holds, without comments and surrounding space."""
-    return _COMMENT.sub("", text[element.content : element.content_end]).strip()
-
-
-def number(element: Element, text: str) -> float | None:
-    """Return the number that an element holds, None if it holds something else."""
-    try:
-        return float(content(element, text))
-    except ValueError:
-        return None
-
-
-def set_value(element: Element, text: str, value: str) -> Edit:
+def set_value(element: Element, value: str) -> Edit:
     """Return the edit that gives a childless element another value, its comments kept."""
-    if element.content == element.end:
-        start_tag = text[element.start : element.end].rstrip("/>").rstrip()
-        return Edit(element.start, element.end, f"{start_tag}>{value}</{element.tag}>")
-    inside = text[element.content : element.content_end]
-    masked = without_comments(inside)
+    source, start, end = element.source, element.content, element.content_end
+    if start == element.end:
+        start_tag = source.text[element.start : element.end].rstrip("/>").rstrip()
+        return Edit(source, element.start, element.end, f"{start_tag}>{value}</{element.tag}>")
+    masked = without_comments(source.text[start:end])
     match = _NUMBER.search(masked)
     if match and match.group() == masked.strip():
-        return Edit(element.content + match.start(), element.content + match.end(), value)
-    return Edit(element.content, element.content_end, value)
+        return Edit(source, start + match.start(), start + match.end(), value)
+    return Edit(source, start, end, value)
 
 
-def append_child(parent: Element, text: str, tag: str, value: str) -> Edit:
+def append_child(parent: Element, tag: str, value: str) -> Edit:
     """Return the edit that adds an element behind the last child, indented like it."""
+    child = f"<{tag}>{value}</{tag}>"
     if not parent.children:
-        return Edit(parent.content, parent.content, f"<{tag}>{value}</{tag}>")
+        return Edit(parent.source, parent.content, parent.content, child)
     last = parent.children[-1]
-    before = text[text.rfind("\n", 0, last.start) + 1 : last.start]
-    separator = "\n" + before if not before.strip() else ""
-    return Edit(last.end, last.end, f"{separator}<{tag}>{value}</{tag}>")
+    return Edit(parent.source, last.end, last.end, indent_of(last) + child)
+
+
+def indent_of(element: Element) -> str:
+    """Return the line break and space before an element; empty where it does not begin a line."""
+    text, start = element.source.raw, element.start
+    before = text[text.rfind("\n", 0, start) + 1 : start]
+    return "" if before.strip() else "\n" + before
 
 
 def apply(text: str, edits: Iterable[Edit]) -> str:
@@ -216,72 +242,19 @@ def rendered(text: str, path: Path) -> str:
 
 
 MERGED = "merged__"
-"""Tag around what an include was replaced by; its ``at`` is the pose, ``x y z roll pitch yaw``."""
+"""Tag of an include that was followed: it holds the included model; its ``at`` is the model's pose,
+``x y z roll pitch yaw``."""
 DEEPEST = 8
 _NAME = re.compile(r"(?:model://)?([A-Za-z0-9_][A-Za-z0-9._-]{0,99})/?")
 
 
-@dataclass(frozen=True)
-class Piece:
-    """A stretch of the whole text that a file holds, from a place on; None is of no file."""
-
-    text: str
-    path: Path | None = None
-    at: int = 0
-
-
-@dataclass(frozen=True)
-class Whole:
-    """A model in one text.
-
-    Attributes
-    ----------
-    pieces
-        The text, in order.
-    files
-        Every file -> its text as it was read, before it was prepared.
-    """
-
-    pieces: tuple[Piece, ...]
-    files: Mapping[Path, str]
-
-    @property
-    def text(self) -> str:
-        """The whole of it, as it was prepared."""
-        return "".join(piece.text for piece in self.pieces)
-
-    @property
-    def raw(self) -> str:
-        """The same as the files have it, if preparing keeps places."""
-        return "".join(
-            piece.text
-            if piece.path is None
-            else self.files[piece.path][piece.at : piece.at + len(piece.text)]
-            for piece in self.pieces
-        )
-
-    def by_file(self, edits: Iterable[Edit]) -> dict[Path, list[Edit]]:
-        """Return each file's edits, in its own places, of edits of the whole text."""
-        files: dict[Path, list[Edit]] = {}
-        for edit in edits:
-            path, shift = self._in_file(edit.start, edit.end)
-            files.setdefault(path, []).append(Edit(edit.start - shift, edit.end - shift, edit.text))
-        return files
-
-    def _in_file(self, start: int, end: int) -> tuple[Path, int]:
-        place = 0
-        for piece in self.pieces:
-            after = place + len(piece.text)
-            if piece.path is not None and place <= start and end <= after:
-                return piece.path, place - piece.at
-            place = after
-        raise ValueError(f"{start} to {end} lies in no file")
-
-
 def assembled(
-    path: Path, read: Callable[[Path], str], prepare: Callable[[str, Path], str]
-) -> Whole:
-    """Return a model with what it includes.
+    path: Path,
+    read: Callable[[Path], str],
+    prepare: Callable[[str, Path], str],
+    above: tuple[Path, ...] = (),
+) -> Element:
+    """Return the root of a model's file; in each include that is followed is the model it names.
 
     Parameters
     ----------
@@ -290,18 +263,31 @@ def assembled(
     read
         Returns a file's text.
     prepare
-        Text and path -> the XML to take apart.
+        Text and path -> the XML to take apart, places kept where it is to be edited.
+    above
+        Files that include this one.
 
     Raises
     ------
     ExportError
         A file cannot be read, holds no model, or includes itself.
     """
-    files: dict[Path, str] = {}
-    return Whole(tuple(_expanded(path, (), files, read, prepare)), files)
+    if path in above or len(above) > DEEPEST:
+        raise ExportError(path, "is included in itself", "take the include out")
+    raw = read(path)
+    root = parse(prepare(raw, path), path, raw)
+    if root.first("include") is None:
+        return root
+    for include in model_in(root).children:
+        file = _included(include)
+        if file is not None:
+            model = model_in(assembled(file, read, prepare, (*above, path)))
+            include.attributes = {"at": _pose(include) or _pose(model) or "0 0 0 0 0 0"}
+            include.tag, include.children = MERGED, [model]
+    return root
 
 
-def model_in(root: Element, path: Path) -> Element:
+def model_in(root: Element) -> Element:
     """Return the first ``<model>`` of a file.
 
     Raises
@@ -309,59 +295,32 @@ def model_in(root: Element, path: Path) -> Element:
     ExportError
         There is none.
     """
-    model = root if root.tag == "model" else next(root.all("model"), None)
+    model = root if root.tag == "model" else root.first("model")
     if model is None:
-        raise ExportError(path, "holds no <model>", "give the SDF of a multirotor")
+        raise ExportError(root.source.path, "holds no <model>", "give the SDF of a multirotor")
     return model
 
 
-def _expanded(
-    path: Path,
-    above: tuple[Path, ...],
-    files: dict[Path, str],
-    read: Callable[[Path], str],
-    prepare: Callable[[str, Path], str],
-) -> list[Piece]:
-    """Return a whole file; what it includes is in the place of the include."""
-    if path in above or len(above) > DEEPEST:
-        raise ExportError(path, "is included in itself", "take the include out")
-    files[path] = read(path)
-    text = prepare(files[path], path)
-    if "<include" not in text:
-        return [Piece(text, path)]
-    pieces, place = [], 0
-    for include in model_in(parse(text, path), path).children:
-        source = _source(include, text, path)
-        if source is None:
-            continue
-        inside = _inside_model(_expanded(source, (*above, path), files, read, prepare), source)
-        own = prepare(files[source], source)
-        at = _pose(include, text, path) or _pose(model_in(parse(own, source), source), own, source)
-        pieces += [
-            Piece(text[place : include.start], path, place),
-            Piece(f'<{MERGED} at="{at or "0 0 0 0 0 0"}">'),
-            *inside,
-            Piece(f"</{MERGED}>"),
-        ]
-        place = include.end
-    return [*pieces, Piece(text[place:], path, place)]
+def sources(root: Element) -> list[Source]:
+    """Return the files that a model was read from."""
+    merged = (include.children[0].source for include in root.all(MERGED))
+    return list(dict.fromkeys((root.source, *merged)))
 
 
-def _source(include: Element, text: str, path: Path) -> Path | None:
+def _included(include: Element) -> Path | None:
     """Return the file that an element includes and merges; None where that is none of ours."""
     if include.tag != "include" or include.attributes.get("merge") not in ("true", "1"):
         return None
     uri = include.find("uri")
-    name = _NAME.fullmatch(content(uri, text)) if uri is not None else None
+    name = None if uri is None else _NAME.fullmatch(uri.value)
     if name is None:
         return None
-    tree = path.absolute().parent.parent
-    source = tree / name.group(1) / "model.sdf"
-    inside = source.resolve().is_relative_to(tree.resolve())
-    return source if inside and source.is_file() else None
+    tree = include.source.path.absolute().parent.parent
+    file = tree / name.group(1) / "model.sdf"
+    return file if file.resolve().is_relative_to(tree.resolve()) and file.is_file() else None
 
 
-def pose_numbers(element: Element, text: str, path: Path) -> list[float]:
+def pose_numbers(element: Element) -> list[float]:
     """Return the six numbers of an element's ``<pose>``; none where it has none.
 
     Raises
@@ -370,39 +329,25 @@ def pose_numbers(element: Element, text: str, path: Path) -> list[float]:
         They are others.
     """
     pose = element.find("pose")
-    words = content(pose, text).split() if pose else []
+    words = pose.value.split() if pose else []
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = [0.0]
     if len(numbers) not in (0, 6):
-        raise ExportError(path, f"has the pose '{' '.join(words)}'", "write six numbers")
+        what = f"has the pose '{' '.join(words)}'"
+        raise ExportError(element.source.path, what, "write six numbers")
     return numbers
 
 
-def _pose(element: Element, text: str, path: Path) -> str:
+def _pose(element: Element) -> str:
     """Return an element's pose as six numbers in text; empty without one."""
-    pose, numbers = element.find("pose"), pose_numbers(element, text, path)
+    pose, numbers = element.find("pose"), pose_numbers(element)
     frame = pose.attributes if pose and numbers else {}
     if frame.get("relative_to") or frame.get("degrees") == "true":
         raise ExportError(
-            path,
+            element.source.path,
             "includes a model at a pose that is not in radians from its own frame",
             "write it as x y z roll pitch yaw",
         )
     return " ".join(map(repr, numbers))
-
-
-def _inside_model(pieces: list[Piece], path: Path) -> list[Piece]:
-    """Return what of a file lies between the tags of its model."""
-    text = "".join(piece.text for piece in pieces)
-    model = model_in(parse(text, path), path)
-    kept, place = [], 0
-    for piece in pieces:
-        after = place + len(piece.text)
-        low, high = max(place, model.content), min(after, model.content_end)
-        if low < high:
-            begin, end = low - place, high - place
-            kept.append(Piece(piece.text[begin:end], piece.path, piece.at + begin))
-        place = after
-    return kept

@@ -15,7 +15,7 @@ import numpy as np
 
 from tuner.core.errors import ExportError
 from tuner.exporters.sdf.model import Array, Inertial, Model, inertials, read_model, together
-from tuner.exporters.sdf.spans import without_comments
+from tuner.exporters.sdf.spans import Element, sources, without_comments
 from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of, with_values
 
 Parent = Literal["inertial", "inertia", "motor", "channel"]
@@ -136,13 +136,13 @@ def lost_in(vehicle: VehicleFile) -> tuple[str, ...]:
     return ("the plugins' reaction torque acts about the body's z axis, not the world's",)
 
 
-def values_in(text: str, path: Path, vehicle: VehicleFile) -> dict[str, float]:
+def values_in(root: Element, vehicle: VehicleFile) -> dict[str, float]:
     """Return what a rendered model holds, name -> value; what it does not hold is not there.
 
     Parameters
     ----------
-    text, path
-        The model and its name for messages.
+    root
+        Of the model.
     vehicle
         How many rotors it has and where, whether they are alike, and whether its centre of mass is
         where rotor positions count from.
@@ -150,17 +150,15 @@ def values_in(text: str, path: Path, vehicle: VehicleFile) -> dict[str, float]:
     Raises
     ------
     ExportError
-        It is not well-formed, or its rotors do not agree with each other.
+        Its rotors do not agree with each other.
     """
-    rotors, motor_tags = len(vehicle.rotors), tags_in("motor")
-    try:
-        tree = ElementTree.fromstring(without_comments(text))
-    except ElementTree.ParseError as error:
-        raise ExportError(path, f"is not well-formed XML ({error})", "correct it") from None
+    rotors, motor_tags, path = len(vehicle.rotors), tags_in("motor"), root.source.path
+    trees = [ElementTree.fromstring(without_comments(file.text)) for file in sources(root)]
     ours = {str(number) for number in range(rotors)}
-    plugins = [e for e in tree.iter("plugin") if _text(e, "motorNumber") in ours]
+    plugins = [e for tree in trees for e in tree.iter("plugin") if _text(e, "motorNumber") in ours]
     channels = [
         e
+        for tree in trees
         for e in tree.iter("channel")
         if _text(e, "input_index") in ours
         and (_text(e, "joint_control_type") or "velocity").startswith("velocity")
@@ -172,7 +170,7 @@ def values_in(text: str, path: Path, vehicle: VehicleFile) -> dict[str, float]:
             index = int(_text(plugin, "motorNumber"))
             read |= _agreed([plugin], {MOTOR_CONSTANT: of_rotor(index)}, path)
     read |= _agreed(plugins, motor_tags, path) | _agreed(channels, tags_in("channel"), path)
-    model = read_model(text, path, rotors)
+    model = read_model(root, rotors)
     whole = composite(model)
     if center_of_mass(vehicle) is not None:
         origin = rotor_origin(model, vehicle)

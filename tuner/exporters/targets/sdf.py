@@ -8,6 +8,7 @@ from jinja2 import Environment, StrictUndefined
 
 from tuner.exporters.sdf import tags
 from tuner.exporters.sdf.patch import sdf_draft, simulator_of
+from tuner.exporters.sdf.spans import parse
 from tuner.exporters.sdf.tags import values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM, Simulator, gz_unit, with_speeds_in
 from tuner.exporters.target import Draft, Target, differences, read_file
@@ -28,7 +29,7 @@ def sdf_or_snippet(
 
     def held_by(text: str, path: Path) -> dict[str, float]:
         model = f"<model><link name='base_link'>{text}</link></model>"
-        return values_in(model, path, vehicle)
+        return values_in(parse(model, path), vehicle)
 
     notes = tags.lost_in(vehicle)
     vehicle = simulator.flown(vehicle)
