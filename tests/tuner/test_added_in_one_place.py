@@ -36,7 +36,7 @@ from tuner.core.errors import ConfigError, ExportError
 from tuner.core.phrases import Worded
 from tuner.core.yaml_section import build, section_of
 from tuner.evaluate.write import write_flights
-from tuner.exporters.simulators import registered
+from tuner.exporters.simulators import THIS_PROJECT, registered
 from tuner.exporters.target import Draft, Target, differences
 from tuner.findings.findings import Finding, brief, one_line
 from tuner.options import FILES, Options
@@ -137,7 +137,7 @@ def added(monkeypatch):
 def ini_target(monkeypatch):
     """A module that exports all that a row gives it a key for."""
 
-    def draft(vehicle, _provenance, _choices):
+    def draft(vehicle, *_):
         rows = {name: REGISTRY[name] for name in values_of(vehicle)}
         keys = {
             n: row.exported_as["ini"].tag for n, row in rows.items() if "ini" in row.exported_as
@@ -145,7 +145,7 @@ def ini_target(monkeypatch):
         values = {name: values_of(vehicle)[name] for name in keys}
         text = "".join(f"{keys[name]}={value!r}\n" for name, value in values.items())
 
-        def faults(path):
+        def faults(path, _):
             lines = dict(line.split("=") for line in path.read_text().splitlines())
             held = {name: float(lines[key]) for name, key in keys.items() if key in lines}
             return differences(values, held)
@@ -156,7 +156,7 @@ def ini_target(monkeypatch):
         return registered("ini")(row) or NotCarried("an ini file holds sails alone")
 
     module = ModuleType("tuner.exporters.targets.ini")
-    module.TARGET = Target("ini", ".ini", draft, entry)
+    module.TARGET = Target("ini", ".ini", draft, replace(THIS_PROJECT, entry=entry))
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setattr(shipped, "EXPORT_TARGETS", [*shipped.EXPORT_TARGETS, "ini"])
 

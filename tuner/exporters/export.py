@@ -16,7 +16,7 @@ from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draws import draws_of, write_draws
 from tuner.exporters.effective import Effective, kept_effective, refly
 from tuner.exporters.gates import Refly, check, check_hover, check_in_simulator, not_flown
-from tuner.exporters.simulators import GAZEBO_CLASSIC, THIS_PROJECT
+from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.exporters.target import (
     Draft,
     Target,
@@ -360,7 +360,7 @@ def in_simulator(run: Run, target: Target) -> tuple[Run, EffectiveResult | None]
     simulator, found = target.simulator, None
     job = run.result.settings.get("job")
     wanted = job.get("target") if isinstance(job, dict) else None
-    if simulator is THIS_PROJECT or wanted == "physical":
+    if not simulator.name or wanted == "physical":
         return run, None
     if simulator is GAZEBO_CLASSIC and run.effective is not None and run.result.effective:
         found = Effective(run.effective, run.result.effective)

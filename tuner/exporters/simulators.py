@@ -90,7 +90,7 @@ class Simulator:
     Attributes
     ----------
     name, title
-        As users type it, and as it is called.
+        As users type it, and as it is called; this project's has no name.
     version, source
         What was read to know what it computes.
     deviations
