@@ -13,7 +13,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tuner.recordings.ros.container import joined
-from tuner.recordings.ros.messages import Definitions, decode, plan
+from tuner.recordings.ros.messages import Block, Definitions, decode, missing_fields
 
 TEXT = """
 uint8 first
@@ -88,9 +88,11 @@ def value(message: Any, path: str) -> float:
     return float(message)
 
 
-def walk(*, aligned: bool) -> Any:
-    text = MessageDefinition(MessageDefinitionFormat.MSG, TEXT)
-    return plan(Definitions(Path("x"), {KIND: text}), KIND, FIELDS, aligned=aligned)
+DEFINITIONS = Definitions(Path("x"), {KIND: MessageDefinition(MessageDefinitionFormat.MSG, TEXT)})
+
+
+def decoded(block: Block, form: str) -> Any:
+    return decode(DEFINITIONS, KIND, FIELDS, block, aligned=form != "ros1")
 
 
 def serialised(message: Any, form: str) -> bytes:
@@ -103,7 +105,7 @@ def serialised(message: Any, form: str) -> bytes:
 @given(st.lists(outer, min_size=1, max_size=5), st.sampled_from(["ros1", "little", "big"]))
 def test_every_field_of_every_message(messages: list[Any], form: str) -> None:
     block = joined(list(range(len(messages))), [serialised(m, form) for m in messages])
-    columns, whole = decode(walk(aligned=form != "ros1"), block)
+    columns, whole = decoded(block, form)
     assert whole.all()
     for path in FIELDS:
         expected = [value(message, path) for message in messages]
@@ -118,7 +120,7 @@ def test_a_cut_message_is_not_whole_and_spoils_no_other(
     raw = serialised(message, form)
     cut = data.draw(st.integers(0, len(raw) - 1))
     block = joined([0, 1, 2], [raw, raw[:cut], raw])
-    columns, whole = decode(walk(aligned=form != "ros1"), block)
+    columns, whole = decoded(block, form)
     assert whole.tolist() == [True, False, True]
     for path in FIELDS:
         got = columns[path].astype(float)[[0, 2]]
@@ -136,6 +138,11 @@ def test_byte_orders_may_mix_and_counts_may_lie(form: str) -> None:
     at = good.index(np.float32(3.0).tobytes()) - 4
     lying[at : at + 4] = b"\xff\xff\xff\x7f"
     others = [good] if form == "ros1" else [serialised(message, "big")]
-    columns, whole = decode(walk(aligned=form != "ros1"), joined([0, 1, 2], [good, lying, *others]))
+    columns, whole = decoded(joined([0, 1, 2], [good, lying, *others]), form)
     assert whole.tolist() == [True, False, True]
     assert columns["last"][[0, 2]].tolist() == [9.0, 9.0]
+
+
+def test_fields_that_a_type_does_not_have() -> None:
+    lacking = ("name[0]", "triple[3]", "inners.b", "pair[2].a", "inners[0].d", "fixed", "lost")
+    assert missing_fields(DEFINITIONS, KIND, [*FIELDS, *lacking]) == lacking

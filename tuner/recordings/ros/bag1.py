@@ -13,9 +13,9 @@ import contextlib
 import re
 import struct
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,10 @@ from tuner.recordings.ros.container import (
     Chunk,
     ChunkedFile,
     Connection,
+    Content,
     DamagedError,
     Entries,
+    FileBytes,
     unsigned,
 )
 from tuner.recordings.ros.messages import Block, Bytes, Index
@@ -53,86 +55,71 @@ class Bag1(ChunkedFile):
             if not re.fullmatch(rb"#ROSBAG V2\.0\r?\n", magic):
                 reason = "is empty" if not magic else "is no ROS 1 bag of version 2.0"
                 raise RecordingError(self.path, reason, "give the recording itself")
-            first = stream.tell()
+            data = FileBytes(stream)
             try:
-                self._read_index(stream)
+                self._read_index(data, len(magic))
             except DamagedError as err:
-                self._walk(stream, first, err.cause)
+                self._walk(data, len(magic), err.cause)
         if not self.connections:
             raise RecordingError(self.path, "holds no messages", "record it again")
 
     def _lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int:
         return sum(chunk.held.get(number, 0) for chunk in chunks for number in wanted)
 
-    def _read_index(self, stream: BinaryIO) -> None:
+    def _read_index(self, data: FileBytes, first: int) -> None:
         """Learn connections and chunks from the end of the bag."""
-        header, _ = _record(stream, BAG)
-        start = _number(header, b"index_pos", 8)
+        header, _, _ = _record(data, first, BAG)
+        at = _number(header, b"index_pos", 8)
         connections = _number(header, b"conn_count", 4)
         chunks = _number(header, b"chunk_count", 4)
-        size = self.path.stat().st_size
-        if start == 0:
+        if at == 0:
             raise DamagedError("it has no index", Cause.NOT_CLOSED)
-        if start >= size or connections > size // 20 or chunks > size // 20:
+        if at >= len(data) or connections > len(data) // 20 or chunks > len(data) // 20:
             raise DamagedError("its end is missing", Cause.END_MISSING)
-        stream.seek(start)
-        records = [_connection(*_record(stream, CONNECTION)) for _ in range(connections)]
-        infos = [_chunk_info(*_record(stream, CHUNK_INFO)) for _ in range(chunks)]
+        for _ in range(connections):
+            header, content, at = _whole(data, at, CONNECTION)
+            known = _connection(header, content)
+            self.connections[known.id] = known
         counts: Counter[int] = Counter()
-        for position, info in infos:
-            stream.seek(position)
-            header, packed = _header(stream, CHUNK)
-            self._chunks.append(replace(_chunk(header, stream.tell(), packed), **info))
+        for _ in range(chunks):
+            header, content, at = _whole(data, at, CHUNK_INFO)
+            position, info = _chunk_info(header, content)
+            self._chunks.append(replace(_chunk(*_record(data, position, CHUNK)), **info))
             counts.update(info["held"])
-        self.connections = {record.id: record for record in records}
         self._count(counts)
 
-    def _walk(self, stream: BinaryIO, first: int, cause: Cause) -> None:
+    def _walk(self, data: FileBytes, first: int, cause: Cause) -> None:
         """Learn connections and chunks from front to end, as far as records can be followed."""
         self._chunks, self.connections = [], {}
-        size = self.path.stat().st_size
-        stream.seek(first)
         reached, unread = first, 0
         with contextlib.suppress(DamagedError):
-            while reached < size:
-                header, length = _header(stream, None)
-                position = stream.tell()
+            for _, header, begin, end in _records(data, first):
+                behind = min(end, len(data))
                 if header.get(b"op") == bytes([CHUNK]):
-                    chunk = _chunk(header, position, min(length, size - position))
-                    unread += self._add(stream, chunk)
-                reached = min(position + length, size)
-                stream.seek(reached)
-        self._salvaged(cause, size - reached + unread, {})
+                    unread += self._add(data, _chunk(header, begin, behind))
+                reached = behind
+        self._salvaged(cause, len(data) - reached + unread)
 
-    def _place(self, stream: BinaryIO, chunk: Chunk) -> tuple[str, int, int, int]:  # noqa: ARG002
-        return chunk.compression, chunk.position, chunk.length, chunk.size
-
-    def _index(self, stream: BinaryIO, chunk: Chunk) -> Entries:
-        stream.seek(chunk.position + chunk.length)
-        return dict(_entries(stream) for _ in range(len(chunk.held)))
+    def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
+        entries, at = {}, chunk.position + chunk.length
+        for _ in chunk.held:
+            header, content, at = _whole(data, at, INDEX)
+            entries[_number(header, b"conn", 4)] = _entries(content)
+        return entries
 
     def _scan(self, content: bytes) -> tuple[Mapping[int, list[tuple[int, int]]], int]:
         messages: dict[int, list[tuple[int, int]]] = {}
-        at = read = 0
-        while at + 8 <= len(content):
-            (size,) = struct.unpack_from("<I", content, at)
-            start = at + 8 + size
-            if size > LONGEST_HEADER or start > len(content):
-                break
-            try:
-                header = _fields(content[at + 4 : start - 4])
-            except DamagedError:
-                break
-            (length,) = struct.unpack_from("<I", content, start - 4)
-            if start + length > len(content):
+        read = 0
+        for at, header, begin, end in _records(content, 0):
+            if end > len(content):
                 break
             if header.get(b"op") == bytes([CONNECTION]):
-                record = _connection(header, content[start : start + length])
+                record = _connection(header, content[begin:end])
                 self.connections.setdefault(record.id, record)
             elif header.get(b"op") == bytes([MESSAGE]):
                 time = _time(header.get(b"time", b""))
                 messages.setdefault(_number(header, b"conn", 4), []).append((time, at))
-            at = read = start + length
+            read = end
         return messages, read
 
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
@@ -148,19 +135,53 @@ class Bag1(ChunkedFile):
         return Block(content, start[inside], end[inside], time[inside])
 
 
-def _read(stream: BinaryIO, size: int) -> bytes:
-    data = stream.read(size)
-    if len(data) != size:
+Header = dict[bytes, bytes]
+"""Of a record: name -> value."""
+
+
+def _record(data: Content, at: int, op: int | None = None) -> tuple[Header, int, int]:
+    """Return the header of a record, and where its data begin and end, if need be behind all."""
+    begin = at + 8 + _length(data, at)
+    if begin > at + 8 + LONGEST_HEADER:
+        raise DamagedError("a record header is absurdly long")
+    header, size = _header(data[at + 4 : begin - 4]), _length(data, begin - 4)
+    if op is not None and header.get(b"op") != bytes([op]):
+        raise DamagedError("its index points nowhere")
+    return header, begin, begin + size
+
+
+def _whole(data: Content, at: int, op: int) -> tuple[Header, bytes, int]:
+    """Return the header and the data of a record, and where the next begins."""
+    header, begin, end = _record(data, at, op)
+    if end - begin > LONGEST_DATA or end > len(data):
+        raise DamagedError("a record is absurdly long")
+    return header, data[begin:end], end
+
+
+def _records(data: Content, at: int) -> Iterator[tuple[int, Header, int, int]]:
+    """Yield where records begin, their headers, and where their data begin and end.
+
+    As far as they can be followed; the last may be cut.
+    """
+    with contextlib.suppress(DamagedError):
+        while at < len(data):
+            header, begin, end = _record(data, at)
+            yield at, header, begin, end
+            at = end
+
+
+def _length(data: Content, at: int) -> int:
+    if at + 4 > len(data):
         raise DamagedError("it ends in the middle of a record")
-    return data
+    return int.from_bytes(data[at : at + 4], "little")
 
 
-def _fields(raw: bytes) -> dict[bytes, bytes]:
+def _header(raw: bytes) -> Header:
     """Split a record header into its ``name=value`` fields."""
     fields = {}
     at = 0
     while at + 4 <= len(raw):
-        (size,) = struct.unpack_from("<I", raw, at)
+        size = _length(raw, at)
         name, equals, value = raw[at + 4 : at + 4 + size].partition(b"=")
         if not equals or at + 4 + size > len(raw):
             raise DamagedError("a record header makes no sense")
@@ -169,25 +190,7 @@ def _fields(raw: bytes) -> dict[bytes, bytes]:
     return fields
 
 
-def _header(stream: BinaryIO, op: int | None) -> tuple[dict[bytes, bytes], int]:
-    """Read the header of a record, and how long its data are."""
-    (size,) = struct.unpack("<I", _read(stream, 4))
-    if size > LONGEST_HEADER:
-        raise DamagedError("a record header is absurdly long")
-    fields = _fields(_read(stream, size))
-    if op is not None and fields.get(b"op") != bytes([op]):
-        raise DamagedError("its index points nowhere")
-    return fields, int.from_bytes(_read(stream, 4), "little")
-
-
-def _record(stream: BinaryIO, op: int) -> tuple[dict[bytes, bytes], bytes]:
-    header, size = _header(stream, op)
-    if size > LONGEST_DATA:
-        raise DamagedError("a record is absurdly long")
-    return header, _read(stream, size)
-
-
-def _number(header: dict[bytes, bytes], name: bytes, size: int) -> int:
+def _number(header: Header, name: bytes, size: int) -> int:
     value = header.get(name, b"")
     if len(value) != size:
         raise DamagedError(f"a record lacks its '{name.decode()}'")
@@ -201,8 +204,8 @@ def _time(value: bytes) -> int:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-def _connection(header: dict[bytes, bytes], data: bytes) -> Connection:
-    inner = _fields(data)
+def _connection(header: Header, data: bytes) -> Connection:
+    inner = _header(data)
     try:
         topic = header[b"topic"].decode()
         kind = normalize_msgtype(inner[b"type"].decode())
@@ -213,7 +216,7 @@ def _connection(header: dict[bytes, bytes], data: bytes) -> Connection:
     return Connection(_number(header, b"conn", 4), "/" + topic.strip("/"), kind, definition, 0)
 
 
-def _chunk_info(header: dict[bytes, bytes], data: bytes) -> tuple[int, dict[str, Any]]:
+def _chunk_info(header: Header, data: bytes) -> tuple[int, dict[str, Any]]:
     """Return where a chunk lies, and its messages, start and end as the index has them."""
     if len(data) % 8:
         raise DamagedError("a chunk's entry in the index makes no sense")
@@ -222,20 +225,18 @@ def _chunk_info(header: dict[bytes, bytes], data: bytes) -> tuple[int, dict[str,
     return _number(header, b"chunk_pos", 8), {"held": held, "start": start, "end": end}
 
 
-def _chunk(header: dict[bytes, bytes], position: int, packed: int) -> Chunk:
+def _chunk(header: Header, begin: int, end: int) -> Chunk:
     compression = header.get(b"compression", b"").decode(errors="replace")
     size = _number(header, b"size", 4)
-    return Chunk(position, packed, {}, compression=compression, size=size)
+    return Chunk(begin, end - begin, compression=compression, size=size)
 
 
-def _entries(stream: BinaryIO) -> tuple[int, tuple[Index, Index]]:
-    """Read the index of one connection in a chunk: its number, times and offsets."""
-    header, data = _record(stream, INDEX)
-    if len(data) % 12:
+def _entries(content: bytes) -> tuple[Index, Index]:
+    """Return the times and offsets of one connection's messages, of its index in a chunk."""
+    if len(content) % 12:
         raise DamagedError("an index makes no sense")
-    entries = np.frombuffer(data, dtype="<u4").reshape(-1, 3).astype(np.int64)
-    time = entries[:, 0] * 1_000_000_000 + entries[:, 1]
-    return _number(header, b"conn", 4), (time, entries[:, 2])
+    entries = np.frombuffer(content, dtype="<u4").reshape(-1, 3).astype(np.int64)
+    return entries[:, 0] * 1_000_000_000 + entries[:, 1], entries[:, 2]
 
 
 def _belongs(content: Bytes, connection: int, header: Index, size: Index) -> NDArray[np.bool_]:

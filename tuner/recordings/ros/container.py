@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import sys
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -22,6 +23,31 @@ from tuner.recordings.ros.messages import Block, Bytes, Index
 LARGEST_CHUNK = 128 << 20
 #: Wanted pieces of an uncompressed chunk that lie this near are read in one go, in bytes.
 NEAR = 1 << 16
+
+
+class FileBytes:
+    """A file as bytes, of which only those that are asked for are read.
+
+    Parameters
+    ----------
+    stream
+        The open file.
+    """
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+        self._size = stream.seek(0, io.SEEK_END)
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, part: slice) -> bytes:
+        self._stream.seek(part.start)
+        return self._stream.read(max(0, min(part.stop, self._size) - part.start))
+
+
+Content = bytes | FileBytes
+"""Where records stand: a file, or a chunk of it unpacked."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +116,6 @@ def unpack(compression: str, packed: bytes, size: int) -> bytes:
     DamagedError
         The compression is unknown, the size absurd or nothing can be unpacked.
     """
-    if compression in ("none", ""):
-        return packed
     if not 0 < size <= LARGEST_CHUNK:
         raise DamagedError(f"a chunk claims {size} bytes")
     try:
@@ -143,25 +167,41 @@ class Chunk:
     Attributes
     ----------
     position, length
-        Where it lies in the file, and how many bytes.
+        Where its data lie in the file, and how many bytes.
     held
         Connection -> the messages in the chunk, or what else says that there are any.
     start, end
         s since 1970 of the first and the last message; None where no index says so.
     compression, size
-        How its data are packed, and their bytes when unpacked, where that is known beforehand.
+        How its data are packed, and their bytes when unpacked.
     entries
         Its messages, where the chunk was walked; empty leaves them to its index.
     """
 
     position: int
     length: int
-    held: Mapping[int, int]
+    held: Mapping[int, int] = field(default_factory=dict)
     start: float | None = None
     end: float | None = None
     compression: str = ""
     size: int = 0
     entries: Entries = field(default_factory=dict)
+
+    @property
+    def packed(self) -> bool:
+        """Whether its data are compressed."""
+        return self.compression not in ("none", "")
+
+    def holding(self, rows: Mapping[int, Sequence[tuple[int, int]]]) -> Chunk:
+        """Return the chunk with what walking it found: connection -> times and offsets."""
+        tables = {number: np.array(held, dtype=np.int64).T for number, held in rows.items()}
+        last = max((int(time.max()) for time, _ in tables.values()), default=None)
+        return replace(
+            self,
+            held={number: len(held) for number, held in rows.items()},
+            end=None if last is None else last * 1e-9,
+            entries={number: (time, offset) for number, (time, offset) in tables.items()},
+        )
 
 
 @dataclass
@@ -171,11 +211,7 @@ class ChunkedFile(Container):
     _chunks: list[Chunk] = field(default_factory=list)
 
     @abstractmethod
-    def _place(self, stream: BinaryIO, chunk: Chunk) -> tuple[str, int, int, int]:
-        """Return how a chunk's records are packed, where they lie, and their two sizes."""
-
-    @abstractmethod
-    def _index(self, stream: BinaryIO, chunk: Chunk) -> Entries:
+    def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
         """Return the messages of a chunk as the index behind it has them."""
 
     @abstractmethod
@@ -194,10 +230,11 @@ class ChunkedFile(Container):
         """Yield the messages of some connections, chunk by chunk."""
         lost: list[Chunk] = []
         with self.path.open("rb") as stream:
+            data = FileBytes(stream)
             for chunk in self._chunks:
                 present = [number for number in wanted if number in chunk.held]
                 try:
-                    located = self._locate(stream, chunk, present) if present else []
+                    located = self._locate(data, chunk, present) if present else []
                 except DamagedError:
                     lost.append(chunk)
                     continue
@@ -214,61 +251,42 @@ class ChunkedFile(Container):
                 )
             )
 
-    def _locate(self, stream: BinaryIO, chunk: Chunk, wanted: list[int]) -> list[tuple[int, Block]]:
+    def _locate(self, data: FileBytes, chunk: Chunk, wanted: list[int]) -> list[tuple[int, Block]]:
         """Return the blocks of a chunk, by the index behind it or by walking it."""
         try:
-            entries = chunk.entries or self._index(stream, chunk)
+            entries = chunk.entries or self._index(data, chunk)
         except DamagedError:
-            entries = self._walked(stream, chunk)[0].entries
-        compression, position, packed, _ = self._place(stream, chunk)
-        if compression not in ("none", "") or packed < 4 * NEAR:
-            content = self._content(stream, chunk)
+            entries = self._walked(data, chunk)[0].entries
+        if chunk.packed or chunk.length < 4 * NEAR:
+            content = np.frombuffer(_unpacked(data, chunk), dtype=np.uint8)
         else:  # only the wanted pieces of one that may hold images unpacked
-            content, entries = read_wanted(stream, position, packed, entries, wanted)
+            content, entries = read_wanted(data, chunk, entries, wanted)
         return [(n, self._block(content, n, *entries[n])) for n in entries if n in wanted]
 
-    def _content(self, stream: BinaryIO, chunk: Chunk) -> Bytes:
-        """Return the unpacked records of a chunk."""
-        compression, position, packed, size = self._place(stream, chunk)
-        if packed > LARGEST_CHUNK:
-            raise DamagedError(f"a chunk claims {packed} bytes")
-        stream.seek(position)
-        return np.frombuffer(unpack(compression, stream.read(packed), size), dtype=np.uint8)
-
-    def _walked(self, stream: BinaryIO, chunk: Chunk) -> tuple[Chunk, int]:
+    def _walked(self, data: FileBytes, chunk: Chunk) -> tuple[Chunk, int]:
         """Return a chunk with what walking it finds in it, and how many bytes make no sense."""
-        content = self._content(stream, chunk).tobytes()
+        content = _unpacked(data, chunk)
         rows, read = self._scan(content)
-        entries = {number: _columns(held) for number, held in rows.items()}
-        last = max((int(time.max()) for time, _ in entries.values()), default=None)
-        known = replace(
-            chunk,
-            held={number: len(held) for number, held in rows.items()},
-            end=None if last is None else last * 1e-9,
-            entries=entries,
-        )
-        return known, len(content) - read
+        return chunk.holding(rows), len(content) - read
 
-    def _add(self, stream: BinaryIO, chunk: Chunk) -> int:
+    def _add(self, data: FileBytes, chunk: Chunk) -> int:
         """Add a chunk that a walk came upon; return how many bytes of it make no sense."""
         missed = chunk.length
         with contextlib.suppress(DamagedError):
-            chunk, missed = self._walked(stream, chunk)
+            chunk, missed = self._walked(data, chunk)
         self._chunks.append(chunk)
-        return missed if chunk.compression in ("none", "") else 0  # of the file, not unpacked
+        return 0 if chunk.packed else missed  # of the file, not unpacked
 
-    def _salvaged(
-        self, cause: Cause, lost: int, loose: Mapping[int, list[tuple[int, int, int]]]
-    ) -> None:
-        """Count what a walk found in chunks and outside, times first, and note the damage."""
-        counts = Counter({number: len(rows) for number, rows in loose.items()})
+    def _salvaged(self, cause: Cause, lost: int) -> None:
+        """Count what a walk found, and note the damage."""
+        counts: Counter[int] = Counter()
         for chunk in self._chunks:
             counts.update(chunk.held)
-        ends = [chunk.end for chunk in self._chunks if chunk.end is not None]
-        ends += [max(rows)[0] * 1e-9 for rows in loose.values()]
+        start = max((chunk.end for chunk in self._chunks if chunk.end is not None), default=None)
         self._count(counts)
-        salvaged, start = sum(counts.values()), max(ends, default=None)
-        self.damage.append(Damage(cause, salvaged=salvaged, bytes_lost=lost, start=start))
+        self.damage.append(
+            Damage(cause, salvaged=sum(counts.values()), bytes_lost=lost, start=start)
+        )
 
     def _count(self, counts: Mapping[int, int]) -> None:
         """Tell the connections how many messages each has."""
@@ -278,24 +296,18 @@ class ChunkedFile(Container):
         }
 
 
-def _columns(rows: list[tuple[int, int]]) -> tuple[Index, Index]:
-    table = np.array(rows, dtype=np.int64)
-    return table[:, 0], table[:, 1]
+def _unpacked(data: FileBytes, chunk: Chunk) -> bytes:
+    """Return the records of a chunk."""
+    if chunk.length > LARGEST_CHUNK:
+        raise DamagedError(f"a chunk claims {chunk.length} bytes")
+    content = data[chunk.position : chunk.position + chunk.length]
+    return unpack(chunk.compression, content, chunk.size) if chunk.packed else content
 
 
 def read_wanted(
-    stream: BinaryIO, origin: int, size: int, entries: Entries, wanted: Collection[int]
+    data: FileBytes, chunk: Chunk, entries: Entries, wanted: Collection[int]
 ) -> tuple[Bytes, Entries]:
-    """Read the wanted connections' records of an unpacked chunk.
-
-    Parameters
-    ----------
-    stream, origin, size
-        As of `read_pieces`.
-    entries
-        Of the chunk.
-    wanted
-        Connections among them.
+    """Read the wanted connections' records of an unpacked chunk, and not the images between them.
 
     Returns
     -------
@@ -303,54 +315,22 @@ def read_wanted(
         The bytes read, and the wanted entries with their offsets in them.
     """
     kept = {number: entry for number, entry in entries.items() if number in wanted}
-    if not kept:
+    starts = np.unique(np.concatenate([offset for _, offset in kept.values()] or [[]])).astype(int)
+    if len(starts) == 0 or starts[0] < 0 or starts[-1] >= chunk.length:
         raise DamagedError("an index points nowhere")
     bounds = np.unique(np.concatenate([offset for _, offset in entries.values()]))
-    starts = np.unique(np.concatenate([offset for _, offset in kept.values()]))
-    content, moved = read_pieces(stream, origin, size, starts, bounds)
-    return content, {
+    bounds = np.append(bounds[bounds < chunk.length], chunk.length)
+    ends = bounds[np.searchsorted(bounds, starts, side="right")]
+    first = np.concatenate([[0], np.flatnonzero(starts[1:] - ends[:-1] > NEAR) + 1])
+    last = np.append(first[1:], len(starts)) - 1
+    lengths = ends[last] - starts[first]
+    if lengths.sum() > LARGEST_CHUNK:
+        raise DamagedError("a chunk is absurdly long")
+    begins = chunk.position + starts[first]
+    pieces = [data[at : at + n] for at, n in zip(begins.tolist(), lengths.tolist(), strict=True)]
+    piece = np.searchsorted(first, np.arange(len(starts)), side="right") - 1
+    moved = starts + (np.cumsum(lengths) - lengths - starts[first])[piece]
+    return np.frombuffer(b"".join(pieces), dtype=np.uint8), {
         number: (time, moved[np.searchsorted(starts, offset)])
         for number, (time, offset) in kept.items()
     }
-
-
-def read_pieces(
-    stream: BinaryIO, origin: int, size: int, starts: Index, bounds: Index
-) -> tuple[Bytes, Index]:
-    """Read the wanted records of an unpacked chunk, and not the images between them.
-
-    Parameters
-    ----------
-    stream
-        The file.
-    origin, size
-        Where the chunk's data begin in it, and how long they are.
-    starts
-        (n,) increasing offsets of wanted records in the chunk.
-    bounds
-        Increasing offsets of all records.
-
-    Returns
-    -------
-    tuple
-        The bytes read, and (n,) where each wanted record begins in them.
-    """
-    if len(starts) == 0 or starts[0] < 0 or starts[-1] >= size:
-        raise DamagedError("an index points nowhere")
-    bounds = np.append(bounds[bounds < size], size)
-    ends = bounds[np.searchsorted(bounds, starts, side="right")]
-    apart = np.flatnonzero(starts[1:] - ends[:-1] > NEAR) + 1
-    first = np.concatenate([[0], apart])
-    last = np.concatenate([apart, [len(starts)]]) - 1
-    pieces = []
-    moved = np.empty_like(starts)
-    length = 0
-    for begin, end in zip(first, last, strict=True):
-        stream.seek(origin + int(starts[begin]))
-        piece = stream.read(int(ends[end] - starts[begin]))
-        moved[begin : end + 1] = starts[begin : end + 1] - starts[begin] + length
-        pieces.append(piece)
-        length += len(piece)
-        if length > LARGEST_CHUNK:
-            raise DamagedError("a chunk is absurdly long")
-    return np.frombuffer(b"".join(pieces), dtype=np.uint8), moved

@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import BinaryIO
 
 import numpy as np
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
@@ -26,9 +25,10 @@ from tuner.recordings.ros.container import (
     Chunk,
     ChunkedFile,
     Connection,
+    Content,
     DamagedError,
     Entries,
-    read_pieces,
+    FileBytes,
     unsigned,
 )
 from tuner.recordings.ros.messages import Block, Bytes, Index
@@ -38,6 +38,8 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, CHUNK_INDEX, STATISTICS, DATA_EN
     0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x0B, 0x0F,
 )  # fmt: skip
 
+#: Messages outside of chunks that are read together.
+AT_ONCE = 4096
 #: Bytes of a message record before its payload: op, length, channel, sequence, two times.
 BEFORE_PAYLOAD = 9 + 22
 #: Channel, sequence and time of a message. No true time is beyond 2^63: read with a sign, as in the
@@ -55,56 +57,41 @@ _FORMATS = {
 class Mcap(ChunkedFile):
     """An MCAP file with ROS messages.
 
-    Its chunks' positions are those of their records, and ``held`` says where the index of a
-    channel's messages lies.
+    In its chunks ``held`` says where the index of a channel's messages lies. Messages outside of
+    chunks count as chunks of some thousands.
     """
 
-    _loose: dict[int, list[tuple[int, int, int]]] = field(default_factory=dict)
     _schemas: dict[int, tuple[str, MessageDefinition]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         with self.path.open("rb") as stream:
-            if stream.read(len(MAGIC)) != MAGIC:
+            data = FileBytes(stream)
+            if data[0 : len(MAGIC)] != MAGIC:
                 raise RecordingError(self.path, "is no MCAP file", "give the recording itself")
             try:
-                self._read_summary(stream)
+                self._read_summary(data)
             except DamagedError as err:
-                self._walk(stream, err.cause)
+                self._walk(data, err.cause)
         if not self.connections:
             raise RecordingError(self.path, "holds no ROS messages", "record it again")
 
-    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
-        """Yield the messages of some connections, chunk by chunk, then those outside of chunks."""
-        yield from super().blocks(wanted)
-        size = self.path.stat().st_size
-        with self.path.open("rb") as stream:
-            for number in wanted:
-                loose = np.array(self._loose.get(number, []), dtype=np.int64).reshape(-1, 3)
-                for rows in np.array_split(loose, -(-len(loose) // 4096)) if len(loose) else ():
-                    time, starts, ends = rows.T
-                    bounds = np.unique([*starts, *ends])
-                    content, moved = read_pieces(stream, 0, size, starts, bounds)
-                    yield number, self._block(content, number, time, moved)
-
-    def _read_summary(self, stream: BinaryIO) -> None:
+    def _read_summary(self, data: FileBytes) -> None:
         """Learn channels and chunks from the end of the file."""
-        size = self.path.stat().st_size
-        stream.seek(max(0, size - 37))
-        footer = stream.read(37)
+        end = max(0, len(data) - 37)
+        footer = data[end : len(data)]
         if len(footer) != 37 or footer[-8:] != MAGIC or footer[:9] != b"\x02\x14" + bytes(7):
             raise DamagedError("its end is missing", Cause.END_MISSING)
         (start,) = struct.unpack_from("<Q", footer, 9)
-        if not 0 < start <= size - 37:
+        if not 0 < start <= end:
             raise DamagedError("it has no summary", Cause.NOT_CLOSED)
-        if size - start > LARGEST_CHUNK:
+        if end - start > LARGEST_CHUNK:
             raise DamagedError("its summary is absurdly long")
-        stream.seek(start)
         counts: dict[int, int] = {}
-        summary = stream.read(size - 37 - start)
-        for op, at, end in _records(summary):
-            content = summary[at:end]
+        summary = data[start:end]
+        for op, begin, behind in _records(summary, 0):
+            content = summary[begin:behind]
             if op == CHUNK_INDEX:
-                self._chunks.append(_chunk_index(content, size))
+                self._chunks.append(_chunk_index(content, len(data)))
             elif op == STATISTICS:
                 counts = _counts(content)
             else:
@@ -113,39 +100,43 @@ class Mcap(ChunkedFile):
             raise DamagedError("its summary names no chunks")
         self._count(counts)
 
-    def _walk(self, stream: BinaryIO, cause: Cause) -> None:
+    def _walk(self, data: FileBytes, cause: Cause) -> None:
         """Learn channels and messages from front to end, as far as records can be followed."""
         self._chunks, self.connections = [], {}
-        size = self.path.stat().st_size
-        at, unread = len(MAGIC), 0
-        while at + 9 <= size:
-            stream.seek(at)
-            op, length = struct.unpack("<BQ", stream.read(9))
-            end = at + 9 + length
-            if op in (FOOTER, DATA_END) or op == 0 or (end > size and op != CHUNK):
+        loose: dict[int, list[tuple[int, int]]] = {}
+        reached, unread = len(MAGIC), 0
+        for op, begin, end in _records(data, reached):
+            if op in (0, FOOTER, DATA_END) or (end > len(data) and op != CHUNK):
                 break
+            if loose and (op != MESSAGE or sum(map(len, loose.values())) >= AT_ONCE):
+                self._chunks.append(Chunk(0, reached).holding(loose))
+                loose = {}
             if op == CHUNK:
-                unread += self._add(stream, Chunk(at, min(length, size - at - 9), {}))
-            elif op == MESSAGE and length >= 22:
-                number, _, time = _HEAD.unpack(stream.read(14))
-                self._loose.setdefault(number, []).append((time, at, end))
-            elif op in (SCHEMA, CHANNEL) and length < LARGEST_CHUNK:
+                unread += self._add(data, _chunk(data, begin, min(end, len(data))))
+            elif op == MESSAGE and end - begin >= _HEAD.size + 8:
+                number, _, time = _HEAD.unpack(data[begin : begin + _HEAD.size])
+                loose.setdefault(number, []).append((time, begin - 9))
+            elif op in (SCHEMA, CHANNEL) and end - begin < LARGEST_CHUNK:
                 with contextlib.suppress(DamagedError):
-                    self._learn(op, stream.read(length))
-            at = end
-        self._salvaged(cause, max(size - at, 0) + unread, self._loose)
+                    self._learn(op, data[begin:end])
+            reached = end
+        if loose:
+            self._chunks.append(Chunk(0, reached).holding(loose))
+        self._salvaged(cause, max(len(data) - reached, 0) + unread)
 
     def _scan(self, content: bytes) -> tuple[Mapping[int, list[tuple[int, int]]], int]:
         messages: dict[int, list[tuple[int, int]]] = {}
         read = 0
-        for op, at, end in _records(content):
+        for op, begin, end in _records(content, 0):
+            if end > len(content):
+                break
             read = end
-            if op == MESSAGE and end - at >= 22:
-                number, _, time = _HEAD.unpack_from(content, at)
-                messages.setdefault(number, []).append((time, at - 9))
+            if op == MESSAGE and end - begin >= _HEAD.size + 8:
+                number, _, time = _HEAD.unpack_from(content, begin)
+                messages.setdefault(number, []).append((time, begin - 9))
             elif op in (SCHEMA, CHANNEL):
                 with contextlib.suppress(DamagedError):
-                    self._learn(op, content[at:end])
+                    self._learn(op, content[begin:end])
         return messages, read
 
     def _learn(self, op: int, content: bytes) -> None:
@@ -172,20 +163,8 @@ class Mcap(ChunkedFile):
         except (struct.error, ValueError):
             raise DamagedError("a channel makes no sense") from None
 
-    def _place(self, stream: BinaryIO, chunk: Chunk) -> tuple[str, int, int, int]:
-        stream.seek(chunk.position + 9)
-        head = stream.read(40 + 16)
-        try:
-            (size,) = struct.unpack_from("<Q", head, 16)
-            compression, at = _string(head, 28)
-            (packed,) = struct.unpack_from("<Q", head, at)
-        except (struct.error, ValueError):
-            raise DamagedError("a chunk makes no sense") from None
-        packed = min(packed, max(0, chunk.length - at - 8))
-        return compression, chunk.position + 9 + at + 8, packed, size
-
-    def _index(self, stream: BinaryIO, chunk: Chunk) -> Entries:
-        return {number: _entries(stream, at, number) for number, at in chunk.held.items()}
+    def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
+        return {number: _entries(data, at, number) for number, at in chunk.held.items()}
 
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
         inside = (offset >= 0) & (offset + BEFORE_PAYLOAD <= len(content))
@@ -196,13 +175,10 @@ class Mcap(ChunkedFile):
         return Block(content, offset[inside] + BEFORE_PAYLOAD, end[inside], time[inside])
 
 
-def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield op, start and end of the content of each record, until one is cut."""
-    at = 0
-    while at + 9 <= len(content):
-        op, length = struct.unpack_from("<BQ", content, at)
-        if at + 9 + length > len(content):
-            return
+def _records(data: Content, at: int) -> Iterator[tuple[int, int, int]]:
+    """Yield op, start and end of the content of each record; the last may be cut."""
+    while at + 9 <= len(data):
+        op, length = struct.unpack("<BQ", data[at : at + 9])
         yield op, at + 9, at + 9 + length
         at += 9 + length
 
@@ -214,16 +190,32 @@ def _string(content: bytes, at: int) -> tuple[str, int]:
     return content[at + 4 : at + 4 + length].decode(errors="replace"), at + 4 + length
 
 
+def _chunk(data: FileBytes, begin: int, end: int) -> Chunk:
+    """Return a chunk by the head of its record's content, of which the end may be missing."""
+    head = data[begin : begin + 40 + 16]
+    try:
+        (size,) = struct.unpack_from("<Q", head, 16)
+        compression, at = _string(head, 28)
+        (length,) = struct.unpack_from("<Q", head, at)
+    except (struct.error, ValueError):
+        return Chunk(begin, end - begin)
+    first = begin + at + 8
+    return Chunk(first, min(length, max(0, end - first)), compression=compression, size=size)
+
+
 def _chunk_index(content: bytes, size: int) -> Chunk:
+    """Return a chunk by its entry in the summary of a file of some bytes."""
     try:
         start, end, position, length, indexes = struct.unpack_from("<QQQQI", content)
-        pairs = content[36 : 36 + indexes]
-        index_positions = dict(struct.iter_unpack("<HQ", pairs))
-    except struct.error:
+        held = dict(struct.iter_unpack("<HQ", content[36 : 36 + indexes]))
+        compression, at = _string(content, 36 + indexes + 8)
+        packed, unpacked = struct.unpack_from("<QQ", content, at)
+    except (struct.error, ValueError):
         raise DamagedError("its summary makes no sense") from None
-    if position + length > size or length < 9 or any(at >= size for at in index_positions.values()):
+    behind = position + length
+    if behind > size or packed > length or any(at >= size for at in held.values()):
         raise DamagedError("its summary points nowhere")
-    return Chunk(position, length - 9, index_positions, start * 1e-9, end * 1e-9)
+    return Chunk(behind - packed, packed, held, start * 1e-9, end * 1e-9, compression, unpacked)
 
 
 def _counts(content: bytes) -> dict[int, int]:
@@ -232,17 +224,16 @@ def _counts(content: bytes) -> dict[int, int]:
     return dict(struct.iter_unpack("<HQ", content[46:]))
 
 
-def _entries(stream: BinaryIO, position: int, number: int) -> tuple[Index, Index]:
+def _entries(data: FileBytes, at: int, number: int) -> tuple[Index, Index]:
     """Read the times and offsets of one channel's messages in a chunk."""
-    stream.seek(position)
-    head = stream.read(15)
+    head = data[at : at + 15]
     if len(head) != 15:
         raise DamagedError("an index is missing")
     op, _, channel, length = struct.unpack("<BQHI", head)
-    if op != INDEX or channel != number or length > LARGEST_CHUNK // 8:
+    if op != INDEX or channel != number or length > LARGEST_CHUNK // 8 or length % 16:
         raise DamagedError("an index makes no sense")
-    data = stream.read(length)
-    if len(data) != length or length % 16:
+    content = data[at + 15 : at + 15 + length]
+    if len(content) != length:
         raise DamagedError("an index is cut")
-    entries = np.frombuffer(data, dtype="<i8").reshape(-1, 2)
+    entries = np.frombuffer(content, dtype="<i8").reshape(-1, 2)
     return entries[:, 0].copy(), entries[:, 1].copy()

@@ -10,7 +10,7 @@ as they nearly always do, the cursor is a single number.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -275,167 +275,45 @@ class Block:
     time: Index
 
 
-@dataclass(frozen=True)
-class _Number:
-    """A run of numbers of one kind; `wanted` maps the position in it to the field's path."""
+def missing_fields(definitions: Definitions, kind: str, fields: Sequence[str]) -> tuple[str, ...]:
+    """Return those of some fields that messages of a type do not have, or that cannot be reached.
 
-    kind: str
-    count: int
-    wanted: Mapping[int, str]
-
-
-@dataclass(frozen=True)
-class _Numbers:
-    """A sequence of numbers, its length before it; a string is one of bytes."""
-
-    kind: str
-    wanted: Mapping[int, str]
-
-
-@dataclass(frozen=True)
-class _Structures:
-    """A sequence of structures or strings: the steps of element 0, 1, ... as far as one is wanted.
-
-    `rest` holds the steps of each element after those.
-    """
-
-    elements: tuple[tuple[_Step, ...], ...]
-    rest: tuple[_Step, ...]
-
-
-_Step = _Number | _Numbers | _Structures
-
-
-class UnknownFieldError(Exception):
-    """A message type has no such field, or cannot be walked through to it."""
-
-
-@dataclass(frozen=True)
-class Walk:
-    """The way through a message type as far as the last wanted field.
-
-    Attributes
-    ----------
-    steps
-        What is passed, in order.
-    fields
-        The wanted paths.
-    aligned
-        Whether numbers are padded to their size, as CDR has it.
-    """
-
-    steps: tuple[_Step, ...]
-    fields: tuple[str, ...]
-    aligned: bool
-
-
-def plan(definitions: Definitions, kind: str, fields: Sequence[str], *, aligned: bool) -> Walk:
-    """Plan the walk through messages of a type to some of its fields.
+    A walk through no messages tells.
 
     Raises
     ------
-    UnknownFieldError
-        The type lacks one of them, or is too involved for an honest one.
+    RecordingError
+        The definition of the type is missing or cannot be understood.
     """
-    steps = _all_steps(definitions, kind, fields)
-    if missing := set(fields) - set(_paths(steps)):
-        raise UnknownFieldError(f"{kind} has no field '{min(missing)}'")
-    while steps and not any(True for _ in _paths(steps[-1:])):
-        steps = steps[:-1]
-    return Walk(steps, tuple(dict.fromkeys(fields)), aligned)
+    nothing, empty = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.uint8)
+    walker = _Walker(definitions, set(fields), empty, np.ones(0, dtype=np.bool_))
+    walker.walk((Nodetype.NAME, kind), "", _Messages(nothing, nothing, nothing), 0, 0)
+    return tuple(path for path in dict.fromkeys(fields) if path in walker.wanted)
 
 
-def missing_fields(definitions: Definitions, kind: str, fields: Sequence[str]) -> tuple[str, ...]:
-    """Return those of some fields that a message type does not have."""
-    known = set(_paths(_all_steps(definitions, kind, fields)))
-    return tuple(path for path in fields if path not in known)
-
-
-def _all_steps(definitions: Definitions, kind: str, fields: Sequence[str]) -> tuple[_Step, ...]:
-    return tuple(_Planner(definitions, frozenset(fields)).steps((Nodetype.NAME, kind), "", 0))
-
-
-def _paths(steps: Iterable[_Step]) -> Iterator[str]:
-    for step in steps:
-        if isinstance(step, _Number | _Numbers):
-            yield from step.wanted.values()
-        elif isinstance(step, _Structures):
-            for element in step.elements:
-                yield from _paths(element)
-
-
-@dataclass
-class _Planner:
-    """Lays out the steps through a type, so far as its size is honest."""
-
-    definitions: Definitions
-    wanted: frozenset[str]
-    left: int = 20_000
-
-    def steps(self, what: Any, path: str, depth: int) -> Iterator[_Step]:
-        """Yield the steps through one value of a type; `path` leads to it."""
-        self.left -= 1
-        if depth > DEEPEST or self.left < 0:
-            raise UnknownFieldError(f"the type is nested too deep at '{path}'")
-        node, detail = what
-        if node == Nodetype.NAME:
-            for name, inner in self.definitions.fields(detail):
-                yield from self.steps(inner, f"{path}.{name}" if path else name, depth + 1)
-        elif node == Nodetype.BASE and detail[0] == "string":
-            yield _Numbers("u1", {})
-        elif node == Nodetype.BASE:
-            yield _Number(_kind(detail[0]), 1, {0: path} if path in self.wanted else {})
-        else:
-            yield from self._array(detail, path, depth, fixed=node == Nodetype.ARRAY)
-
-    def _array(self, detail: Any, path: str, depth: int, *, fixed: bool) -> Iterator[_Step]:
-        element, count = detail
-        indices = self._indices(path)
-        numbers = element[0] == Nodetype.BASE and element[1][0] != "string"
-        if fixed and numbers:
-            inside = {i: f"{path}[{i}]" for i in indices if i < count}
-            yield _Number(_kind(element[1][0]), count, inside)
-        elif numbers:
-            yield _Numbers(_kind(element[1][0]), {i: f"{path}[{i}]" for i in indices})
-        elif fixed:
-            if count > MOST:
-                raise UnknownFieldError(f"'{path}' is an array of {count} structures")
-            for i in range(count):
-                yield from self.steps(element, f"{path}[{i}]", depth + 1)
-        else:
-            reach = range(min(max(indices, default=-1) + 1, MOST))
-            yield _Structures(
-                tuple(tuple(self.steps(element, f"{path}[{i}]", depth + 1)) for i in reach),
-                tuple(self.steps(element, f"{path}[]", depth + 1)),
-            )
-
-    def _indices(self, path: str) -> list[int]:
-        """Return the elements of an array that wanted paths lead to or through."""
-        indices = set()
-        for name in self.wanted:
-            if name.startswith(f"{path}["):
-                digits = name[len(path) + 1 :].partition("]")[0]
-                if digits.isdecimal() and len(digits) < 6:
-                    indices.add(int(digits))
-        return sorted(indices)
-
-
-def _kind(name: str) -> str:
-    if name not in _KINDS:
-        raise UnknownFieldError(f"a field of type '{name}' stands in the way")
-    return _KINDS[name]
-
-
-def decode(walk: Walk, block: Block) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
+def decode(
+    definitions: Definitions, kind: str, fields: Sequence[str], block: Block, *, aligned: bool
+) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
     """Return the wanted fields of a block's messages, (n,) each, and which messages were whole.
 
     Numbers keep the kind that they were written with, except that elements of sequences become
     floats, NaN where the sequence is too short. A message that ends before its last wanted field
     is not whole; its numbers mean nothing.
+
+    Parameters
+    ----------
+    definitions, kind
+        The message type.
+    fields
+        Paths that `missing_fields` finds.
+    block
+        The messages.
+    aligned
+        Whether numbers are padded to their size, as CDR has it.
     """
     count = len(block.start)
     whole, little, head = np.ones(count, dtype=np.bool_), np.ones(count, dtype=np.uint8), 0
-    if walk.aligned:  # CDR: four bytes before the payload give the byte order, and do not count
+    if aligned:  # CDR: four bytes before the payload give the byte order, and do not count
         head = 4
         whole = (block.end - block.start >= head) & (block.start >= 0)
         whole &= block.end <= len(block.buffer)
@@ -446,102 +324,174 @@ def decode(walk: Walk, block: Block) -> tuple[dict[str, NDArray[Any]], NDArray[n
         rows = np.flatnonzero(whole & (little == flag))
         if len(rows) == 0:
             continue
-        walker = _Walker(block.buffer, order, walk.aligned, {}, np.ones(len(rows), dtype=np.bool_))
-        start, end = block.start[rows] + head, block.end[rows]
-        walker.walk(walk.steps, start, end, 0, np.arange(len(rows)))
+        every = np.ones(len(rows), dtype=np.bool_)
+        walker = _Walker(definitions, set(fields), block.buffer, every, order, aligned)
+        messages = _Messages(block.start[rows] + head, block.end[rows], np.arange(len(rows)))
+        walker.walk((Nodetype.NAME, kind), "", messages, 0, 0)
         whole[rows] = walker.whole
         for name, values in walker.columns.items():
             native = values.astype(values.dtype.newbyteorder("="), copy=False)
             columns.setdefault(name, np.zeros(count, dtype=native.dtype))[rows] = native
-    return {name: columns.get(name, np.full(count, np.nan)) for name in walk.fields}, whole
+    return {name: columns.get(name, np.full(count, np.nan)) for name in fields}, whole
+
+
+@dataclass(frozen=True)
+class _Messages:
+    """Where some messages start and end in a buffer, and their rows; (n,) each."""
+
+    start: Index
+    end: Index
+    rows: Index
+
+    def of(self, which: NDArray[Any]) -> _Messages:
+        """Return some of them."""
+        return _Messages(self.start[which], self.end[which], self.rows[which])
 
 
 @dataclass
 class _Walker:
-    """Walks all messages of a buffer at once."""
+    """Walks all messages of a buffer at once, up to the last wanted field.
 
+    Attributes
+    ----------
+    wanted
+        Paths that were not come by yet.
+    whole
+        (n,) whether a message held all that was come by.
+    order
+        Of bytes, as NumPy writes it.
+    columns
+        Path -> (n,) numbers.
+    left
+        Values that are walked through at most: types may multiply.
+    """
+
+    definitions: Definitions
+    wanted: set[str]
     buffer: Bytes
-    order: str
-    aligned: bool
-    columns: dict[str, NDArray[Any]]
     whole: NDArray[np.bool_]
+    order: str = "<"
+    aligned: bool = False
+    columns: dict[str, NDArray[Any]] = field(default_factory=dict)
     left: int = 100_000
 
-    def walk(
-        self, steps: Sequence[_Step], start: Index, end: Index, cursor: Cursor, rows: Index
-    ) -> Cursor:
-        """Walk messages from a place behind their starts; return the place behind the steps."""
-        for step in steps:
-            self.left -= 1
-            if self.left < 0:
-                self.whole[rows] = False
-                break
-            if isinstance(step, _Number):
-                cursor = self._number(step, start, end, cursor, rows)
-            elif isinstance(step, _Numbers):
-                cursor = self._numbers(step, start, end, cursor, rows)
-            else:
-                cursor = self._structures(step, start, end, cursor, rows)
+    def walk(self, what: Any, path: str, of: _Messages, cursor: Cursor, depth: int) -> Cursor:
+        """Walk through one value from a place behind the messages' starts; return that behind it.
+
+        Parameters
+        ----------
+        what
+            rosbags' description of the value.
+        path
+            Leads to it.
+        of
+            The messages.
+        cursor
+            Where it begins.
+        depth
+            How deep in the type it is.
+        """
+        self.left -= 1
+        node, detail = what
+        element = what if node in (Nodetype.BASE, Nodetype.NAME) else detail[0]
+        text = element[0] == Nodetype.BASE and element[1][0] == "string"
+        if self.left < 0 or depth > DEEPEST:
+            self._give_up(of)
+        elif node == Nodetype.NAME:
+            for name, inner in self.definitions.fields(detail):
+                if not self.wanted:
+                    break
+                cursor = self.walk(inner, f"{path}.{name}" if path else name, of, cursor, depth + 1)
+        elif node == Nodetype.BASE and text:
+            cursor = self._sequence("u1", "", of, cursor)
+        elif node == Nodetype.ARRAY and (text or element[0] != Nodetype.BASE):
+            if detail[1] > MOST:
+                self._give_up(of)
+            for i in range(min(detail[1], MOST)):
+                cursor = self.walk(element, f"{path}[{i}]", of, cursor, depth + 1)
+        elif text or element[0] != Nodetype.BASE:
+            cursor = self._structures(element, path, of, cursor, depth)
+        elif (kind := _KINDS.get(element[1][0])) is None:
+            self._give_up(of)
+        elif node == Nodetype.SEQUENCE:
+            cursor = self._sequence(kind, path, of, cursor)
+        else:
+            inside = {i: f"{path}[{i}]" for i in self._indices(path)}
+            names = {0: path} if node == Nodetype.BASE else inside
+            cursor = self._numbers(
+                kind, names, 1 if node == Nodetype.BASE else detail[1], of, cursor
+            )
         return cursor
 
-    def _number(
-        self, step: _Number, start: Index, end: Index, cursor: Cursor, rows: Index
-    ) -> Cursor:
-        size = int(step.kind[1])
-        cursor = self._align(cursor, size)
-        for position, path in step.wanted.items():
-            at = start + (cursor + position * size)
-            self._put(path, self._take(at, end, step.kind, rows), rows)
-        return cursor + step.count * size
+    def _give_up(self, of: _Messages) -> None:
+        """Let nothing more be found: what comes next in the type cannot be walked through."""
+        self.left = 0
+        self.whole[of.rows] = False
 
     def _numbers(
-        self, step: _Numbers, start: Index, end: Index, cursor: Cursor, rows: Index
+        self, kind: str, names: Mapping[int, str], count: int, of: _Messages, cursor: Cursor
     ) -> Cursor:
-        count, cursor = self._length(start, end, cursor, rows)
-        size = int(step.kind[1])
+        """Walk through some numbers of one kind; ``names`` maps places among them to paths."""
+        size = int(kind[1])
+        cursor = self._align(cursor, size)
+        for position, path in names.items():
+            if path in self.wanted and position < count:
+                at = of.start + (cursor + position * size)
+                self._put(path, self._take(at, of.end, kind, of.rows), of)
+        return cursor + count * size
+
+    def _sequence(self, kind: str, path: str, of: _Messages, cursor: Cursor) -> Cursor:
+        """Walk through numbers with their count before them; a string is one of bytes."""
+        count, cursor = self._length(of, cursor)
+        size = int(kind[1])
         # An empty sequence is not padded.
         padded = self._align(cursor, size)
         if np.all(count > 0):
             cursor = padded
         elif np.any(count > 0):
             cursor = np.where(count > 0, padded, cursor)
-        for position, path in step.wanted.items():
+        for position in self._indices(path):
             has = count > position
-            values = np.full(len(rows), np.nan)
-            at = (start + cursor + position * size)[has]
-            values[has] = self._take(at, end[has], step.kind, rows[has])
-            self._put(path, values, rows)
-        return self._advance(cursor, count * size, start, end, rows)
+            values = np.full(len(of.rows), np.nan)
+            at = (of.start + cursor + position * size)[has]
+            values[has] = self._take(at, of.end[has], kind, of.rows[has])
+            self._put(f"{path}[{position}]", values, of)
+        return self._advance(cursor, count * size, of)
 
     def _structures(
-        self, step: _Structures, start: Index, end: Index, cursor: Cursor, rows: Index
+        self, element: Any, path: str, of: _Messages, cursor: Cursor, depth: int
     ) -> Cursor:
-        count, cursor = self._length(start, end, cursor, rows)
-        at = np.zeros(len(rows), dtype=np.int64) + cursor
+        """Walk through structures or strings with their count before them."""
+        counts, cursor = self._length(of, cursor)
+        at = np.zeros(len(of.rows), dtype=np.int64) + cursor
         # Each element takes at least a byte, and nobody walks through more than MOST of them.
-        absurd = count > np.minimum(end - start - at, MOST)
-        self.whole[rows[absurd]] = False
-        count = np.where(absurd, 0, count)
-        for i in range(int(count.max(initial=0))):
-            has = np.flatnonzero(count > i)
-            steps = step.elements[i] if i < len(step.elements) else step.rest
-            at[has] = self.walk(steps, start[has], end[has], at[has], rows[has])
+        absurd = counts > np.minimum(of.end - of.start - at, MOST)
+        self.whole[of.rows[absurd]] = False
+        counts = np.where(absurd, 0, counts)
+        reach = min(max(self._indices(path), default=-1) + 1, MOST)
+        for i in range(max(int(counts.max(initial=0)), reach)):
+            has = np.flatnonzero(counts > i)
+            at[has] = self.walk(element, f"{path}[{i}]", of.of(has), at[has], depth + 1)
         return at
 
-    def _length(
-        self, start: Index, end: Index, cursor: Cursor, rows: Index
-    ) -> tuple[Index, Cursor]:
+    def _indices(self, path: str) -> list[int]:
+        """Return the elements of an array that wanted paths lead to or through."""
+        names = (name[len(path) + 1 :] for name in self.wanted if name.startswith(f"{path}["))
+        digits = {name.partition("]")[0] for name in names}
+        return sorted(int(index) for index in digits if index.isdecimal() and len(index) < 6)
+
+    def _length(self, of: _Messages, cursor: Cursor) -> tuple[Index, Cursor]:
         cursor = self._align(cursor, 4)
-        length = self._take(start + cursor, end, "u4", rows).astype(np.int64)
+        length = self._take(of.start + cursor, of.end, "u4", of.rows).astype(np.int64)
         return length, cursor + 4
 
-    def _advance(self, cursor: Cursor, by: Index, start: Index, end: Index, rows: Index) -> Cursor:
+    def _advance(self, cursor: Cursor, by: Index, of: _Messages) -> Cursor:
         """Move on by a length from the file, one number again if all lengths agree."""
         if len(by) == 0:
             return cursor
-        beyond = start + cursor + by > end
+        beyond = of.start + cursor + by > of.end
         if beyond.any():
-            self.whole[rows[beyond]] = False
+            self.whole[of.rows[beyond]] = False
             by = np.where(beyond, 0, by)
         if isinstance(cursor, int) and by.min() == by.max():
             return cursor + int(by[0])
@@ -564,9 +514,10 @@ class _Walker:
         spread = self.buffer[at[:, None] + np.arange(size)]
         return np.asarray(spread.view(self.order + kind)[:, 0])
 
-    def _put(self, path: str, values: NDArray[Any], rows: Index) -> None:
-        if len(rows) == len(self.whole):
+    def _put(self, path: str, values: NDArray[Any], of: _Messages) -> None:
+        self.wanted.discard(path)
+        if len(of.rows) == len(self.whole):
             self.columns[path] = values
         else:
             empty = np.full(len(self.whole), np.nan)
-            self.columns.setdefault(path, empty)[rows] = values
+            self.columns.setdefault(path, empty)[of.rows] = values

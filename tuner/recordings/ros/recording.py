@@ -6,7 +6,7 @@ import re
 import shutil
 import weakref
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import mkdtemp
@@ -46,11 +46,8 @@ from tuner.recordings.ros.messages import (
     USUAL,
     Block,
     Definitions,
-    UnknownFieldError,
-    Walk,
     decode,
     missing_fields,
-    plan,
 )
 
 #: Files compressed as a whole are unpacked beside the others up to this size.
@@ -216,8 +213,8 @@ class RosRecording(Recording):
     def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return those of some fields that a topic's messages do not have."""
         try:
-            return missing_fields(self._definitions, self._kind(topic), fields)
-        except (UnknownFieldError, RecordingError):
+            return self._missing(self._kind(topic), fields)
+        except RecordingError:
             return fields
 
     def undefined(self, topic: str) -> str | None:
@@ -234,18 +231,19 @@ class RosRecording(Recording):
 
     def read(self, wanted: Mapping[str, Request]) -> Contents:
         """Read the wanted fields of some topics."""
-        walks: dict[int, tuple[Walk, Clock | None]] = {}
+        plans: dict[int, tuple[list[str], Clock | None]] = {}
         for connection in self._container.connections.values():
             if connection.topic in wanted and connection.count:
-                walks[connection.id] = self._plan(connection, wanted[connection.topic])
+                plans[connection.id] = self._plan(connection, wanted[connection.topic])
         parts: dict[str, list[Samples]] = {name: [] for name in wanted}
         broken: dict[str, int] = dict.fromkeys(wanted, 0)
-        for number, block in self._container.blocks(walks):
-            walk, clock = walks[number]
-            columns, whole = decode(walk, block)
-            topic = self._container.connections[number].topic
-            broken[topic] += int(len(whole) - whole.sum())
-            parts[topic].append(_samples(columns, whole, block.time, clock))
+        for number, block in self._container.blocks(plans):
+            (fields, clock), source = plans[number], self._container.connections[number]
+            columns, whole = decode(
+                self._definitions, source.type, fields, block, aligned=self._container.aligned
+            )
+            broken[source.topic] += int(len(whole) - whole.sum())
+            parts[source.topic].append(_samples(columns, whole, block.time, clock))
         cut = [
             Damage(Cause.MESSAGES_DAMAGED, topic, lost=count)
             for topic, count in broken.items()
@@ -254,25 +252,21 @@ class RosRecording(Recording):
         samples = {name: _joined(rows) for name, rows in parts.items() if rows}
         return Contents(samples, damage=(*self._container.damage, *cut))
 
-    def _has(self, kind: str, path: str) -> bool:
-        return not missing_fields(self._definitions, kind, (path,))
+    def _missing(self, kind: str, fields: Sequence[str]) -> tuple[str, ...]:
+        return missing_fields(self._definitions, kind, fields)
 
-    def _plan(self, connection: Connection, request: Request) -> tuple[Walk, Clock | None]:
-        """Plan how to reach the wanted fields and the time."""
-        kind = connection.type
-        fields = list(request.fields)
-        try:
-            clock = next((c for c in request.clocks if self._has(kind, c.field)), None)
-            if clock is not None:
-                fields.append(clock.field)
-            elif self._has(kind, _SECONDS):
-                fields += [_SECONDS, _NANOSECONDS]
-            walk = plan(self._definitions, kind, fields, aligned=self._container.aligned)
-        except UnknownFieldError as err:
-            raise RecordingError(
-                self.path, f"{connection.topic}: {err}", "correct the topic map"
-            ) from None
-        return walk, clock
+    def _plan(self, connection: Connection, request: Request) -> tuple[list[str], Clock | None]:
+        """Return the fields to read, those of the time among them, and which one that is."""
+        kind, fields = connection.type, list(request.fields)
+        clock = next((c for c in request.clocks if not self._missing(kind, (c.field,))), None)
+        if clock is not None:
+            fields.append(clock.field)
+        elif not self._missing(kind, (_SECONDS,)):
+            fields += [_SECONDS, _NANOSECONDS]
+        if missing := self._missing(kind, fields):
+            what = f"{connection.topic}: {kind} has no field '{min(missing)}'"
+            raise RecordingError(self.path, what, "correct the topic map")
+        return fields, clock
 
 
 def _samples(
