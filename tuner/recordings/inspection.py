@@ -5,13 +5,16 @@ A recording that was inspected before is answered from the cache, before numpy i
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import to_jsonable_python
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -243,8 +246,8 @@ def _inspect(
     plain = topics is None and not beside.is_file()
     kept = cached("inspection", digest(path), namespace) if cache and plain else None
     if kept is not None and (content := load(kept)) is not None:
-        before = from_json(content)
-        if before is not None:
+        with contextlib.suppress(ValidationError):  # of a damaged cache
+            before = TypeAdapter(Inspection).validate_json(content)
             return dataclasses.replace(before, path=str(path))
     from tuner.recordings.inspector import examine  # noqa: PLC0415 (loads numpy and the readers)
 
@@ -277,30 +280,8 @@ def as_json(
         ],
         "errors": [str(error) for error in errors],
     }
-    from pydantic_core import to_jsonable_python  # noqa: PLC0415 (not to answer from the cache)
-
     content = to_jsonable_python(content, inf_nan_mode="null")
     return json.dumps(content, indent=2, allow_nan=False)
-
-
-def from_json(content: bytes) -> Inspection | None:
-    """Return an inspection that was kept as JSON; None if it is damaged."""
-    try:
-        raw = json.loads(content)
-        lists: dict[str, Callable[[Any], object]] = {
-            "topics": lambda t: TopicReport(**t | {"signals": tuple(t["signals"])}),
-            "signals": lambda s: SignalReport(**s | {"columns": tuple(s["columns"])}),
-            "missions": lambda m: MissionReport(**m | {"height": tuple(m["height"])}),
-            "inlets": lambda i: Inlet(i["name"], tuple(i["missing"])),
-            "coefficients": lambda c: Informed(**c),
-            "notes": Note.read,
-            "damage": Damage.read,
-        }
-        parts = {name: tuple(map(read, raw[name])) for name, read in lists.items()}
-        battery = tuple(raw["battery"]) if raw["battery"] else None
-        return Inspection(**raw | parts | {"battery": battery})
-    except (ValueError, TypeError, KeyError):
-        return None
 
 
 def render(

@@ -12,24 +12,24 @@ import io
 import json
 import logging
 import math
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter
 
 from tuner.core.disk import exists, readable
 from tuner.core.errors import RecordingError
 from tuner.recordings.cache import cached, digest, load, store
 from tuner.recordings.clocks import Grid, clock_of
 from tuner.recordings.content import Content, ReadOptions, Signals, read_content, read_signals
-from tuner.recordings.flight import SIGNALS, Array, Flight, InitialState, Series
+from tuner.recordings.flight import SIGNALS, Array, Flight, Series
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.interpolation import longest_gap, resample, runs, without_gaps
 from tuner.recordings.missions import IDLE, stretches, yaw_spin
-from tuner.recordings.notes import Damage, Note, NoteCode
+from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.sources import require_pose
 from tuner.recordings.states import initial_state
 from tuner.recordings.topics import TopicMap
@@ -41,7 +41,6 @@ BEFORE = 2.0
 AFTER = 0.2
 #: Longer missions, on the uniform clock, come of broken stamps.
 MOST_TICKS = 2_000_000
-_PLAIN = ("name", "path", "sha256", "rate", "yaw_rate_setpoint", "level_held", "trajectory")
 
 logger = logging.getLogger(__name__)
 
@@ -227,23 +226,16 @@ def load_flight(
 
 def to_npz(flights: Sequence[Flight]) -> bytes:
     """Return flights as the bytes of an ``.npz`` file: their arrays, and the rest as JSON."""
-    about, arrays = [], dict[str, Any]()
-    for number, flight in enumerate(flights):
-        known: dict[str, Any] = {name: getattr(flight, name) for name in _PLAIN}
-        for name in ("notes", "damage"):
-            known[name] = [dataclasses.asdict(each) for each in getattr(flight, name)]
-        about.append(known)
-        groups = {
-            "time": {"": flight.time},
-            "signals": flight.signals,
-            "stamps": {name: series.time for name, series in flight.series.items()},
-            "series": {name: series.values for name, series in flight.series.items()},
-            "initial": vars(flight.initial),
-        }
-        for group, held in groups.items():
-            arrays |= {f"{number} {group} {name}": values for name, values in held.items()}
-    sink = io.BytesIO()
-    np.savez(sink, about=np.frombuffer(json.dumps(about).encode(), np.uint8), **arrays)
+    arrays: list[Array] = []
+
+    def plain(value: object) -> dict[str, Any]:
+        if not isinstance(value, np.ndarray):
+            return vars(value)
+        arrays.append(value)
+        return {"array": len(arrays) - 1}
+
+    about, sink = json.dumps(flights, default=plain), io.BytesIO()
+    np.savez(sink, *arrays, about=np.frombuffer(about.encode(), np.uint8))
     return sink.getvalue()
 
 
@@ -251,28 +243,16 @@ def from_npz(content: bytes) -> tuple[Flight, ...] | None:
     """Return the flights that `to_npz` made bytes of; None if they are damaged."""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        flights = []
-        for number, known in enumerate(json.loads(arrays.pop("about").tobytes())):
-            groups: dict[str, dict[str, Array]] = defaultdict(dict)
-            for key, values in arrays.items():
-                of, group, name = key.split(" ")
-                if int(of) == number:
-                    groups[group][name] = values
-            stamps = groups["stamps"]
-            parts = {
-                "notes": tuple(map(Note.read, known["notes"])),
-                "damage": tuple(map(Damage.read, known["damage"])),
-                "time": groups["time"][""],
-                "signals": groups["signals"],
-                "series": {n: Series(stamps[n], v) for n, v in groups["series"].items()},
-                "initial": InitialState(**groups["initial"]),
-            }
-            flights.append(Flight(**known | parts))
+
+            def restored(held: dict[str, Any]) -> object:
+                return file[f"arr_{held['array']}"] if set(held) == {"array"} else held
+
+            known = json.loads(file["about"].tobytes(), object_hook=restored)
+        config = ConfigDict(arbitrary_types_allowed=True)
+        return TypeAdapter(tuple[Flight, ...], config=config).validate_python(known)
     except Exception as err:  # a damaged cache is read anew, whatever is wrong with it
         logger.info("a cached flight is damaged: %s", err)
         return None
-    return tuple(flights)
 
 
 #: What a recording must hold.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 from tuner.core.phrases import Worded, listed
 
@@ -214,11 +214,6 @@ class Note:
     numbers: Mapping[str, float] = field(default_factory=dict)
     names: tuple[str, ...] = ()
 
-    @classmethod
-    def read(cls, raw: Mapping[str, Any]) -> Note:
-        """Return the note of what `dataclasses.asdict` made of one."""
-        return cls(**{**raw, "code": NoteCode(raw["code"]), "names": tuple(raw["names"])})
-
 
 class Cause(Worded):
     """How a recording is broken.
@@ -283,11 +278,6 @@ class Damage:
         start = None if self.start is None else self.start + seconds
         end = None if self.end is None else self.end + seconds
         return replace(self, start=start, end=end)
-
-    @classmethod
-    def read(cls, raw: Mapping[str, Any]) -> Damage:
-        """Return the damage of what `dataclasses.asdict` made of one."""
-        return cls(**{**raw, "cause": Cause(raw["cause"])})
 
 
 PASSED_OVER = (NoteCode.LAYOUT_UNKNOWN, NoteCode.FIELD_MISSING)

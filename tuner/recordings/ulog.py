@@ -11,12 +11,10 @@ from __future__ import annotations
 
 import contextlib
 import io
-import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +38,8 @@ from tuner.recordings.recording import (
 LONGEST_MESSAGE = 65_535
 #: What a log begins with.
 MAGIC = b"ULog\x01\x12\x35"
+#: Bytes before its first message.
+HEADER = 16
 #: Logs are read into memory; PX4 writes some 10 MB a minute.
 LARGEST = 4 << 30
 #: Bytes that are looked through at once.
@@ -71,8 +71,8 @@ class ULogRecording(Recording):
         self.path = path
         if path.stat().st_size > LARGEST:
             raise RecordingError(path, "is larger than any log of a flight", "cut it")
-        self._formats, self.parameters, start = _definitions(path)
-        counts, ids, self._behind = _count(path, start)
+        self._formats, self.parameters = _definitions(path)
+        counts, ids, self._behind = _count(path)
         self.topics = tuple(
             sorted(
                 (Topic(name, ids[number], count) for number, (name, count) in counts.items()),
@@ -144,10 +144,10 @@ class ULogRecording(Recording):
         return Samples(receive, stamp, fields)
 
 
-def _blocks(path: Path, at: int) -> Iterator[tuple[bytes, list[int]]]:
+def _blocks(path: Path) -> Iterator[tuple[bytes, list[int]]]:
     """Yield blocks of a log, each with where its whole messages begin, and the end of the last."""
     with path.open("rb") as stream:
-        stream.seek(at)
+        stream.seek(HEADER)
         rest = b""
         while block := stream.read(READ_AT_ONCE):
             buffer, places, here = rest + block, [0], 0
@@ -162,33 +162,21 @@ def _blocks(path: Path, at: int) -> Iterator[tuple[bytes, list[int]]]:
                 yield buffer, places
 
 
-def _definitions(path: Path) -> tuple[Formats, dict[str, float], int]:
-    """Return formats and parameters of a log, and where its data begin; formats are checked."""
+def _definitions(path: Path) -> tuple[Formats, dict[str, float]]:
+    """Return formats and parameters of a log; formats are checked."""
     with path.open("rb") as stream:
-        if not stream.read(16).startswith(MAGIC) or stream.tell() < 16:
+        if len(start := stream.read(HEADER)) < HEADER or not start.startswith(MAGIC):
             raise RecordingError(path, "is no PX4 log", "give the .ulg file itself")
-    formats: Formats = {}
-    parameters: dict[str, float] = {}
-    start = 16
-    blocks = ((buffer, pair) for buffer, at in _blocks(path, start) for pair in pairwise(at))
-    for buffer, (begin, behind) in blocks:
-        kind, content = buffer[begin + 2], buffer[begin + 3 : behind]
-        if kind in b"ALCD":
-            break
-        start += 3 + len(content)
-        if kind == ord("F"):
-            name, _, fields = content.decode(errors="replace").partition(":")
-            parts = re.findall(r"([\w/]+)(?:\[(\d{1,6})\])? (\w+);", fields)
-            formats[name] = [(what, int(count or 1), field) for what, count, field in parts]
-        elif kind == ord("P") and content:
-            word, _, name = content[1 : 1 + content[0]].decode(errors="replace").partition(" ")
-            form = {"float": "<f", "int32_t": "<i"}.get(word)
-            if form is not None and len(content) == 1 + content[0] + 4:
-                parameters[name] = float(struct.unpack_from(form, content, 1 + content[0])[0])
+    log, _ = _parse(path, [], header_only=True)
+    formats: Formats = {
+        name: [(what, max(count, 1), field) for what, count, field in known.fields]
+        for name, known in log.message_formats.items()
+    }
     for name in formats:
         if _size(formats, name, 0) > LONGEST_MESSAGE:
             raise RecordingError(path, f"the format of {name} is absurd", "record it again")
-    return formats, parameters, start
+    values = log.initial_parameters.items()
+    return formats, {name: float(of) for name, of in values if isinstance(of, int | float)}
 
 
 def parameters_of(path: Path) -> dict[str, float]:
@@ -222,13 +210,13 @@ def _size(formats: Formats, name: str, depth: int) -> int:
     return total
 
 
-def _count(path: Path, start: int) -> tuple[dict[int, tuple[str, int]], dict[int, str], int]:
+def _count(path: Path) -> tuple[dict[int, tuple[str, int]], dict[int, str], int]:
     """Count the messages of each subscription, and the bytes behind the last whole record."""
     names: dict[int, str] = {}
     kinds: dict[int, str] = {}
     counts: Counter[int] = Counter()
-    reached = start
-    for buffer, places in _blocks(path, start):
+    reached = HEADER
+    for buffer, places in _blocks(path):
         content = np.frombuffer(buffer, dtype=np.uint8)
         at = np.array(places[:-1], dtype=np.int64)
         kind, size = content[at + 2], np.diff(places) - 3
@@ -247,14 +235,15 @@ def _count(path: Path, start: int) -> tuple[dict[int, tuple[str, int]], dict[int
     return counted, kinds, path.stat().st_size - reached
 
 
-def _parse(path: Path, names: list[str]) -> tuple[Any, str]:
+def _parse(path: Path, names: list[str], *, header_only: bool = False) -> tuple[Any, str]:
     """Parse a log with pyulog, which prints what it finds wrong."""
     from pyulog import ULog  # noqa: PLC0415 (slow to import)
 
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed):
-            return ULog(str(path), names), printed.getvalue()
+            log = ULog(str(path), names, parse_header_only=header_only)
+        return log, printed.getvalue()
     except Exception as err:  # pyulog's own and whatever a hostile log makes of it
         what = f"is no readable PX4 log ({reason_of(err)})"
         raise RecordingError(path, what, "record it again") from None

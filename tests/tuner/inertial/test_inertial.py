@@ -18,7 +18,7 @@ from tuner.inertial.signals import stretches_of
 from tuner.job.ground import least_noticed, vehicle_of
 from tuner.job.without_pose import fit_without_pose
 from tuner.options import SimulationOptions
-from tuner.recordings import inspect_recordings
+from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.result import BEST_FIT_FILE

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from tests.tuner.recordings import making
-from tuner.recordings import Flight, load_flight
 from tuner.recordings import loader as loading
 from tuner.recordings.cache import digest, own_folder
 from tuner.recordings.content import ReadOptions
+from tuner.recordings.flight import Flight
+from tuner.recordings.loader import load_flight
 
 
 @pytest.fixture
@@ -98,7 +99,7 @@ def test_unwritable_cache_is_no_error(bag: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_concurrent_runs_agree(bag: Path) -> None:
     code = (
-        "import sys; from tuner.recordings import load_flight; "
+        "import sys; from tuner.recordings.loader import load_flight; "
         "f = load_flight(sys.argv[1]); print(f.signals['position'].sum().hex(), len(f.time))"
     )
     runs = [

@@ -7,9 +7,9 @@ import pytest
 
 from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
-from tuner.recordings import inspect_recordings
 from tuner.recordings.defects import clean, is_stale, without_stale
 from tuner.recordings.flight import Series
+from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
 from tuner.recordings.missions import find_missions
 from tuner.recordings.notes import NoteCode

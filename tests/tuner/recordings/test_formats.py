@@ -10,8 +10,9 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from tests.tuner.recordings import making
 from tuner.core.errors import RecordingError
-from tuner.recordings import Flight, load_flight
+from tuner.recordings.flight import Flight
 from tuner.recordings.formats import open_recording
+from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause
 from tuner.recordings.recording import Request
 

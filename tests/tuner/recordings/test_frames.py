@@ -17,9 +17,9 @@ from tuner.cli import main
 from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
-from tuner.recordings import inspect_recordings
 from tuner.recordings.flight import Series
 from tuner.recordings.frames import contradiction, correct_frames, noted_contradiction
+from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
 from tuner.search.job_flights import load_flights, read_usable

@@ -22,7 +22,8 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from tests.tuner.recordings import fuzz, making
 from tuner.core.errors import InputError
-from tuner.recordings import inspect_recordings, load_flight
+from tuner.recordings.inspection import inspect_recordings
+from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause, NoteCode
 from tuner.recordings.ros.container import Chunk, DamagedError, FileBytes, read_wanted, unpack, zstd
 from tuner.recordings.ros.messages import Definitions, missing_fields

@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tuner.core.errors import RecordingError
-from tuner.recordings import load_flight
 from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import GAP, without_gaps
-from tuner.recordings.loader import gaps_in
+from tuner.recordings.loader import gaps_in, load_flight
 from tuner.recordings.topics import load_topic_map
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 from tests.tuner.recordings.micro_sd import log_of, write_micro_sd
 from tuner.core.errors import RecordingError
-from tuner.recordings import inspect_recordings, load_flight
 from tuner.recordings.formats import open_recording
+from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.interpolation import body_rate_of, correlation, smooth
+from tuner.recordings.loader import load_flight
 from tuner.recordings.micro_sd import MicroSdRecording
 from tuner.recordings.notes import Cause
 from tuner.recordings.recording import Request

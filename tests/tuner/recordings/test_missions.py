@@ -10,8 +10,8 @@ import pytest
 from tests.tuner.recordings import making
 from tuner.config import Options, settle
 from tuner.findings.findings import Code
-from tuner.recordings import inspect_recordings
 from tuner.recordings.flight import Series
+from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import (
     FITTED,
     PIECE,

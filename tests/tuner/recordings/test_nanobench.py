@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from tuner.core.shipped import find_config
-from tuner.recordings import Flight, inspect_recordings, load_flight
+from tuner.recordings.flight import Flight
+from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.interpolation import body_rate_of, correlation, smooth
+from tuner.recordings.loader import load_flight
 from tuner.vehicle import read_vehicle
 
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", Path(__file__).parents[4] / "shared" / "flights"))

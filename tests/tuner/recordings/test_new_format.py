@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from tests.tuner.recordings import making
-from tuner.recordings import formats, inspect_recordings, load_flight
+from tuner.recordings import formats
+from tuner.recordings.inspection import inspect_recordings
+from tuner.recordings.loader import load_flight
 
 MODULE = '''
 """NumPy's structured arrays as recordings."""

@@ -13,7 +13,9 @@ from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
 from tuner.job.recording_verdict import Verdict, in_words, verdict_of
-from tuner.recordings import Flight, inspect_recordings, load_flight
+from tuner.recordings.flight import Flight
+from tuner.recordings.inspection import inspect_recordings
+from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import advice_of, settings_in_words
 from tuner.search.job_flights import as_logged, read_usable

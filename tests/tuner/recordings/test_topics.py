@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from tests.tuner.recordings import making
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.shipped import configs_folder
-from tuner.recordings import SIGNALS, load_flight
+from tuner.recordings.flight import SIGNALS
+from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode, note_in_words
 from tuner.recordings.topics import load_topic_map, read_sidecar, shipped_maps
 from tuner.recordings.unit_detection import UNITS, to_enu_flu

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.tuner.recordings import making
-from tuner.recordings import load_flight
 from tuner.recordings.flight import Array, Flight
+from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.unit_detection import Scale, Stamped, scale_of, scales_of, to_enu_flu, unit_of
 

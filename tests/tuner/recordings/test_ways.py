@@ -17,10 +17,9 @@ from tuner.config import Options, settle
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.findings.findings import one_line
 from tuner.objective.rotor_signals import levers, order_findings
-from tuner.recordings import Flight, load_flight
-from tuner.recordings.flight import Series
+from tuner.recordings.flight import Flight, Series
 from tuner.recordings.inspector import suggested_map
-from tuner.recordings.loader import read_inertial
+from tuner.recordings.loader import load_flight, read_inertial
 from tuner.recordings.matlab import MAGIC
 from tuner.recordings.notes import NoteCode, note_in_words
 from tuner.search.job_flights import read_usable

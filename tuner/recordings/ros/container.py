@@ -315,8 +315,9 @@ def read_wanted(
         The bytes read, and the wanted entries with their offsets in them.
     """
     kept = {number: entry for number, entry in entries.items() if number in wanted}
-    starts = np.unique(np.concatenate([offset for _, offset in kept.values()] or [[]])).astype(int)
-    if len(starts) == 0 or starts[0] < 0 or starts[-1] >= chunk.length:
+    offsets = [offset for _, offset in kept.values() if len(offset)]
+    starts = np.unique(np.concatenate(offsets)) if offsets else np.zeros(0, dtype=np.int64)
+    if not offsets or starts[0] < 0 or starts[-1] >= chunk.length:
         raise DamagedError("an index points nowhere")
     bounds = np.unique(np.concatenate([offset for _, offset in entries.values()]))
     bounds = np.append(bounds[bounds < chunk.length], chunk.length)

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 import anyio.to_thread
 from fastapi import APIRouter, Form, Query, Request
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from starlette.datastructures import FormData
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
@@ -75,8 +75,8 @@ def environment() -> Environment:
         "lasting": _lasting,
         "flight": flight_name,
         "web": on_the_web,
-        "note": lambda raw: note_in_words(Note.read(raw)),
-        "damage": lambda raw: damage_sentence(Damage.read(raw)),
+        "note": lambda raw: note_in_words(TypeAdapter(Note).validate_python(raw)),
+        "damage": lambda raw: damage_sentence(TypeAdapter(Damage).validate_python(raw)),
     }
     made.filters |= filters
     made.globals |= {"states": STATES, "visitor": VISITOR.get}
