@@ -21,7 +21,7 @@ from tuner.recordings.sources import (
     Place,
     choose_map,
     locate,
-    require_pose,
+    pose_error,
     unread,
     with_guesses,
 )
@@ -135,6 +135,8 @@ class Signals:
         What was dropped, repaired or doubted.
     damage
         What the file has lost, with times as those of ``series``.
+    no_pose
+        Why they hold no pose, where they do not.
     """
 
     recording: Recording
@@ -145,6 +147,7 @@ class Signals:
     series: Mapping[str, Series]
     notes: tuple[Note, ...]
     damage: tuple[Damage, ...]
+    no_pose: RecordingError | None
 
 
 @dataclass(frozen=True)
@@ -154,20 +157,18 @@ class Content(Signals):
     missions: tuple[Mission, ...]
 
 
-def read_signals(options: ReadOptions, *, with_pose: bool) -> Signals:
+def read_signals(options: ReadOptions) -> Signals:
     """Read and clean all signals that a topic map finds in a recording.
 
     Parameters
     ----------
     options
         Which recording, and how it is to be read.
-    with_pose
-        Whether a recording without a pose is an error.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or holds no pose though one is asked for.
+        The file cannot be read.
     """
     path, given, sidecar = options.path, options.given, options.sidecar
     recording = open_recording(path, given.messages if given is not None else ())
@@ -185,8 +186,7 @@ def read_signals(options: ReadOptions, *, with_pose: bool) -> Signals:
     if given is None:
         chosen, taken = with_guesses(recording, chosen)
     places, passed_over = locate(recording, chosen, strict=given is not None)
-    if with_pose:
-        require_pose(recording, chosen, places, given=given is not None)
+    no_pose = pose_error(recording, chosen, places, given=given is not None)
     raw, contents, noticed = extract(recording, places, chosen.time)
     of_map = None if given is None else given.motor_order
     of_log = motor_order_of(recording.parameters)
@@ -209,12 +209,16 @@ def read_signals(options: ReadOptions, *, with_pose: bool) -> Signals:
             raw[name] = replace(raw[name], values=raw[name].values[:, columns])
         names = (order_in_words([column + 1 for column in columns]),)
         notes.append(Note(NoteCode.MOTOR_ORDER_GIVEN, "info", names=names))
-    series, epoch, dropped = _clean(path, raw, with_pose=with_pose)
+    series, epoch, dropped = _clean(raw)
     topics = {signal: data.topic for signal, data in raw.items()}
     damage = tuple(part.later(_late(raw, contents, epoch)) for part in contents.damage)
     notes += dropped
+    for needed in ("position", "attitude"):
+        if no_pose is None and needed not in series:
+            where = f" in {topics[needed]}" if topics.get(needed) else ""
+            no_pose = RecordingError(path, f"no usable {needed}{where}", "inspect the recording")
     return Signals(
-        recording, chosen, places, contents.samples, topics, series, tuple(notes), damage
+        recording, chosen, places, contents.samples, topics, series, tuple(notes), damage, no_pose
     )
 
 
@@ -240,19 +244,27 @@ def _late(raw: Mapping[str, Raw], contents: Contents, epoch: int) -> float:
 
 
 def read_content(options: ReadOptions) -> Content:
-    """Read a recording up to its missions.
+    """Read a recording up to its missions; see `read_signals` and `content_of`."""
+    return content_of(read_signals(options), options.sidecar)
+
+
+def content_of(signals: Signals, sidecar: Sidecar) -> Content:
+    """Return the signals of a recording on one clock and in one frame, and its missions.
 
     Parameters
     ----------
-    options
-        Which recording, and how it is to be read.
+    signals
+        Of the recording.
+    sidecar
+        What the file beside it states.
 
     Raises
     ------
     RecordingError
-        The file cannot be read or holds no pose.
+        They hold no pose.
     """
-    sidecar, signals = options.sidecar, read_signals(options, with_pose=True)
+    if signals.no_pose is not None:
+        raise signals.no_pose
     topics = signals.topics
     series, shifted = align_pose(signals.series, topics)
     series, turned = correct_frames(series, topics)
@@ -278,9 +290,7 @@ def _quickened(raw: dict[str, Raw]) -> tuple[dict[str, Raw], list[Note]]:
     return quick, [Note(NoteCode.TIME_READ, count=len(next(iter(raw.values())).time))]
 
 
-def _clean(
-    path: Path, raw: Mapping[str, Raw], *, with_pose: bool
-) -> tuple[dict[str, Series], int, list[Note]]:
+def _clean(raw: Mapping[str, Raw]) -> tuple[dict[str, Series], int, list[Note]]:
     first = [raw["position"]] if "position" in raw else list(raw.values())
     epoch = min((int(data.time.min()) for data in first), default=0)
     series, units = {}, list[Note]()
@@ -300,10 +310,6 @@ def _clean(
             notes[alike] = replace(note, names=(*before, *note.names))
         if len(time):
             series[signal] = Series(time, values)
-    for needed in ("position", "attitude") if with_pose else ():
-        if needed not in series:
-            where = f" in {raw[needed].topic}" if needed in raw and raw[needed].topic else ""
-            raise RecordingError(path, f"no usable {needed}{where}", "inspect the recording")
     return series, epoch, [*units, *notes.values()]
 
 
@@ -422,7 +428,7 @@ def _unit(
         return unit_by_range(signal, recorded.values, place.unit)
     epoch = int(recorded.time[0])
     where = None if position is None else position.stamped(epoch)
-    must = signal == "attitude"
+    must = signal == "attitude" and position is not None  # else no flight is made of it
     return unit_of_angles(recording.path, recorded.stamped(epoch), where, must=must)
 
 

@@ -23,6 +23,7 @@ from tuner.recordings.content import (
     Content,
     ReadOptions,
     Signals,
+    content_of,
     read_content,
     read_signals,
 )
@@ -39,7 +40,7 @@ from tuner.recordings.inspection import (
     TopicReport,
 )
 from tuner.recordings.interpolation import RATE, derivative, resample, smooth, upward
-from tuner.recordings.loader import flying, is_inertial, keep_flights, obstacle
+from tuner.recordings.loader import flights_of, flying, is_inertial, obstacle
 from tuner.recordings.missions import yaw_spin
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.recording import Samples, Topic
@@ -88,12 +89,11 @@ def examine(
     options = ReadOptions.of(path, topics, namespace)
     with readable(path):
         try:
-            content = read_content(options)
+            signals = read_signals(options)
+            if is_inertial(signals):
+                return _without_pose(signals)
+            content = content_of(signals, options.sidecar)
         except RecordingError as err:
-            with contextlib.suppress(RecordingError):
-                signals = read_signals(options, with_pose=False)
-                if is_inertial(signals):
-                    return _without_pose(signals)
             # Its topics are listed nevertheless, so that the user sees what to map.
             messages = options.given.messages if options.given else ()
             recording = open_recording(path, messages)
@@ -108,8 +108,9 @@ def examine(
                 topics=tuple(_topic(topic, None, ()) for topic in recording.topics),
                 inlets=inlets({}, trajectory=False),
             )
-    if keep and content.missions:
-        keep_flights(content, options)
+    if keep:
+        with contextlib.suppress(RecordingError):
+            flights_of(content, options, keep=True)
     return _with_flight(content, options.sidecar)
 
 

@@ -24,13 +24,19 @@ from tuner.core.disk import exists, readable
 from tuner.core.errors import RecordingError
 from tuner.recordings.cache import cached, digest, load, store
 from tuner.recordings.clocks import Grid, clock_of
-from tuner.recordings.content import Content, ReadOptions, Signals, read_content, read_signals
+from tuner.recordings.content import (
+    Content,
+    ReadOptions,
+    Signals,
+    content_of,
+    read_content,
+    read_signals,
+)
 from tuner.recordings.flight import SIGNALS, Array, Flight, Series
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.interpolation import longest_gap, resample, runs, without_gaps
 from tuner.recordings.missions import IDLE, stretches, yaw_spin
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.sources import require_pose
 from tuner.recordings.states import initial_state
 from tuner.recordings.topics import TopicMap
 from tuner.recordings.unit_detection import FASTEST_TURN
@@ -143,14 +149,10 @@ def load_flights(
     path = Path(path)
     if not exists(path):
         raise RecordingError(path, "no such file", "check the path")
-    options, kept = ReadOptions.of(path, topics, namespace, rate), None
-    if cache:
-        kept = _kept(options)
-        before = load(kept)
-        flights = from_npz(before) if before is not None else None
-        if flights is not None:
-            # The same content may lie elsewhere now.
-            return tuple(dataclasses.replace(flight, path=str(path)) for flight in flights)
+    options = ReadOptions.of(path, topics, namespace, rate)
+    if cache and (flights := from_npz(load(_kept(options)))) is not None:
+        # The same content may lie elsewhere now.
+        return tuple(dataclasses.replace(flight, path=str(path)) for flight in flights)
     with readable(path):
         content = read_content(options)
     if not content.missions:
@@ -159,27 +161,29 @@ def load_flights(
             "nothing flies in it: no mission was found",
             "inspect it, or give 'start' and 'end' in a side-car",
         )
-    flights = _flights_of(content, options)
-    if kept is not None:
-        store(kept, to_npz(flights))
-    return flights
+    return flights_of(content, options, keep=cache)
 
 
-def _flights_of(content: Content, options: ReadOptions) -> tuple[Flight, ...]:
-    sha256, missions = digest(options.path), range(len(content.missions))
-    return tuple(make_flight(content, options, i, sha256=sha256) for i in missions)
-
-
-def keep_flights(content: Content, options: ReadOptions) -> None:
-    """Keep the flights of a recording that was read to be inspected: a long one takes a while.
+def flights_of(content: Content, options: ReadOptions, *, keep: bool) -> tuple[Flight, ...]:
+    """Return the flights of a recording, whatever it was read for.
 
     Parameters
     ----------
     content, options
         What it holds, and how it was read.
+    keep
+        Whether they are kept in the user's cache: a long recording takes a while.
+
+    Raises
+    ------
+    RecordingError
+        A mission is shorter than two ticks, or longer than any.
     """
-    with contextlib.suppress(RecordingError):
-        store(_kept(options), to_npz(_flights_of(content, options)))
+    sha256, missions = digest(options.path), range(len(content.missions))
+    flights = tuple(make_flight(content, options, i, sha256=sha256) for i in missions)
+    if keep and flights:
+        store(_kept(options), to_npz(flights))
+    return flights
 
 
 def load_flight(
@@ -239,8 +243,10 @@ def to_npz(flights: Sequence[Flight]) -> bytes:
     return sink.getvalue()
 
 
-def from_npz(content: bytes) -> tuple[Flight, ...] | None:
-    """Return the flights that `to_npz` made bytes of; None if they are damaged."""
+def from_npz(content: bytes | None) -> tuple[Flight, ...] | None:
+    """Return the flights that `to_npz` made bytes of; None if there are none, or damaged ones."""
+    if content is None:
+        return None
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as file:
 
@@ -341,7 +347,7 @@ def obstacle(signals: Signals, flown: tuple[tuple[float, float], ...]) -> Record
 def read_inertial(
     path: Path, *, topics: str | Path | None = None, namespace: str = ""
 ) -> InertialFlight | None:
-    """Read a recording that holds no pose; None of one that does, or whose samples are corrupt.
+    """Read a recording that holds no pose; None of one that does, whose flights are kept.
 
     Raises
     ------
@@ -351,17 +357,16 @@ def read_inertial(
     ConfigError
         The topic map or the side-car is wrong.
     """
-    with contextlib.suppress(RecordingError):  # a fit reads them next, from the cache
-        load_flights(path, topics=topics, namespace=namespace)
-        return None
     options = ReadOptions.of(path, topics, namespace)
     with readable(path):
-        signals = read_signals(options, with_pose=False)
-    if not is_inertial(signals):
-        require_pose(
-            signals.recording, signals.topic_map, signals.places, given=options.given is not None
-        )
-        return None
+        if from_npz(load(_kept(options))) is not None:
+            return None
+        signals = read_signals(options)
+        if not is_inertial(signals):
+            content = content_of(signals, options.sidecar)
+            with contextlib.suppress(RecordingError):  # a fit says it next
+                flights_of(content, options, keep=True)
+            return None
     runs = flying(signals)
     if (error := obstacle(signals, runs)) is not None:
         raise error

@@ -434,24 +434,25 @@ def _obstacle(recording: Recording, topics: TopicMap, what: str, *, given: bool)
     )
 
 
-def _require_definitions(recording: Recording, signals: Iterable[str]) -> None:
-    """Raise if topics would hold some signals, but the definitions of their types are missing."""
+def _without_definition(recording: Recording, signals: Iterable[str]) -> RecordingError | None:
+    """Return the error of topics that hold some signals, if their types are defined nowhere."""
     for topic in recording.topics:
         holds = topic.count and any(recording.usual(topic.name, signal) for signal in signals)
         if holds and recording.undefined(topic.name) is not None:
-            raise RecordingError(
+            return RecordingError(
                 recording.path,
                 f"holds {topic.name}, but not the definition of its type {topic.type}, which "
                 "databases of ROS 2 Humble and before do not",
                 "name the folder of its package's .msg files under 'messages' in a topic map "
                 "(extends: px4_ros2), or convert the recording to MCAP",
             )
+    return None
 
 
-def require_pose(
+def pose_error(
     recording: Recording, topics: TopicMap, places: Mapping[str, Place], *, given: bool = False
-) -> None:
-    """Raise a `RecordingError` with the nearest topic names if a pose is missing.
+) -> RecordingError | None:
+    """Return why no pose was found, with the nearest topic names; None where one was.
 
     Parameters
     ----------
@@ -462,21 +463,24 @@ def require_pose(
     """
     missing = [signal for signal in ("position", "attitude") if signal not in places]
     if not missing:
-        return
+        return None
     what = " and ".join(missing)
     if is_tabular(recording.format):
-        raise RecordingError(recording.path, *_obstacle(recording, topics, what, given=given))
+        return RecordingError(recording.path, *_obstacle(recording, topics, what, given=given))
     sources = [source for signal in missing for source in topics.signals.get(signal, ())]
     if not sources:
-        raise RecordingError(
-            recording.path, f"the topic map '{topics.name}' names no topic for {what}", "add one"
-        )
-    _require_definitions(recording, missing)
-    names = [topic.name for topic in recording.topics if topic.count]
+        named = f"the topic map '{topics.name}' names no topic for {what}"
+        return RecordingError(recording.path, named, "add one")
+    return _without_definition(recording, missing) or _no_topic(recording, what, sources)
+
+
+def _no_topic(recording: Recording, what: str, sources: Sequence[Source]) -> RecordingError:
+    """Return the error that no topic holds a pose, with the nearest names."""
+    path, names = recording.path, [topic.name for topic in recording.topics if topic.count]
     if all(source.topic == "*" for source in sources):
         held = [field for name in names for field in recording.fields(name)]
-        raise RecordingError(
-            recording.path,
+        return RecordingError(
+            path,
             f"holds no {what}, only {', '.join(held[:12]) or 'nothing'}",
             "log the vehicle's estimate of it, or motion capture; body rate, acceleration and "
             "motor commands are fitted without one, by themselves (tune --flights)",
@@ -485,15 +489,13 @@ def require_pose(
     for topic in wanted:
         for name in names:
             if name.endswith(topic) and name != topic:
-                raise RecordingError(
-                    recording.path,
-                    f"no topic {topic}; found {name}",
-                    f"use --namespace {name[: -len(topic)].strip('/')}",
-                )
+                prefix = name[: -len(topic)].strip("/")
+                found = f"no topic {topic}; found {name}"
+                return RecordingError(path, found, f"use --namespace {prefix}")
     near = [n for topic in wanted for n in difflib.get_close_matches(topic, names, n=2, cutoff=0.6)]
     listed = ", ".join(dict.fromkeys(near)) if near else ", ".join(names[:12]) or "nothing at all"
-    raise RecordingError(
-        recording.path,
+    return RecordingError(
+        path,
         f"no topic {' or '.join(wanted[:4])} for {what}; "
         f"{'similar are' if near else 'it holds'} {listed}",
         "name the right one in a topic map (--topics FILE)",
