@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Mapping
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -288,18 +289,9 @@ def _whole(column: pyarrow.ChunkedArray, numbers: Array, unit: int) -> Nanosecon
     result[known] = np.rint(numbers[known] * unit)
     if is_text(column) and known.any() and np.abs(numbers[known]).max() > 1e6:
         # A float has some 16 digits, too few for nanoseconds since 1970.
-        try:
-            text = compute.utf8_trim_whitespace(column.combine_chunks())
-            parts = compute.split_pattern(text, ".", max_splits=1)
-            whole = compute.list_element(parts, 0)
-            start = np.from_dlpack(compute.cast(whole, int64()))
-        except ArrowInvalid:
-            return result
-        rest = np.zeros(len(numbers))
-        for i, cell in enumerate(text.to_pylist()):
-            rest[i] = _number(f"0.{cell.partition('.')[2]}") if "." in cell else 0.0
-        exact = known & np.isfinite(rest) & (start >= 0)
-        result[exact] = start[exact] * unit + np.rint(rest[exact] * unit).astype(np.int64)
+        cells = column.to_pylist()
+        for row in np.flatnonzero(known):
+            result[row] = round(Decimal(cells[row].strip()) * unit)
     return result
 
 

@@ -81,6 +81,7 @@ TIMES = {
     "milliseconds since 1970": lambda t: [str((v + EPOCH) // 10**6) for v in t],
     "microseconds since 1970": lambda t: [str((v + EPOCH) // 10**3) for v in t],
     "nanoseconds since 1970": lambda t: [str(v + EPOCH) for v in t],
+    "microseconds as np.savetxt writes them": lambda t: [f"{v / 1e3:.18e}" for v in t],
     "2026-04-02T14:13:00.123Z": stamps("{date}T{time}Z"),
     "2026-04-02 14:13:00.123": stamps("{date} {time}"),
     "2026/04/02 14:13:00,123": lambda t: [
