@@ -37,14 +37,14 @@ from tuner.ground.rig_data import (
     read_columns,
     steady_flight,
 )
-from tuner.ground.stands import rpm_curve, thrust_stand, torque_stand
+from tuner.ground.stands import THRUST, TORQUE, rpm_curve, stand
 from tuner.ground.step_response import step_response
 from tuner.vehicle import VehicleFile
 
 ATTITUDE = ("qw", "qx", "qy", "qz")
 GYRATION = (0.05, 3.0)
 """Radius of gyration over the rotors' distance from the centre, beyond which units are wrong."""
-THRUST = (0.05, 20.0)
+LIFT = (0.05, 20.0)
 """Largest thrust of all rotors over the weight, beyond which a unit or lever is wrong."""
 
 
@@ -86,9 +86,7 @@ def measure(  # noqa: PLR0911 (one return a kind)
             return _thrust_stand(name, experiment, vehicle, folder)
         case TorqueStand(rotors=rotors, lever_arm=arm, lever_arm_error=error):
             path, samples = _read(folder, experiment.recording, ("rotor_speed", "force"))
-            return torque_stand(
-                name, path, samples, rotors=rotors, lever_arm=arm, lever_arm_error=error
-            )
+            return stand(name, path, samples, TORQUE, rotors=rotors, lever=arm, lever_error=error)
         case RpmCurve(reference_voltage=reference):
             wanted = ("command", "rotor_speed")
             path, samples = _read(folder, experiment.recording, wanted, ("voltage",))
@@ -152,18 +150,19 @@ def _bifilar(name: str, given: Bifilar, vehicle: VehicleFile, folder: Path) -> M
 
 def _thrust_stand(name: str, given: ThrustStand, vehicle: VehicleFile, folder: Path) -> Measurement:
     path, samples = _read(folder, given.recording, ("rotor_speed", "force"))
-    measurement = thrust_stand(
+    measurement = stand(
         name,
         path,
         samples,
+        THRUST,
         rotors=given.rotors,
-        lever_ratio=given.lever_ratio,
-        lever_ratio_error=given.lever_ratio_error,
+        lever=given.lever_ratio,
+        lever_error=given.lever_ratio_error,
     )
     top = float(np.nanquantile(samples["rotor_speed"], 0.95))
     thrust = len(vehicle.rotors) * math.exp(measurement.value[0]) * top**2
     share = thrust / (vehicle.mass * GRAVITY)
-    if not THRUST[0] < share < THRUST[1]:
+    if not LIFT[0] < share < LIFT[1]:
         what = f"gives {thrust:.3g} N of thrust at {top:.0f} rad/s to a vehicle of {vehicle.mass:g}"
         raise RecordingError(path, f"{what} kg", "check the force (N) and the lever ratio")
     return measurement
@@ -223,14 +222,10 @@ def _yaw_spin(name: str, given: YawSpin, vehicle: VehicleFile, folder: Path) -> 
 
 def _propeller(name: str, given: Propeller, folder: Path) -> Measurement:
     if given.table is not None:
-        path = folder / Path(given.table).expanduser()
-        table, where = read_static_table(path), str(path)
-    else:
-        assert given.thrust_coefficient is not None
-        assert given.power_coefficient is not None
-        table = np.array([[0.0, given.thrust_coefficient, given.power_coefficient]])
-        where = name
-    measurement = propeller(
-        name, table, diameter=given.diameter, air_density=given.air_density, path=where
-    )
-    return measurement if given.table is not None else replace(measurement, curves=())
+        table = read_static_table(folder / Path(given.table).expanduser())
+        return propeller(name, table, diameter=given.diameter, air_density=given.air_density)
+    assert given.thrust_coefficient is not None
+    assert given.power_coefficient is not None
+    table = np.array([[0.0, given.thrust_coefficient, given.power_coefficient]])
+    measurement = propeller(name, table, diameter=given.diameter, air_density=given.air_density)
+    return replace(measurement, curves=())

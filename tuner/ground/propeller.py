@@ -69,23 +69,18 @@ def read_static_table(path: Path) -> Array:
     return table
 
 
-def propeller(
-    name: str, table: Array, *, diameter: float, air_density: float, path: str = ""
-) -> Measurement:
+def propeller(name: str, table: Array, *, diameter: float, air_density: float) -> Measurement:
     """Return motor and moment constant of a propeller from (n, 3) RPM, C_T, C_P.
 
     Parameters
     ----------
-    name, path
-        Of the experiment and its table.
+    name
+        Of the experiment.
     table
         One row a speed; the median counts.
     diameter, air_density
         m and kg/m³.
     """
-    if not 0.01 < diameter < 2.0:
-        what = f"a propeller of {diameter:g} m is none of a multirotor"
-        raise RecordingError(path or name, what, "give the diameter in m: 11 inch are 0.2794")
     thrust, power = (float(np.median(table[:, column])) for column in (1, 2))
     values = np.log([
         propeller_motor_constant(thrust, diameter=diameter, density=air_density),

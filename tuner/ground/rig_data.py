@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.ndimage import median_filter
+from scipy.spatial.transform import Rotation
 
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Z95, robust_sd
@@ -396,10 +397,9 @@ def angle_of_attitude(path: str, quaternion: Array, axis: str) -> Array:
     RecordingError
         Another body axis, or none, hangs vertical.
     """
-    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
-    w, x, y, z = (quaternion / np.where(norm > 0.1, norm, np.nan)).T
-    up = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
-    mean = np.nanmean(up, axis=1) if np.isfinite(w).any() else np.zeros(3)
+    known = np.linalg.norm(quaternion, axis=1) > 0.1
+    turned = Rotation.from_quat(quaternion[known], scalar_first=True).as_matrix()
+    mean = turned[:, 2].mean(axis=0) if known.any() else np.zeros(3)
     hanging = int(np.argmax(np.abs(mean)))
     if abs(mean[hanging]) < VERTICAL:
         raise RecordingError(path, "hangs by no body axis", "hang it by the axis to be measured")
@@ -407,15 +407,7 @@ def angle_of_attitude(path: str, quaternion: Array, axis: str) -> Array:
         what = f"hangs by its body axis {AXES[hanging]}, and axis says {axis}"
         raise RecordingError(path, what, "correct the axis, or hang it by the other one")
     # the heading of a body axis that lies level tells the turn about the vertical
-    level = (hanging + 1) % 3
-    columns = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x)),
-    )
-    forward, left = columns[level]
-    heading = np.arctan2(left, forward)
-    known = np.isfinite(heading)
-    angle = np.full(len(heading), np.nan)
-    angle[known] = np.unwrap(heading[known])
+    level = turned[:, :, (hanging + 1) % 3]
+    angle = np.full(len(known), np.nan)
+    angle[known] = np.unwrap(np.arctan2(level[:, 1], level[:, 0]))
     return np.asarray(angle - np.nanmean(angle))

@@ -34,16 +34,22 @@ class _Level:
     time: float
 
 
-def thrust_stand(
+THRUST = {"motor_constant": 1.0}
+TORQUE = {"moment_constant": 1.0, "motor_constant": 1.0}
+"""What F · lever / (n Ω²) is the product of: k of a thrust stand, k_M k_F of a torque stand."""
+
+
+def stand(
     name: str,
     path: str,
     samples: Mapping[str, Array],
+    row: Mapping[str, float],
     *,
     rotors: int,
-    lever_ratio: float,
-    lever_ratio_error: float,
+    lever: float,
+    lever_error: float,
 ) -> Measurement:
-    """Return the motor constant from F · lever_ratio = n k Ω² (Eq. 6.8) and an offset.
+    """Return a constant of the rotors from F · lever = n k Ω² (Eq. 6.8, 7.3.2) and an offset.
 
     Parameters
     ----------
@@ -51,48 +57,19 @@ def thrust_stand(
         Of the experiment and its recording.
     samples
         ``time`` s, ``rotor_speed`` rad/s, ``force`` N.
+    row
+        What k is: `THRUST` or `TORQUE`.
     rotors
         How many turned.
-    lever_ratio, lever_ratio_error
-        Thrust over the force that the sensor reads, and its relative standard error.
+    lever, lever_error
+        Thrust over the force that the sensor reads, or torque over it in m, and the relative
+        standard error.
 
     Raises
     ------
     RecordingError
         There are too few steps, they are too short, or the force does not grow with the speed.
     """
-    slope, error, remarks, curves = _slope(path, samples, "Thrust stand")
-    value = math.log(slope * lever_ratio / rotors)
-    variance = (error / slope) ** 2 + lever_ratio_error**2
-    return Measurement(
-        name, ({"motor_constant": 1.0},), np.array([value]), np.array([[variance]]), remarks, curves
-    )
-
-
-def torque_stand(
-    name: str,
-    path: str,
-    samples: Mapping[str, Array],
-    *,
-    rotors: int,
-    lever_arm: float,
-    lever_arm_error: float,
-) -> Measurement:
-    """Return moment_constant · motor_constant from lever_arm · F = n k_M k_F Ω² (7.3.2).
-
-    Parameters and errors as of `thrust_stand`; ``lever_arm`` in m, its error relative.
-    """
-    slope, error, remarks, curves = _slope(path, samples, "Torque stand")
-    value = math.log(slope * lever_arm / rotors)
-    variance = (error / slope) ** 2 + lever_arm_error**2
-    row = {"moment_constant": 1.0, "motor_constant": 1.0}
-    return Measurement(name, (row,), np.array([value]), np.array([[variance]]), remarks, curves)
-
-
-def _slope(
-    path: str, samples: Mapping[str, Array], title: str
-) -> tuple[float, float, tuple[Remark, ...], tuple[Curve, ...]]:
-    """Return dF/dΩ², N s²/rad², its standard error, remarks and the picture."""
     time, speed, force = samples["time"], samples["rotor_speed"], samples["force"]
     levels, used, dropped = _levels(time, speed, force)
     if len(levels) < FEWEST:
@@ -124,6 +101,7 @@ def _slope(
         remarks.append(Remark("not_quadratic", {"deviation": bend / bend_error}))
     squares = design[:, 0]
     order = np.argsort(squares)
+    title = "Thrust stand" if row == THRUST else "Torque stand"
     curves = (
         Curve.of(
             ("Rotor speed", "time, s", "rotor speed, rad/s"),
@@ -138,7 +116,11 @@ def _slope(
             (squares[order], fit[order]),
         ),
     )
-    return slope, math.sqrt(covariance[0, 0]), tuple(remarks), curves
+    value = math.log(slope * lever / rotors)
+    variance = covariance[0, 0] / slope**2 + lever_error**2
+    return Measurement(
+        name, (row,), np.array([value]), np.array([[variance]]), tuple(remarks), curves
+    )
 
 
 def _levels(time: Array, speed: Array, force: Array) -> tuple[list[_Level], NDArray[np.bool_], int]:

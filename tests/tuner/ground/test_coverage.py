@@ -11,7 +11,7 @@ from tuner.ground.bifilar import bifilar
 from tuner.ground.hovers import hover_weights, yaw_spin
 from tuner.ground.measurement import scaled_of
 from tuner.ground.propeller import propeller
-from tuner.ground.stands import rpm_curve, thrust_stand, torque_stand
+from tuner.ground.stands import THRUST, TORQUE, rpm_curve, stand
 from tuner.ground.step_response import step_response
 
 TRUTH = rigs.TRUTH
@@ -27,16 +27,14 @@ def swing(random):
 def thrust(random):
     samples = rigs.stand(random, slope=4 * TRUTH["motor_constant"], lever=LEVER)
     lever = LEVER * (1 + random.normal(0, 0.005))
-    return thrust_stand(
-        "thrust", "t.csv", samples, rotors=4, lever_ratio=lever, lever_ratio_error=0.005
-    )
+    return stand("thrust", "t.csv", samples, THRUST, rotors=4, lever=lever, lever_error=0.005)
 
 
 def torque(random):
     slope = 2 * TRUTH["moment_constant"] * TRUTH["motor_constant"]
     samples = rigs.stand(random, slope=slope, lever=ARM, noise=0.02)
     arm = ARM * (1 + random.normal(0, 0.005))
-    return torque_stand("torque", "t.csv", samples, rotors=2, lever_arm=arm, lever_arm_error=0.005)
+    return stand("torque", "t.csv", samples, TORQUE, rotors=2, lever=arm, lever_error=0.005)
 
 
 def curve(random):
@@ -129,9 +127,7 @@ def test_a_speed_that_reacts_before_its_commands_stamp_leaves_the_time_constants
 def test_a_wrong_lever_ratio_conflicts_with_the_hovers():
     random = np.random.default_rng(3)
     samples = rigs.stand(random, slope=4 * TRUTH["motor_constant"], lever=LEVER)
-    wrong = thrust_stand(
-        "thrust", "t.csv", samples, rotors=4, lever_ratio=1.0, lever_ratio_error=0.005
-    )
+    wrong = stand("thrust", "t.csv", samples, THRUST, rotors=4, lever=1.0, lever_error=0.005)
     known = {name: scaled_of(name, value) for name, value in TRUTH.items() if name in KNOWN}
     together = combine([wrong, hover(random)], known)
     assert together.p_value < 1e-6
