@@ -50,13 +50,16 @@ def reason_in_words(reason: Reason) -> str:
 def half_width_in_words(
     interval: tuple[float | None, float | None] | None, value: float, unit: str
 ) -> str:
-    """Return half a 95 % interval: a time in ms, else as a share of the value where it has one."""
+    """Return half a 95 % interval, as it stands beside a column of units.
+
+    A time is in ms; else it is a share of its value, or a plain number where that is smaller.
+    """
     if interval is None or None in interval:
         return ""
     low, high = interval
     half = ((high or 0.0) - (low or 0.0)) / 2.0
     if unit == "s" or abs(value) < half:
-        return f"±{quantity(half, unit)}"
+        return f"±{quantity(half, unit if unit == 's' else '')}"
     return f"±{percent(half / abs(value))}"
 
 

@@ -8,6 +8,7 @@ from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import NOT_FITTED, Direction, Reason, ReasonCode, Verdict
 from tuner.uncertainty.verdict_texts import (
     direction_in_words,
+    half_width_in_words,
     judgement_in_words,
     parts_in_words,
     reason_in_words,
@@ -122,3 +123,10 @@ def test_a_direction_is_named_with_its_proportion_and_size(
 ) -> None:
     direction = Direction(moves=moves, error=0.1, null=False, common_scale=False)
     assert direction_in_words(direction) == sentence
+
+
+def test_half_an_interval_is_a_share_a_time_or_a_plain_number_beside_its_unit() -> None:
+    assert half_width_in_words((1.98, 2.02), 2.0, "kg m²") == "±1 %"
+    assert half_width_in_words((0.011, 0.013), 0.012, "s") == "±1 ms"
+    assert half_width_in_words((-1.0, 2.0), 0.5, "N s²/(rad m)") == "±1.5"
+    assert half_width_in_words((None, 2.0), 0.5, "m") == ""
