@@ -54,8 +54,7 @@ def in_doubt(linear: Linear, model: Columns, groups: Iterable[tuple[Columns, flo
     where the flights can hardly tell a term from the model: that is chance.
     """
     square = linear.information() + linear.prior
-    everything = np.ones(len(linear.flight), bool)
-    alone = linear.step(model, inside=everything)
+    alone = linear.step(model)
     squares = np.zeros(len(linear.scaled))
     for group, presence in groups:
         evidence = Evidence.of(linear, square, alone, model, group)

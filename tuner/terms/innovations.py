@@ -24,13 +24,12 @@ from tuner.terms.candidates import (
     is_stand_in,
     names_in,
     presence_of,
-    start_of,
     with_free,
     with_groups,
 )
 from tuner.terms.doubt import SMALLEST, in_doubt
 from tuner.terms.held_out_score import vector_after
-from tuner.terms.linear import Columns, Linear, linear_of
+from tuner.terms.linear import Columns, Linear, linear_of, neutral_of
 from tuner.terms.score import EARNING, score, surviving
 from tuner.terms.selection_state import Selected
 from tuner.vehicle import COEFFICIENTS, conditions
@@ -81,6 +80,7 @@ class Innovations:
         space, vector = wide.objective.space, np.asarray(wide.point.coefficients)
         scaled = space.scaled(vector)
         linear = linear_of(information, scaled, space.prior_mean, predictor.loss)
+        linear = replace(linear, names=space.names, neutral=neutral_of(space))
         return Innovations(selected, fitted, space, vector, linear)
 
     def in_doubt(self) -> dict[str, float]:
@@ -131,7 +131,6 @@ class Innovations:
             model,
             {name: self._columns(names) for name, names in begin.items()},
             candidates=len(tried),
-            neutral=self._neutral(tried),
             without=self._columns(names_in(without)),
             stand_ins=[name for name in begin if is_stand_in(name)],
             no_gusts=list(begin),  # they are followed
@@ -139,7 +138,8 @@ class Innovations:
             at_once=True,
         )
         change = self._change(model, tried, kept)
-        size = np.abs(self.linear.scaled + change - self._neutral(tried)) / self.linear.prior_sd
+        everywhere = np.arange(len(change))
+        size = np.abs(change - self.linear.away(everywhere)) / self.linear.prior_sd
         large = [name for name in kept if size[self._columns(tried[name])].max() > SMALLEST]
         if set(large) == set(within):
             return None
@@ -207,19 +207,8 @@ class Innovations:
     def _change(self, model: Columns, tried: Groups, kept: Collection[str]) -> Array:
         """Return the step (P,) to the minimum with some groups, the others at neutral values."""
         free = np.concatenate([model, *(self._columns(tried[name]) for name in kept)])
-        away = np.zeros(len(self.linear.scaled))
-        for name in set(tried) - set(kept):
-            gone = self._columns(tried[name])
-            away[gone] = (self._neutral(tried) - self.linear.scaled)[gone]
-        everything = np.ones(len(self.linear.flight), bool)
-        return self.linear.step(free.astype(np.intp), inside=everything, from_=away)
-
-    def _neutral(self, tried: Groups) -> Array:
-        """Return neutral values (P,) of the groups, scaled; zero for all others."""
-        neutral = start_of(names_in(tried))
-        return np.array(
-            [p.scaled(neutral[p.name]) if p.name in neutral else 0.0 for p in self.space.parameters]
-        )
+        gone = [name for group in set(tried) - set(kept) for name in tried[group]]
+        return self.linear.step(free.astype(np.intp), from_=self.linear.away(self._columns(gone)))
 
     def _model(self, names: Sequence[str]) -> Columns:
         """Return the columns of what the model holds anyway, and innovations see."""

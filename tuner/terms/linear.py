@@ -9,7 +9,7 @@ does, has a column for each flight, which no other flight sees.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -28,7 +28,7 @@ from tuner.objective.normal import Objective, portions
 from tuner.objective.residuals import robust
 from tuner.objective.space import Space
 from tuner.uncertainty.overdispersion import Stretches
-from tuner.vehicle import REGISTRY
+from tuner.vehicle import COEFFICIENTS, REGISTRY
 from tuner.vehicle.coefficient import Parameter
 
 Array = NDArray[np.float64]
@@ -62,6 +62,10 @@ class Linear:
         (S, L) which columns each stretch sees; None where all see all.
     around
         How many of the last columns say what surrounds one flight each.
+    names
+        (P,) of the columns: a condition's once for each flight; none where nobody asks.
+    neutral
+        (P,) at which what has columns is not there, scaled; zero by default.
     """
 
     scaled: Array
@@ -75,6 +79,25 @@ class Linear:
     loss: float
     seen: NDArray[np.intp] | None = None
     around: int = 0
+    names: tuple[str, ...] = ()
+    neutral: Array | None = None
+
+    @cached_property
+    def _places(self) -> dict[str, list[int]]:
+        places: dict[str, list[int]] = {}
+        for column, name in enumerate(self.names):
+            places.setdefault(name, []).append(column)
+        return places
+
+    def columns_of(self, names: Iterable[str]) -> Columns:
+        """Return the columns of some names, in their order."""
+        return np.array([column for name in names for column in self._places[name]], np.intp)
+
+    def away(self, gone: Columns) -> Array:
+        """Return the change (P,) that leads some columns to their neutral values."""
+        change = np.zeros(len(self.scaled))
+        change[gone] = ((0.0 if self.neutral is None else self.neutral) - self.scaled)[gone]
+        return change
 
     @property
     def flights(self) -> int:
@@ -154,7 +177,7 @@ class Linear:
         return rows
 
     def step(
-        self, free: Columns, *, inside: NDArray[np.bool_], from_: Array | None = None
+        self, free: Columns, *, inside: NDArray[np.bool_] | None = None, from_: Array | None = None
     ) -> Array:
         """Return the change (P,) that minimises the loss of some stretches.
 
@@ -163,13 +186,13 @@ class Linear:
         free
             What may move.
         inside
-            (S,) which stretches are fitted.
+            (S,) which stretches are fitted; all by default.
         from_
             (P,) change that is made anyway; none by default.
         """
         change = np.zeros(len(self.scaled)) if from_ is None else from_.copy()
         hessian = self.information(inside) + self.prior
-        score = self._scores[inside].sum(axis=0)
+        score = (self._scores if inside is None else self._scores[inside]).sum(axis=0)
         slope = score + self.pull + hessian @ change
         square = hessian[np.ix_(free, free)]
         change[free] -= scaled_solve(square, slope[free], RIDGE)
@@ -236,7 +259,23 @@ def linear_at(
         ]
     )
     mean = np.concatenate([objective.space.prior_mean, np.zeros(rows.size)])
-    return linear_of(information, scaled, mean, loss, around=len(around))
+    names = (*objective.space.names, *(name for name in around for _ in rows[0]))
+    neutral = np.concatenate([neutral_of(objective.space), np.zeros(rows.size)])
+    linear = linear_of(information, scaled, mean, loss, around=len(around))
+    return replace(linear, names=names, neutral=neutral)
+
+
+def neutral_of(space: Space) -> Array:
+    """Return at which scaled coordinates (K,) coefficients of terms do nothing; zero of others."""
+    rows = [(parameter, COEFFICIENTS[parameter.name].neutral) for parameter in space.parameters]
+    return np.array(
+        [
+            0.0
+            if value is None or (value <= 0.0 and parameter.scale == "log")
+            else parameter.scaled(value)
+            for parameter, value in rows
+        ]
+    )
 
 
 def _with_coefficients_around(

@@ -45,9 +45,9 @@ def chance_of_gusts(
     freedom = len(of_sections) - len(group)
     if freedom < 1:
         return 1.0
-    at, everything = np.pad(begin, (0, len(of_sections))), np.ones(len(sections), bool)
+    at = np.pad(begin, (0, len(of_sections)))
     alone, with_flights, with_sections = (
-        float(cut.change_of_loss(cut.step(free, inside=everything, from_=at)).sum())
+        float(cut.change_of_loss(cut.step(free, from_=at)).sum())
         for free in (model, np.append(model, group), np.append(model, of_sections))
     )
     between = (alone - with_flights) / len(group)
@@ -156,8 +156,8 @@ def score(
     group: Columns,
     *,
     candidates: int,
-    neutral: NDArray[np.float64] | None = None,
-    gone: Columns | None = None,
+    inside: bool = False,
+    gone: Columns = NOTHING,
     no_gust: bool = False,
     material: float = MATERIAL,
 ) -> Score:
@@ -188,9 +188,8 @@ def score(
         Columns of the group.
     candidates
         Among how many groups it was picked: the level of significance is shared by them.
-    neutral
-        (K,) scaled neutral values, where the point holds fitted ones; by default the group is at
-        its neutral values there.
+    inside
+        Whether the point holds fitted values of the group, rather than its neutral ones.
     gone
         Columns of coefficients that go to their neutral values with the group and without it.
     no_gust
@@ -200,16 +199,11 @@ def score(
         Share of the loss below which a gain is no evidence.
     """
     columns = (model, np.concatenate([model, group]))
-    to_neutral = np.zeros(len(linear.scaled)) if neutral is None else neutral - linear.scaled
-    begin = np.zeros(len(linear.scaled))
-    if gone is not None:
-        begin[gone] = to_neutral[gone]
-    without = begin.copy()
-    without[group] = to_neutral[group]
-    everything = np.ones(len(linear.flight), bool)
-    alone, with_group = _steps(linear, columns, (without, begin), everything)
-    fit = _Gain.of(linear, alone, with_group, everything)
-    by_flight, inside = linear.sees_alike(group), neutral is not None
+    begin = linear.away(gone)
+    without = linear.away(_joined([gone, group])) if inside else begin
+    alone, with_group = _steps(linear, columns, (without, begin))
+    fit = _Gain.of(linear, alone, with_group)
+    by_flight = linear.sees_alike(group)
     across = by_flight and linear.flights > 1
     folds = linear.flight if across else linear.section
     held_out = _held_out(linear, columns, (without, begin), folds)
@@ -248,7 +242,6 @@ def surviving(
     groups: Mapping[str, Columns],
     *,
     candidates: int,
-    neutral: NDArray[np.float64],
     without: Columns = NOTHING,
     stand_ins: Collection[str] = (),
     no_gusts: Collection[str] = (),
@@ -267,7 +260,7 @@ def surviving(
 
     Parameters
     ----------
-    linear, candidates, neutral, material
+    linear, candidates, material
         As of `score`; the point is the fit with all groups.
     model
         Columns of the coefficients that stay.
@@ -293,7 +286,7 @@ def surviving(
                 others,
                 columns,
                 candidates=candidates,
-                neutral=neutral,
+                inside=True,
                 gone=gone,
                 no_gust=name in no_gusts,
                 material=material,
@@ -337,12 +330,12 @@ class _Gain:
         linear: Linear,
         alone: NDArray[np.float64],
         with_group: NDArray[np.float64],
-        inside: NDArray[np.bool_],
+        inside: NDArray[np.bool_] | bool = True,
     ) -> _Gain:
         """Return the gain of one change (K,) over another in some stretches, none elsewhere."""
         without = linear.change_of_loss(alone)
         gain = np.where(inside, without - linear.change_of_loss(with_group), 0.0)
-        return _Gain(gain, np.where(inside, linear.loss / len(inside) + without, 0.0))
+        return _Gain(gain, np.where(inside, linear.loss / len(without) + without, 0.0))
 
     def with_flights_apart(self, flight: NDArray[np.intp]) -> _Gain:
         """Return the gain whose scatter is that of the flights, if that is larger."""
@@ -385,7 +378,7 @@ def _steps(
     linear: Linear,
     columns: tuple[Columns, Columns],
     begin: tuple[NDArray[np.float64], NDArray[np.float64]],
-    inside: NDArray[np.bool_],
+    inside: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the changes (K,) that fit some stretches, without and with a group."""
     without, with_group = (

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from jax import Array
@@ -49,7 +48,6 @@ from tuner.terms.held_out_score import predicted_losses, vector_after
 from tuner.terms.linear import linear_at
 from tuner.terms.score import Score, score, surviving
 from tuner.terms.selection_state import LinearisedFit, Selected, offsets_of, row_of
-from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import with_coefficients
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
@@ -107,10 +105,12 @@ class Selection:
     def _in_doubt(self, state: LinearisedFit, groups: Sequence[Sequence[str]]) -> dict[str, float]:
         """Return how far each coefficient of the model would move with what is not in it."""
         names = [*self.job.space.names, *names_in(state.added)]
-        outside = [(self._columns(group), presence_of(group)) for group in groups]
-        moves = in_doubt(state.linear, self._columns(names), outside)
+        linear = state.linear
+        outside = [(linear.columns_of(group), presence_of(group)) for group in groups]
+        moves = in_doubt(linear, linear.columns_of(names), outside)
         coefficients = [name for name in names if name not in conditions_in(self.candidates)]
-        return dict(zip(coefficients, moves[self._columns(coefficients)].tolist(), strict=True))
+        own = linear.columns_of(coefficients)
+        return dict(zip(coefficients, moves[own].tolist(), strict=True))
 
     def _wanted(
         self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
@@ -184,10 +184,9 @@ class Selection:
         """Return the fit without the groups that do not hold their places beside the others."""
         kept, taken = surviving(
             state.linear,
-            self._columns(self.job.space.names),
-            {group: self._columns(names) for group, names in state.added.items()},
+            state.linear.columns_of(self.job.space.names),
+            {group: state.linear.columns_of(names) for group, names in state.added.items()},
             candidates=len(self.candidates),
-            neutral=self._neutral,
             stand_ins=[group for group in state.added if is_stand_in(group)],
             no_gusts=[group for group in state.added if _no_gust(state, group)],
         )
@@ -204,18 +203,16 @@ class Selection:
         them astray.
         """
         space, linear = state.fitted.objective.space, state.linear
-        gone = self._columns(names_in({name: self.candidates[name] for name in taken}))
+        gone = linear.columns_of(names_in({name: self.candidates[name] for name in taken}))
         kept = {name: names for name, names in state.added.items() if name not in taken}
-        away = np.zeros(len(linear.scaled))
-        away[gone] = (self._neutral - linear.scaled)[gone]
-        free = self._columns([*self.job.space.names, *names_in(kept)])
-        change = linear.step(free, inside=np.ones(len(linear.flight), bool), from_=away)
+        free = linear.columns_of([*self.job.space.names, *names_in(kept)])
+        change = linear.step(free, from_=linear.away(gone))
         of_flight, offsets = state.fitted.objective.of_flight, np.array(state.fitted.point.offsets)
         for name, unit in zip(of_flight, units_of(of_flight), strict=True):
             if name in conditions_in(kept):
-                offsets[of_flight.index(name)] += change[self._columns([name])] / unit
+                offsets[of_flight.index(name)] += change[linear.columns_of([name])] / unit
         moved = vector_after(
-            space, state.fitted.point.coefficients, change[self._columns(space.names)]
+            space, state.fitted.point.coefficients, change[linear.columns_of(space.names)]
         )
         point = Point(np.asarray(moved), np.asarray(offsets))
         return replace(state, fitted=replace(state.fitted, point=point))
@@ -300,35 +297,6 @@ class Selection:
         objective, point = with_conditions(objective, point, conditions_in(self.candidates))
         return objective, np.array(point.coefficients)
 
-    @cached_property
-    def _space(self) -> dict[str, list[int]]:
-        """Name -> its columns in every `Linear`: one for each flight of what surrounds it."""
-        names = (*self.job.space.names, *coefficients_in(self.candidates))
-        columns = {name: [number] for number, name in enumerate(names)}
-        for name in conditions_in(self.candidates):
-            first = sum(map(len, columns.values()))
-            columns[name] = [first + flight for flight in self._flights]
-        return columns
-
-    @property
-    def _flights(self) -> range:
-        return range(self.fitted.objective.flights)
-
-    @cached_property
-    def _neutral(self) -> NDArray[np.float64]:
-        """Scaled neutral values (P,) of the candidates; zero for the base model's coefficients."""
-        neutral = start_of(coefficients_in(self.candidates))
-        scales = [COEFFICIENTS[name].scale for name in neutral]
-        scaled = [
-            np.log(value) if scale == "log" else value
-            for value, scale in zip(neutral.values(), scales, strict=True)
-        ]
-        around = len(conditions_in(self.candidates)) * len(self._flights)
-        return np.array([0.0] * len(self.job.space) + scaled + [0.0] * around)
-
-    def _columns(self, names: Sequence[str]) -> NDArray[np.intp]:
-        return np.array([column for name in names for column in self._space[name]], np.intp)
-
     def _score(self, state: LinearisedFit, group: str) -> Score:
         """Return what a group is worth beside the others in the model."""
         inside, names = group in state.added, self.candidates[group]
@@ -375,12 +343,13 @@ class Selection:
     ) -> Score:
         """Return what some names are worth beside all else in the model."""
         others = [*self.job.space.names, *names_in(state.added)]
+        linear = state.linear
         return score(
-            state.linear,
-            self._columns([name for name in others if name not in names]),
-            self._columns(names),
+            linear,
+            linear.columns_of(name for name in others if name not in names),
+            linear.columns_of(names),
             candidates=len(self.candidates),
-            neutral=self._neutral if inside else None,
+            inside=inside,
             no_gust=no_gust,
         )
 
@@ -400,8 +369,8 @@ class Selection:
         return bool(gains.sum() > (scatter if by_flight else -scatter))
 
     def _predicted(self, state: LinearisedFit, scale: Mapping[str, Array]) -> NDArray[np.float64]:
-        model = self._columns([*self.job.space.names, *names_in(state.added)])
-        own = self._columns(state.fitted.objective.space.names)
+        model = state.linear.columns_of([*self.job.space.names, *names_in(state.added)])
+        own = state.linear.columns_of(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)
 
 

@@ -2,8 +2,11 @@
 
 import numpy as np
 
+from tests.tuner.uncertainty.making import controller_file, vehicle_file
+from tuner.config import JobFile
 from tuner.objective.information import BLOCK, FisherInformation
-from tuner.terms.linear import linear_of
+from tuner.objective.space import space_of
+from tuner.terms.linear import linear_of, neutral_of
 from tuner.terms.score import score
 
 FLIGHTS, SECONDS, WINDOW, STRIDE, RATE = 3, 24.0, 0.5, 0.25, 40
@@ -88,3 +91,11 @@ def test_a_flight_that_is_flown_whole_keeps_its_stretches():
     np.testing.assert_array_equal(linear.hessian.ravel(), blocks.ravel())
     np.testing.assert_array_equal(linear.score.ravel(), information.score.ravel())
     assert linear.section.tolist() == [0, 0, 0, 1, 1, 2, 2] * 2
+
+
+def test_a_term_is_taken_away_to_where_it_does_nothing_of_the_base_model_too():
+    """A thrust exponent that a job names counts against thrust by the square of the speed."""
+    names = ("motor_constant", "thrust_exponent", "rotor_drag_ratio_y", "linear_drag_x")
+    space = space_of(vehicle_file(), controller_file(), JobFile(free=names))
+    neutral = dict(zip(space.names, neutral_of(space), strict=True))
+    assert [neutral[name] for name in names] == [0.0, 2.0, 0.0, 0.0]

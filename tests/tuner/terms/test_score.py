@@ -96,7 +96,7 @@ def test_what_chance_explains_goes_before_what_it_does_not(monkeypatch):
 
     monkeypatch.setattr("tuner.terms.score.score", scored)
     groups = {"first": FIRST, "second": SECOND}
-    kept, taken = surviving(linear_fit(0.0), MODEL, groups, candidates=2, neutral=np.zeros(4))
+    kept, taken = surviving(linear_fit(0.0), MODEL, groups, candidates=2)
     assert (list(kept), list(taken)) == (["first"], ["second"])
 
 
@@ -109,7 +109,7 @@ def test_beside_what_is_there_in_vain_nothing_else_goes(monkeypatch):
         return Score(0.5, 0.4, 0.1, 1.0, SelectionCode.NOT_SIGNIFICANT)
 
     monkeypatch.setattr("tuner.terms.score.score", scored)
-    of = {"candidates": 2, "neutral": np.zeros(4)}
+    of = {"candidates": 2}
     kept, taken = surviving(linear_fit(0.0), MODEL, {"first": FIRST, "second": SECOND}, **of)
     assert (list(kept), list(taken)) == (["second"], ["first"])
     kept, taken = surviving(linear_fit(0.0), MODEL, {"second": SECOND}, **of)
@@ -127,7 +127,6 @@ def test_backward_elimination_leaves_the_term_of_the_truth_at_the_fit_with_both(
         MODEL,
         {"first": FIRST, "second": SECOND},
         candidates=2,
-        neutral=np.zeros(4),
     )
     assert (list(kept), list(taken)) == (["first"], ["second"])
 
@@ -141,7 +140,6 @@ def test_of_two_that_do_the_same_the_stand_in_goes(stand_in):
         np.array([0]),
         {"first": FIRST, "copy": np.array([len(linear.scaled)])},
         candidates=2,
-        neutral=np.zeros(len(linear.scaled) + 1),
         stand_ins=[stand_in],
     )
     assert list(taken) == [stand_in]
@@ -192,7 +190,7 @@ def test_a_flight_that_is_alone_predicts_itself_section_by_section():
         MODEL,
         FIRST,
         candidates=14,
-        neutral=np.zeros(4),
+        inside=True,
     )
     assert inside.reason is SelectionCode.PREDICTS_SECTIONS
 
@@ -204,7 +202,7 @@ def test_a_flight_that_is_alone_is_bought_a_term_no_more_often_than_chance_is_le
         linear = alone(linear_fit(0.0, seed=seed, **given))
         after = moved_to_minimum(linear, both)
         found = score(linear, MODEL, FIRST, candidates=1)
-        stayed = score(after, MODEL, FIRST, candidates=1, neutral=np.zeros(4))
+        stayed = score(after, MODEL, FIRST, candidates=1, inside=True)
         bought.append((found.earns_place, stayed.earns_place))
     assert np.mean(bought) <= 0.01
 
@@ -234,7 +232,7 @@ def test_a_term_in_the_model_is_worth_what_taking_it_away_would_cost():
     before = linear_fit(0.5)
     added = score(before, MODEL, FIRST, candidates=1)
     after = moved_to_minimum(before, np.concatenate([MODEL, FIRST]))
-    inside = score(after, MODEL, FIRST, candidates=1, neutral=np.zeros(4))
+    inside = score(after, MODEL, FIRST, candidates=1, inside=True)
     assert inside.gain_fit == pytest.approx(added.gain_fit, rel=1e-6)
     assert inside.gain_holdout == pytest.approx(added.gain_holdout, rel=1e-6)
     assert inside.earns_place
@@ -245,10 +243,10 @@ def test_what_is_in_the_model_stays_where_flights_left_out_are_of_two_minds():
     before = linear_fit(0.8, 0.0, 0.8, 0.4, seed=14, gusts=True)
     assert score(before, MODEL, FIRST, candidates=1).reason is SelectionCode.NOT_PREDICTED
     after = moved_to_minimum(before, np.concatenate([MODEL, FIRST]))
-    inside = score(after, MODEL, FIRST, candidates=1, neutral=np.zeros(4))
+    inside = score(after, MODEL, FIRST, candidates=1, inside=True)
     assert inside.reason is SelectionCode.SIGNIFICANT
     assert inside.earns_place
-    shared = score(after, MODEL, FIRST, candidates=10, neutral=np.zeros(4))
+    shared = score(after, MODEL, FIRST, candidates=10, inside=True)
     assert shared.reason is SelectionCode.NOT_SIGNIFICANT
 
 
@@ -256,7 +254,7 @@ def test_a_gust_that_does_what_a_term_would_is_not_feared_where_a_recorded_signa
     """Two flights show it, in gusts that are worst in a few stretches."""
     both = np.concatenate([MODEL, FIRST])
     after = moved_to_minimum(linear_fit(0.8, seed=33, gusts=True, shown_by=2), both)
-    groups, of = {"first": FIRST}, {"candidates": 14, "neutral": np.zeros(4)}
+    groups, of = {"first": FIRST}, {"candidates": 14}
     kept, taken = surviving(after, MODEL, groups, **of)
     assert not kept
     assert taken["first"].reason is SelectionCode.NOT_SIGNIFICANT
@@ -271,7 +269,7 @@ def test_gusts_let_a_term_stay_whose_signal_was_recorded_hardly_more_often():
     both, stayed = np.concatenate([MODEL, FIRST]), []
     for seed in range(200):
         after = moved_to_minimum(linear_fit(0.0, seed=seed, gusts=True), both)
-        found = score(after, MODEL, FIRST, candidates=14, neutral=np.zeros(4), no_gust=True)
+        found = score(after, MODEL, FIRST, candidates=14, inside=True, no_gust=True)
         stayed.append(found.earns_place)
     assert np.mean(stayed) <= 0.01
 
@@ -287,7 +285,7 @@ def test_one_flight_that_the_others_predict_badly_takes_no_term_away(monkeypatch
     monkeypatch.setattr("tuner.terms.score._held_out", lambda *_: held_out)
     outside = score(linear_fit(0.8), MODEL, FIRST, candidates=1)
     assert outside.reason is SelectionCode.NOT_PREDICTED
-    inside = score(after, MODEL, FIRST, candidates=1, neutral=np.zeros(4))
+    inside = score(after, MODEL, FIRST, candidates=1, inside=True)
     assert inside.earns_place is stays
 
 

@@ -21,6 +21,7 @@ from tuner.vehicle.selection_table import SelectionCode
 
 DRAG = 0.03
 LINEAR = "linear_drag"
+BLIND = SimpleNamespace(columns_of=lambda _: ())
 
 
 def selected(drag, *, seed=0, job=None, around=None):
@@ -130,11 +131,9 @@ def test_of_all_groups_only_the_battery_is_judged_as_one_that_a_recorded_signal_
         return {}, {}
 
     monkeypatch.setattr(selection, "surviving", surviving)
-    monkeypatch.setattr(selection.Selection, "_neutral", None)
-    monkeypatch.setattr(selection.Selection, "_columns", lambda *_: ())
     groups = {**term_groups(), "wind": ("wind_x", "wind_y")}
     job = SimpleNamespace(space=SimpleNamespace(names=BASE_IN_ORDER))
-    standing = LinearisedFit(SimpleNamespace(residuals_at_noise_level=False), groups, None)
+    standing = LinearisedFit(SimpleNamespace(residuals_at_noise_level=False), groups, BLIND)
     selection.Selection(job, None, groups, print, print)._pruned(standing)
     assert judged == ["battery"]
 
@@ -192,14 +191,12 @@ def test_terms_that_are_free_from_the_beginning_stand_in_the_table_with_what_the
 ):
     worth = Score(0.4, 0.3, 0.1, 0.5, SelectionCode.NOT_SIGNIFICANT)
     monkeypatch.setattr(selection, "score", lambda *_, **__: worth)
-    monkeypatch.setattr(selection.Selection, "_neutral", None)
-    monkeypatch.setattr(selection.Selection, "_columns", lambda *_: ())
     drag, tilt = (tuple(f"{name}_{axis}" for axis in "xyz") for name in (LINEAR, "marker_tilt"))
     names = (*BASE_IN_ORDER, *drag, *tilt, "angular_drag_x")
     job = SimpleNamespace(
         space=SimpleNamespace(names=names, free=names), first_terms={"marker_tilt": tilt}
     )
-    standing = LinearisedFit(SimpleNamespace(residuals_at_noise_level=False), {}, None)
+    standing = LinearisedFit(SimpleNamespace(residuals_at_noise_level=False), {}, BLIND)
     groups = {"fuselage_drag": ("fuselage_drag",)}
     rows = selection.Selection(job, None, groups, print, print)._rows(standing, {})
     assert [(row.group, row.kept, row.reason) for row in rows] == [

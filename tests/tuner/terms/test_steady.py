@@ -72,7 +72,7 @@ def test_a_flight_of_one_stretch_says_nothing_of_what_is_steady():
 def test_the_mean_of_gusts_is_no_wind():
     """By residuals about the winds of flights alone, a wind would stay in a third of the fits."""
     stays = [
-        score(at_minimum(own), MODEL, WINDS, candidates=1, neutral=STILL).earns_place
+        score(at_minimum(own), MODEL, WINDS, candidates=1, inside=True).earns_place
         for seed in range(100)
         for own in [by_flight(linear_fit(0.0, seed=seed, gusts=True, alike=True), 1)]
     ]
