@@ -182,7 +182,7 @@ class Lowering:
         def of(*elements: Element) -> Element:
             return self.apply(name, params, *elements)
 
-        if self._is_long(shape):
+        if self.is_long(shape):
             arrays = [self.elements(o)[()] if not o.shape else o for o in operands]
 
             def read(array: Any, index: Index) -> Element:
@@ -221,14 +221,22 @@ class Lowering:
             return (elements[0], *self.e.alike(*elements[1:]))
         return self.e.alike(*elements)
 
-    def _is_long(self, shape: Sequence[int]) -> bool:
+    def is_long(self, shape: Sequence[int]) -> bool:
+        """Return whether an array of a shape does not lie in registers."""
         return prod(shape) > FEW
+
+    def where_read(
+        self, shape: Sequence[int], at: Callable[[Index], Element], sources: Sequence[Value]
+    ) -> Value:
+        """Return an array whose elements are computed where they are read; now, if it is short."""
+        deferred = Deferred(tuple(shape), at, tuple(sources))
+        return deferred if self.is_long(shape) else self.elements(deferred)
 
     def elements(self, value: Value) -> Elements:
         """Return an array in registers, read now."""
         if isinstance(value, np.ndarray):
             return value
-        if self._is_long(value.shape):
+        if self.is_long(value.shape):
             raise UnsupportedError(f"an array of shape {value.shape} as a whole")
         places = product(*map(range, value.shape))
         found = [self.at(value, [constant(I64, i) for i in place]) for place in places]
@@ -434,7 +442,7 @@ class Lowering:
         if storage.begins and number is not None:
             first = self._product(number, storage.strides[0])
         with nullcontext() if guard is None else self.b.if_then(guard):
-            if storage.begins and not isinstance(rows, np.ndarray) and self._is_long(rows.shape):
+            if storage.begins and not isinstance(rows, np.ndarray) and self.is_long(rows.shape):
 
                 def row(index: Index) -> None:
                     part = array_of(
@@ -722,32 +730,22 @@ Structural = Callable[[Lowering, JaxprEqn, list[Value]], "Value | list[Value]"]
 
 
 def _broadcast_in_dim(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    (value,) = operands
     shape, kept = eqn.params["shape"], eqn.params["broadcast_dimensions"]
-    if lower._is_long(shape):
-        if isinstance(value, np.ndarray) and value.shape == ():
-            single = value[()]
-            return Deferred(tuple(shape), lambda _: single, (value,))
+    value = operands[0] if lower.is_long(shape) else lower.elements(operands[0])
 
-        def at(index: Index) -> Element:
-            zero = constant(I64, 0)
-            own = [
-                index[axis] if length != 1 else zero
-                for axis, length in zip(kept, value.shape, strict=True)
-            ]
-            return lower.at(value, own)
+    def at(index: Index) -> Element:
+        own = [
+            constant(I64, 0) if length == 1 else index[axis]
+            for axis, length in zip(kept, value.shape, strict=True)
+        ]
+        return lower.at(value, own)
 
-        return Deferred(tuple(shape), at, (value,))
-    given = lower.elements(value)
-    lengths = [1] * len(shape)
-    for axis, length in zip(kept, given.shape, strict=True):
-        lengths[axis] = length
-    return np.broadcast_to(given.reshape(lengths), shape)
+    return lower.where_read(shape, at, (value,))
 
 
 def _reshape(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
     (value,), shape = operands, shape_of(eqn.outvars[0])
-    if not lower._is_long(shape):
+    if not lower.is_long(shape):
         return lower.elements(value).reshape(shape)
     if [n for n in shape if n != 1] != [n for n in value.shape if n != 1]:
         raise UnsupportedError(f"reshape of {value.shape} to {shape}")
@@ -759,13 +757,9 @@ def _reshape(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
     return Deferred(tuple(shape), at, (value,))
 
 
-def _transpose(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    return lower.elements(operands[0]).transpose(eqn.params["permutation"])
-
-
 def _concatenate(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
     axis, shape = eqn.params["dimension"], shape_of(eqn.outvars[0])
-    if not lower._is_long(shape):
+    if not lower.is_long(shape):
         return np.concatenate([lower.elements(o) for o in operands], axis=axis)
     firsts = np.cumsum([0, *(o.shape[axis] for o in operands)]).tolist()
 
@@ -786,17 +780,9 @@ def _concatenate(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value
     return Deferred(shape, at, tuple(operands))
 
 
-def _stack(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    return np.stack([lower.elements(o) for o in operands], axis=eqn.params.get("axis", 0))
-
-
 def _slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
     (value,), p = operands, eqn.params
     strides = p["strides"] or (1,) * len(value.shape)
-    if isinstance(value, np.ndarray):
-        limits = zip(p["start_indices"], p["limit_indices"], strides, strict=True)
-        return np.asarray(value[tuple(slice(*each) for each in limits)], object)
-    shape = shape_of(eqn.outvars[0])
 
     def at(index: Index) -> Element:
         moved = [
@@ -807,17 +793,7 @@ def _slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
         ]
         return lower.at(value, moved)
 
-    cut = Deferred(tuple(shape), at, (value,))
-    return cut if lower._is_long(shape) else lower.elements(cut)
-
-
-def _split(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> list[Value]:
-    ends = np.cumsum(eqn.params["sizes"])[:-1]
-    return list(np.split(lower.elements(operands[0]), ends, axis=eqn.params["axis"]))
-
-
-def _reverse(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    return np.flip(lower.elements(operands[0]), eqn.params["dimensions"])
+    return lower.where_read(shape_of(eqn.outvars[0]), at, (value,))
 
 
 def _pad(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
@@ -841,7 +817,7 @@ def _iota(lower: Lowering, eqn: JaxprEqn, _: list[Value]) -> Value:
     def at(index: Index) -> Element:
         return converted(lower.e, lower.as_index(index[axis]), kind)
 
-    if lower._is_long(shape):
+    if lower.is_long(shape):
         return Deferred(tuple(shape), at)
     numbers = [constant(kind, place[axis]) for place in np.ndindex(*shape)]
     return array_of(numbers, shape)
@@ -930,12 +906,24 @@ STRUCTURAL: dict[str, Structural] = {
     "reshape": _reshape,
     "squeeze": _reshape,
     "expand_dims": _reshape,
-    "transpose": _transpose,
+    "transpose": lambda lower, eqn, operands: lower.elements(operands[0]).transpose(
+        eqn.params["permutation"]
+    ),
     "concatenate": _concatenate,
-    "stack": _stack,
+    "stack": lambda lower, eqn, operands: np.stack(
+        [lower.elements(o) for o in operands], axis=eqn.params.get("axis", 0)
+    ),
     "slice": _slice,
-    "split": _split,
-    "rev": _reverse,
+    "split": lambda lower, eqn, operands: list[Value](
+        np.split(
+            lower.elements(operands[0]),
+            np.cumsum(eqn.params["sizes"])[:-1],
+            axis=eqn.params["axis"],
+        )
+    ),
+    "rev": lambda lower, eqn, operands: np.flip(
+        lower.elements(operands[0]), eqn.params["dimensions"]
+    ),
     "pad": _pad,
     "iota": _iota,
     "reduce_sum": _reduce("add"),

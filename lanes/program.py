@@ -300,7 +300,12 @@ class _Compiled:
     def __init__(self, program: Program, vectors: int) -> None:
         self.program, self.lengths = program, program.stand_ins
         widest = max(
-            (np.dtype(a.dtype).itemsize for a in program.arguments if _is_real(a.dtype)), default=8
+            (
+                np.dtype(a.dtype).itemsize
+                for a in program.arguments
+                if np.issubdtype(a.dtype, np.floating)
+            ),
+            default=8,
         )
         self.width = max(vectors * register_bytes() // widest, 1)
         self.structure: Any
@@ -460,10 +465,6 @@ def _side_by_side(leaf: NDArray[Any], taken: NDArray[np.intp], lanes: int) -> ND
         for place, lane in enumerate(taken.tolist()):
             laid[some, ..., place] = leaf[some, ..., lane]
     return laid
-
-
-def _is_real(dtype: Any) -> bool:
-    return np.issubdtype(np.dtype(dtype), np.floating)
 
 
 def _addresses(arrays: Sequence[NDArray[Any] | None]) -> Any:

@@ -252,14 +252,6 @@ def _extreme(sign: str) -> Rule:
 _larger, _smaller = _extreme(">"), _extreme("<")
 
 
-def _clamp(e: Emitter, p: Parameters, lower: ir.Value, x: ir.Value, upper: ir.Value) -> ir.Value:
-    return _smaller(e, p, _larger(e, p, x, lower), upper)
-
-
-def _negative(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
-    return e.b.fneg(x) if is_float(x) else e.b.neg(x)
-
-
 def _absolute(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
     if is_float(x):
         return e.intrinsic("fabs", x)
@@ -276,10 +268,6 @@ def _sign(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
     return e.select(e.isnan(x), x, e.select(whole, unit, x))
 
 
-def _square(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
-    return e.b.fmul(x, x, flags=CONTRACT) if is_float(x) else e.b.mul(x, x)
-
-
 def _integer_power(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
     exponent, factor, result = abs(p["y"]), x, None
     multiply = ELEMENTWISE["mul"]
@@ -292,10 +280,6 @@ def _integer_power(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
     if result is None:
         return e.number(x, 1)
     return _divide(e, p, e.number(x, 1), result) if p["y"] < 0 else result
-
-
-def _reciprocal_root(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
-    return e.b.fdiv(e.number(x, 1.0), e.intrinsic("sqrt", x), flags=CONTRACT)
 
 
 _LOG_2E = 1.4426950408889634
@@ -367,18 +351,10 @@ def _round(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
     return e.intrinsic("roundeven" if to_even else "round", x)
 
 
-def _is_finite(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
-    return e.b.fcmp_ordered("<", e.intrinsic("fabs", x), e.number(x, np.inf))
-
-
 def _power(e: Emitter, _: Parameters, x: ir.Value, y: ir.Value) -> ir.Value:
     if not is_float(y):
         y = e.b.sitofp(y, x.type)
     return e.intrinsic("pow", x, y)
-
-
-def _not(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
-    return e.b.not_(x)
 
 
 def _select_n(e: Emitter, _: Parameters, which: ir.Value, *cases: ir.Value) -> ir.Value:
@@ -416,10 +392,6 @@ def converted(e: Emitter, x: ir.Value, to: ir.Type) -> ir.Value:
     return found
 
 
-def _convert(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
-    return converted(e, x, type_of(p["new_dtype"]))
-
-
 def _reduce_precision(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
     if (p["exponent_bits"], p["mantissa_bits"]) == (11, 52) or isinstance(
         base(x.type), ir.FloatType
@@ -428,10 +400,6 @@ def _reduce_precision(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
     if (p["exponent_bits"], p["mantissa_bits"]) != (8, 23):
         raise UnsupportedError(f"reduce_precision to {p['mantissa_bits']} bits")
     return converted(e, converted(e, x, ir.FloatType()), ir.DoubleType())
-
-
-def _same(_: Emitter, __: Parameters, x: ir.Value) -> ir.Value:
-    return x
 
 
 ELEMENTWISE: dict[str, Rule] = {
@@ -446,13 +414,13 @@ ELEMENTWISE: dict[str, Rule] = {
     "pow": _power,
     "atan2": _libm("atan2"),
     "nextafter": _libm("nextafter"),
-    "neg": _negative,
+    "neg": lambda e, _, x: e.b.fneg(x) if is_float(x) else e.b.neg(x),
     "abs": _absolute,
     "sign": _sign,
-    "square": _square,
+    "square": lambda e, _, x: e.b.fmul(x, x, flags=CONTRACT) if is_float(x) else e.b.mul(x, x),
     "integer_pow": _integer_power,
     "sqrt": _intrinsic("sqrt"),
-    "rsqrt": _reciprocal_root,
+    "rsqrt": lambda e, _, x: e.b.fdiv(e.number(x, 1.0), e.intrinsic("sqrt", x), flags=CONTRACT),
     "cbrt": _libm("cbrt"),
     "exp": _exp,
     "exp2": _intrinsic("exp2"),
@@ -477,7 +445,7 @@ ELEMENTWISE: dict[str, Rule] = {
     "floor": _intrinsic("floor"),
     "ceil": _intrinsic("ceil"),
     "round": _round,
-    "is_finite": _is_finite,
+    "is_finite": lambda e, _, x: e.b.fcmp_ordered("<", e.intrinsic("fabs", x), e.number(x, np.inf)),
     "lt": _compare("<"),
     "le": _compare("<="),
     "gt": _compare(">"),
@@ -487,15 +455,13 @@ ELEMENTWISE: dict[str, Rule] = {
     "and": lambda e, _, x, y: e.b.and_(x, y),
     "or": lambda e, _, x, y: e.b.or_(x, y),
     "xor": lambda e, _, x, y: e.b.xor(x, y),
-    "not": _not,
-    "clamp": _clamp,
+    "not": lambda e, _, x: e.b.not_(x),
+    "clamp": lambda e, p, lower, x, upper: _smaller(e, p, _larger(e, p, x, lower), upper),
     "select_n": _select_n,
-    "convert_element_type": _convert,
+    "convert_element_type": lambda e, p, x: converted(e, x, type_of(p["new_dtype"])),
     "reduce_precision": _reduce_precision,
-    "copy": _same,
-    "copy_p": _same,
-    "stop_gradient": _same,
-    "real": _same,
-    "optimization_barrier": _same,
+    **dict.fromkeys(
+        ("copy", "copy_p", "stop_gradient", "real", "optimization_barrier"), lambda _, __, x: x
+    ),
 }
 """Primitive -> rule, for those that do to arrays what they do to each element."""

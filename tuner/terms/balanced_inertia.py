@@ -97,16 +97,7 @@ class Balance(eqx.Module):
         Forces along the body's axes in the middle of each stretch, then moments about them; those
         about x and y stand for squares at an arm of a metre.
         """
-        return self._residuals(tunable, jnp.asarray(vector))
-
-    @eqx.filter_jit
-    def jacobian(self, tunable: Tunable, vector: ArrayLike) -> Float[Array, "6 S F K"]:
-        """Return the residuals' derivatives by the search vector."""
-        moved: Array = jax.jacfwd(lambda v: self._residuals(tunable, v))(jnp.asarray(vector))
-        return moved
-
-    def _residuals(self, tunable: Tunable, vector: Array) -> Array:
-        vehicle = tunable.at(vector).vehicle
+        vehicle = tunable.at(jnp.asarray(vector)).vehicle
         air = Air.around(vehicle, self.motion, rotor_acceleration=self.rotor_acceleration)
         acting = total_wrench(vehicle, self.motion, self.rotor_speed, air)
         force = self._force_lacking(vehicle, acting.force)
@@ -117,6 +108,12 @@ class Balance(eqx.Module):
         return jnp.concatenate(
             [force / of_square, moment[:2] / of_square, moment[2:] / about_shaft]
         )
+
+    @eqx.filter_jit
+    def jacobian(self, tunable: Tunable, vector: ArrayLike) -> Float[Array, "6 S F K"]:
+        """Return the residuals' derivatives by the search vector."""
+        moved: Array = jax.jacfwd(lambda v: self.residuals(tunable, v))(jnp.asarray(vector))
+        return moved
 
     def _force_lacking(self, vehicle: Vehicle, acting: Vec3) -> Array:
         """Return what Newton's equation lacks, (3, S, F) N."""

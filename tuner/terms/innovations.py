@@ -115,7 +115,7 @@ class Innovations:
         again, as far as least squares ``had`` it.
         """
         base, tried = self.selected.base, self._tried()
-        within = {name: names for name, names in tried.items() if self._is_in(name)}
+        within = {name: names for name, names in tried.items() if name in self.selected.kept}
         without = {name: names for name, names in within.items() if first and is_stand_in(name)}
         begin = {
             name: names
@@ -200,9 +200,6 @@ class Innovations:
             and not set(row.names) & set(conditions())
             and all(COEFFICIENTS[name].begin is None for name in row.names)
         }
-
-    def _is_in(self, group: str) -> bool:
-        return any(row.group == group and row.kept for row in self.selected.rows)
 
     def _change(self, model: Columns, tried: Groups, kept: Collection[str]) -> Array:
         """Return the step (P,) to the minimum with some groups, the others at neutral values."""

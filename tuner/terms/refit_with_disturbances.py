@@ -105,7 +105,7 @@ def with_disturbances(
         on_message(LACKS)
         return None
     seen = Innovations.of(selected, there, predictor)
-    had = _kept(selected)
+    had = selected.kept
     for number in range(SELECTIONS):
         chosen = seen.selection(had, first=number == 0)
         if chosen is None and number > 0:
@@ -145,7 +145,7 @@ def with_disturbances(
         # without a lag that samples surely call for simulated flights tell nothing of the others
         better = True
     else:
-        if any(is_stand_in(name) and name not in _kept(seen.selected) for name in had):
+        if any(is_stand_in(name) and name not in seen.selected.kept for name in had):
             # what stood in for other terms made another model of it, which says nothing of this one
             fitted = polished(
                 job,
@@ -178,7 +178,7 @@ def _with_lags(
     with_lags = seen.with_lags() if predictor.keeps_track else None
     if with_lags is None:
         return seen, there, predictor
-    without, had = predictor.without_gains, _kept(seen.selected)
+    without, had = predictor.without_gains, seen.selected.kept
     del predictor
     fitted, beside = _descended(with_lags, with_lags.fitted, without)
     if not (beside.keeps_track and beside.is_likelier_than(without)):
@@ -192,11 +192,6 @@ def _with_lags(
         selected, fitted = chosen, chosen.fitted
     fitted, beside = _descended(selected, fitted, beside.without_gains)
     return Innovations.of(selected, fitted, beside), fitted, beside
-
-
-def _kept(selected: Selected) -> list[str]:
-    """Return the groups of terms in a fit."""
-    return [row.group for row in selected.rows if row.kept]
 
 
 def _descended(

@@ -137,23 +137,17 @@ def with_terms_selected(
 
     A job that says exactly what is free names no others, unless its ``terms`` do.
     """
-    clock = time.perf_counter()
-    selected = _selected(job, fitted, on_progress, on_message)
+    clock, candidates = time.perf_counter(), candidates_of(job)
+    selection = Selection(job, fitted, candidates, on_progress, on_message)
+    if not isinstance(job.settings.job.terms, str):
+        selected = Selected(job, fitted, selection.rows_of_named())
+    elif candidates:
+        selected = selection.run()
+    else:
+        rows = () if job.accelerations is None else job.accelerations.rows
+        selected = Selected(job, fitted, rows)
     spent = time.perf_counter() - clock
     return replace(selected, fitted=replace(selected.fitted, wall_time=fitted.wall_time + spent))
-
-
-def _selected(
-    job: Job, fitted: Fitted, on_progress: OnProgress, on_message: Callable[[str], None]
-) -> Selected:
-    if not isinstance(job.settings.job.terms, str):
-        named = Selection(job, fitted, {}, on_progress, on_message).rows_of_named()
-        return Selected(job, fitted, named)
-    candidates = candidates_of(job)
-    if not candidates:
-        rows = () if job.accelerations is None else job.accelerations.rows
-        return Selected(job, fitted, rows)
-    return Selection(job, fitted, candidates, on_progress, on_message).run()
 
 
 def candidates_of(job: Job) -> Groups:

@@ -61,6 +61,11 @@ class Selected:
     base: tuple[Job, Fitted] | None = None
 
     @property
+    def kept(self) -> tuple[str, ...]:
+        """The groups that are in the fit."""
+        return tuple(row.group for row in self.rows if row.kept)
+
+    @property
     def left_out(self) -> tuple[tuple[str, ...], ...]:
         """Names of each group that was tried and not kept, if the flights say anything of it."""
         return tuple(

@@ -326,21 +326,16 @@ def terms_shown(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ...]
     findings = []
     for group in TERMS_SHOWN:
         known = {
-            name: estimate
+            name: uncertainty.estimates[name]
             for name in term_groups()[group]
-            if (estimate := uncertainty.estimates.get(name)) and name not in fitted.held
+            if name in uncertainty.estimates and name not in fitted.held
         }
-        if any(_differs(name, *estimate.ci95) for name, estimate in known.items()):
+        neutral = {name: COEFFICIENTS[name].neutral or 0.0 for name in known}
+        if any(not e.ci95[0] <= neutral[name] <= e.ci95[1] for name, e in known.items()):
             numbers = {name: estimate.value for name, estimate in known.items()}
             numbers |= {f"{name}_error": estimate.std_error for name, estimate in known.items()}
             findings.append(Finding(Code.TERM_SHOWS, "warning", group, numbers, tuple(known)))
     return tuple(findings)
-
-
-def _differs(name: str, low: float, high: float) -> bool:
-    """Return whether an interval of a term's coefficient does not hold its neutral value."""
-    neutral = COEFFICIENTS[name].neutral
-    return neutral is not None and not low <= neutral <= high
 
 
 SIMULATORS_STEP = 1.0 / 4000.0

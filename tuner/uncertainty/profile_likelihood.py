@@ -70,17 +70,19 @@ def profile_likelihood(
     scaled[:, index] = grid
     starts = space.vector_at(scaled)
     chi = _refitted(objective, full_problem.point, criterion, starts, index)
-    values = [space.from_scaled(index, float(x)) for x in grid]
+    values = np.array([space.from_scaled(index, float(x)) for x in grid])
     # as the standard errors do, the likelihood allows for residuals that are not white noise
     rise = (chi - chi.min()) / uncertainty.covariance.beyond_noise[index] ** 2
-    quadratic = ((grid - grid[int(np.argmin(chi))]) / error) ** 2
+    lowest = int(np.argmin(chi))
+    quadratic = ((grid - grid[lowest]) / error) ** 2
+    below = _crossing(values[lowest::-1], rise[lowest::-1])
     return Profile(
         name=name,
         unit=COEFFICIENTS[name].unit,
-        values=values,
+        values=values.tolist(),
         rise=rise.tolist(),
         quadratic=quadratic.tolist(),
-        interval=_crossings(np.array(values), rise),
+        interval=(below, _crossing(values[lowest:], rise[lowest:])),
     )
 
 
@@ -106,14 +108,8 @@ def _refitted(
     return np.asarray(chi)
 
 
-def _crossings(values: Array, rise: Array) -> tuple[float | None, float | None]:
-    """Return where the profile passes the threshold below and above its lowest point."""
-    lowest = int(np.argmin(rise))
-    below = _crossing(values[lowest::-1], rise[lowest::-1])
-    return below, _crossing(values[lowest:], rise[lowest:])
-
-
 def _crossing(values: Array, rise: Array) -> float | None:
+    """Return where a profile passes the threshold, on its way from its lowest point."""
     beyond = np.flatnonzero(rise > THRESHOLD)
     if len(beyond) == 0:
         return None
