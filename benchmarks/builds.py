@@ -25,7 +25,7 @@ from tuner.recordings.states import initial_state
 from tuner.search.job_flights import read_usable
 from tuner.search.problem import job_of
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
-from tuner.uncertainty.holding import with_undetermined_held
+from tuner.uncertainty.identifiability import with_undetermined_held
 
 INLET = "actuator"
 """What the commanded thrust and torque ask of the motors."""

@@ -42,7 +42,7 @@ from tuner.terms.refit_with_disturbances import examined
 from tuner.terms.search_with_terms import search_with_terms
 from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Estimate, Uncertainty, terms_shown
-from tuner.uncertainty.lacking import lack_found
+from tuner.uncertainty.model_error import lack_found
 from tuner.vehicle import COEFFICIENTS, values_of
 
 SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))

@@ -21,7 +21,7 @@ from benchmarks.timing import ROOT
 from tuner.config import Options, settle
 from tuner.core.errors import InputError
 from tuner.evaluate.predict import Predictions, predict, summary
-from tuner.findings.composed import PREDICTED
+from tuner.findings.sentences import PREDICTED
 from tuner.job.run import run
 from tuner.objective.inlets import INLETS
 from tuner.result import BEST_FIT_FILE, RunResult

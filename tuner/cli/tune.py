@@ -27,7 +27,7 @@ def tune(
         Measure where the seconds go: a table by stage, on the terminal and in profile.csv, and
         profile.json, a trace that https://ui.perfetto.dev opens.
     """
-    from tuner.engine.selection import engine_for, job_script_for
+    from tuner.engine.cluster_file import engine_for, job_script_for
 
     if dry_run:
         print(job_script_for(options.cluster))

@@ -1,4 +1,4 @@
-"""What innovations and the closed loop say of coefficients together, strengths learnt with them."""
+"""Fisher information of innovations and of the closed loop, with the disturbances' strengths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The closed loop of rate control, a tick at a time: what pushes it, what is recorded of it.
+"""The state-space model of the filter: the loop of rate control, a tick at a time.
 
 Fed with recorded set-points; what a filter corrects of its state, and what samples say of that.
 """

@@ -15,7 +15,7 @@ from distributed import Client, LocalCluster
 from distributed.security import Security
 
 from tuner.core.errors import InputError
-from tuner.engine.selection import ClusterFile, JobQueue, Kubernetes, extra
+from tuner.engine.cluster_file import ClusterFile, JobQueue, Kubernetes, extra
 
 ANSWER = 10
 """s within which a scheduler answers."""

@@ -30,9 +30,9 @@ from tuner.core.content_store import ContentStore
 from tuner.core.disk import cache_folder
 from tuner.core.errors import EngineError
 from tuner.core.runtime import configure
+from tuner.engine.cluster_file import ClusterFile
 from tuner.engine.clusters import cluster_of, connected
 from tuner.engine.engine import HERE, Engine, Report, Task, using
-from tuner.engine.selection import ClusterFile
 
 
 class Stopped(Exception):  # noqa: N818 (no error: it was asked for)

@@ -15,8 +15,8 @@ from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.predict import Predictions, hold, predict
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, Pose
-from tuner.findings.composed import PREDICTED
 from tuner.findings.findings import Code, Finding
+from tuner.findings.sentences import PREDICTED
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import CLOCKS, OFFSETS

@@ -17,7 +17,7 @@ from sim_jax.constants import GRAVITY
 from sim_jax.crash import AIRBORNE
 from sim_jax.schedule import Schedule
 from tuner.config.job import InletName
-from tuner.findings.composed import PREDICTED
+from tuner.findings.sentences import PREDICTED
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.flight import MOTION
 from tuner.objective.flown import fly

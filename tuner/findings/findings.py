@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from tuner.core.phrases import Worded, as_sentence, listed, percent, shorten
-from tuner.findings import composed
+from tuner.findings import sentences
 from tuner.vehicle.motor_orders import order_in_words
 
 LARGEST = 1e300
@@ -35,17 +35,17 @@ class Code(Worded):
 
     RECORDING = (
         "recording",  # count and numbers, names: code, topic and names of the `Note`
-        composed.recording,
+        sentences.recording,
         "",
     )
     SALVAGED = (
         "salvaged",  # those of `tuner.recordings.notes.Damage`; names: its cause and subject
-        composed.salvaged,
+        sentences.salvaged,
         "Record the flight again if what was lost matters.",
     )
     LEFT_OUT = (
         "left_out",  # names: what the flight lacks, what to do
-        composed.left_out,
+        sentences.left_out,
         lambda finding: as_sentence(finding.names[1]),
     )
     FLIGHT_WORSE = (
@@ -109,8 +109,8 @@ class Code(Worded):
     )
     INLET_CHOSEN = (
         "inlet_chosen",  # correlation, recorded, gyro (Hz); names: inlet, signal, order?
-        composed.inlet_chosen,
-        composed.inlet_remedy,
+        sentences.inlet_chosen,
+        sentences.inlet_remedy,
     )
     MANOEUVRES_CHOSEN = (
         "manoeuvres_chosen",  # fitted, flights; names: recording, numbers
@@ -161,8 +161,8 @@ class Code(Worded):
     )
     SETPOINTS_SCALED = (
         "setpoints_scaled",  # gain, correlation; names: the axis, the law guessed
-        composed.setpoints_scaled,
-        composed.setpoints_remedy,
+        sentences.setpoints_scaled,
+        sentences.setpoints_remedy,
     )
     SETPOINTS_LATE = (
         "setpoints_late",  # seconds
@@ -179,7 +179,7 @@ class Code(Worded):
     )
     SETPOINTS_FOREIGN = (
         "setpoints_foreign",  # axis -> correlation
-        composed.setpoints_foreign,
+        sentences.setpoints_foreign,
         "Give the controller that flew (--controller), or enter below it (inlet: body_rate).",
     )
     HEADING_FLOWN = (
@@ -296,53 +296,53 @@ class Code(Worded):
     )
     HOLDING_BETTER = (
         "holding_better",  # seconds, QUANTITY, QUANTITY_held; names: QUANTITYs
-        composed.holding_better,
+        sentences.holding_better,
         "Predict less far ahead, or with more recorded.",
     )
     INERTIA_BALANCED = (
         "inertia_balanced",  # error, NAME_fitted, NAME_balanced; names: NAMEs
-        composed.inertia_balanced,
+        sentences.inertia_balanced,
         "",
     )
     INERTIA_NOT_BALANCED = (
         "inertia_not_balanced",  # likewise
-        composed.inertia_balanced,
+        sentences.inertia_balanced,
         "Take these inertias for effective ones, and measure them on the ground (tune bench).",
     )
     DISTURBANCES_FOLLOWED = (
         "disturbances_followed",  # gust, thrust (shares), both _seconds
-        composed.disturbances_followed,
+        sentences.disturbances_followed,
         "",
     )
     FLIGHT_NOT_FLOWN = (
         "flight_not_flown",  # rmse, others (m), seconds; beyond, beyond_recorded (shares)?
-        composed.flight_not_flown,
-        composed.flight_not_flown_remedy,
+        sentences.flight_not_flown,
+        sentences.flight_not_flown_remedy,
     )
     LAW_LACKING = (
         "law_lacking",  # share; names: axis, what it goes with, coefficients it moves
-        composed.law_lacking,
-        composed.law_remedy,
+        sentences.law_lacking,
+        sentences.law_remedy,
     )
     CONTROLLER_ANSWERS = (
         "controller_answers",  # AXIS, AXIS_error; names: P, I or late, the AXES
-        composed.controller_answers,
+        sentences.controller_answers,
         "Compare the controller file with the autopilot's parameters, as they are now.",
     )
     ROTOR_SPEEDS_LATE = (
         "rotor_speeds_late",  # seconds
-        composed.rotor_speeds_late,
+        sentences.rotor_speeds_late,
         "Log them unfiltered, and stamped when they were measured.",
     )
     ROTOR_CHANGED = (
         "rotor_changed",  # seconds, rotor (from 1), loss (share); names: its place
-        composed.rotor_changed,
+        sentences.rotor_changed,
         "Look at its propeller, motor and mount before you fly again.",
     )
     TERM_SHOWS = (
         "term_shows",  # NAME, NAME_error; names: NAMEs; the subject is their group
-        composed.term_shows,
-        composed.term_remedy,
+        sentences.term_shows,
+        sentences.term_remedy,
     )
     INPUT_LATE = (
         "input_late",  # seconds
@@ -359,7 +359,7 @@ class Code(Worded):
     )
     FLIGHT_UNMATCHED = (
         "flight_unmatched",  # channel -> multiple of the noise
-        composed.flight_unmatched,
+        sentences.flight_unmatched,
         "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ.",
     )
     MODEL_UNMATCHED = (

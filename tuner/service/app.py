@@ -22,7 +22,7 @@ from starlette.types import ASGIApp
 from tuner.core.errors import InputError
 from tuner.core.runtime import installed
 from tuner.core.validation import first_complaint
-from tuner.engine.selection import engine_for
+from tuner.engine.cluster_file import engine_for
 from tuner.service import tokens
 from tuner.service.errors import ServiceError
 from tuner.service.http import api, watching

@@ -1,4 +1,4 @@
-"""Which groups of coefficients a fit may add, and its problem with all of them in it."""
+"""Candidate terms: the groups of coefficients that a fit may add, and problems with them free."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well fits to the other flights predict each flight: one linear step, then a simulation.
+"""Cross-validation by flights: each predicted by a fit to the others, one linear step away.
 
 A flight that is alone is predicted section by section, by fits to its other sections.
 """
@@ -16,7 +16,7 @@ from tuner.core.numerics import scaled_solve
 from tuner.objective.criterion import OFFSET_SD, Point, SegmentSums
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
-from tuner.terms.linear import Columns, Linear
+from tuner.terms.linearisation import Columns, Linear
 
 LONGEST_STEP = 1.0
 """Standard deviations of a prior that a coefficient may move in one linear step."""

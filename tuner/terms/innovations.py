@@ -1,4 +1,4 @@
-"""Which terms innovations call for once disturbances are estimated, and how far others matter.
+"""Selection of terms by the innovations of a Kalman filter, once disturbances are estimated.
 
 Least squares sees a term through gusts that the loop has turned into a slow wander of all signals,
 and hardly tells it from chance. Innovations are white: they tell the same term up to ten times as
@@ -27,9 +27,9 @@ from tuner.terms.candidates import (
     with_free,
     with_groups,
 )
-from tuner.terms.doubt import SMALLEST, in_doubt
 from tuner.terms.held_out_score import vector_after
-from tuner.terms.linear import Columns, Linear, linear_of, neutral_of
+from tuner.terms.linearisation import Columns, Linear, linear_of, neutral_of
+from tuner.terms.model_averaging import SMALLEST, in_doubt
 from tuner.terms.score import EARNING, score, surviving
 from tuner.terms.selection_state import Selected
 from tuner.vehicle import COEFFICIENTS, conditions

@@ -29,8 +29,8 @@ from tuner.terms.search_with_terms import candidates_of
 from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine, full_problem_of
-from tuner.uncertainty.holding import with_undetermined_held
-from tuner.uncertainty.lacking import alternatives_of, lack_of
+from tuner.uncertainty.identifiability import with_undetermined_held
+from tuner.uncertainty.model_error import alternatives_of, lack_of
 
 CONTRADICTS = 4.0
 """Standard errors by which no coefficient may move. Those of least squares are known from some ten

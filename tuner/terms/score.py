@@ -1,4 +1,7 @@
-"""What one group of coefficients is worth: in the fit, against chance, and in what is left out."""
+"""The score of a group of terms: its gain in the fit, its significance, its gain in held-out data.
+
+`score` tests one group beside a model, `surviving` eliminates groups backwards.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to im
 
 from tuner.core.numerics import scaled_inverse, scaled_solve, symmetric_eigen, unit_diagonal
 from tuner.objective.information import BLOCK
-from tuner.terms.linear import RIDGE, SECTIONS, Columns, Linear
+from tuner.terms.linearisation import RIDGE, SECTIONS, Columns, Linear
 from tuner.uncertainty.overdispersion import STRETCH
 from tuner.vehicle.selection_table import SelectionCode
 

@@ -1,4 +1,4 @@
-"""The search of a job and the selection of its terms: one is not finished without the other."""
+"""The search of a job together with the selection of its terms, and the terms it begins with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which terms beyond the base model a job's fit holds, and the fit with them.
+"""Selection of terms beyond the base model by whole flights, and the fit with them.
 
 One Jacobian scores all candidate groups at the fitted point. If one of them gains by more than
 chance all are fitted together, from where the search began; backward elimination takes away those
@@ -43,9 +43,9 @@ from tuner.terms.candidates import (
     with_groups,
     with_terms,
 )
-from tuner.terms.doubt import in_doubt
 from tuner.terms.held_out_score import predicted_losses, vector_after
-from tuner.terms.linear import linear_at
+from tuner.terms.linearisation import linear_at
+from tuner.terms.model_averaging import in_doubt
 from tuner.terms.score import Score, score, surviving
 from tuner.terms.selection_state import LinearisedFit, Selected, offsets_of, row_of
 from tuner.vehicle.model import with_coefficients

@@ -1,4 +1,4 @@
-"""Where a selection of terms stands, and what it ends with."""
+"""Records of a selection of terms: the fit under way, its table, and what it ends with."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sim_jax.numeric import Array
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.terms.linear import Linear
+from tuner.terms.linearisation import Linear
 from tuner.terms.score import EARNING, Score
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 

@@ -1,4 +1,4 @@
-"""How uncertain the fitted coefficients are, residuals that are not white noise included."""
+"""The covariance of the fitted coefficients: the sandwich estimate, for residuals that wander."""
 
 from __future__ import annotations
 
@@ -90,10 +90,10 @@ def covariance_of(information: FisherInformation) -> Covariance:
     bootstrap methods for cluster-robust inference", 2023). What one stretch alone determines the
     others tell so little of that the jackknife would multiply white noise without bound: beyond a
     leverage of one half, half of the correction is for it, and white noise counts no more than
-    twice. Few stretches make that estimate
-    erratic: what is allowed for is weighed against what independent residuals would say, by the
-    degrees of freedom that the stretches amount to (`allowed_for`; Bell and McCaffrey, "Bias
-    reduction in standard errors for linear regression with multi-stage samples", 2002).
+    twice. Few stretches make that estimate erratic: what is allowed for is weighed against what
+    independent residuals would say, by the degrees of freedom that the stretches amount to
+    (`overdispersion_factors`; Bell and McCaffrey, "Bias reduction in standard errors for linear
+    regression with multi-stage samples", 2002).
     """
     independent = IndependentErrors.of(information)
     inverse, matrix = independent.inverse, independent.matrix

@@ -1,4 +1,4 @@
-"""How well every coefficient is known and by what, and what its standard error is made of."""
+"""Estimates: each coefficient's value, standard error by its parts, interval and verdict."""
 
 from __future__ import annotations
 
@@ -139,10 +139,10 @@ def uncertainty_at(
     reference, bounds = references(space, vector), _bounds(space, vector)
     of_residuals = covariance_of(information)
     parts = parts_of(information, of_residuals.error, _lags(space, scaled))
-    error = quoted(parts)
+    error = total_error(parts)
     covariance = of_residuals.widened(error)
     shares, prior_share = _shares(information, len(flights))
-    directions = weakest(covariance.shape, reference, space.names)
+    directions = worst_directions(covariance.shape, reference, space.names)
     estimates: dict[str, Estimate] = {}
     for index, parameter in enumerate(space.parameters):
         partner, correlation = _partner(covariance.correlation[index], index, space.names)
@@ -352,7 +352,7 @@ TELLS = 1e-3
 """Share of a variance by which it must grow without a flight that tells of the coefficient."""
 
 
-def quoted(parts: Mapping[str, Array]) -> Array:
+def total_error(parts: Mapping[str, Array]) -> Array:
     """Return the honest standard error (K,) from its parts, as of `parts_of`.
 
     Noise, residuals and left-out flights show the same errors in three ways, of which the largest
@@ -416,7 +416,7 @@ def left_out(information: FisherInformation) -> Array | None:
     H - H_i is summed up from the others, for the difference would be rounding errors of any sign.
     (The plain jackknife takes all flights for alike, and one that alone tells of a coefficient for
     one that contradicts the others.) Errors that last for a whole flight show here alone; few
-    flights leave open how large they are (`allowed_for`).
+    flights leave open how large they are (`overdispersion_factors`).
     """
     parts = flights_apart(information)
     if parts.count < FEWEST:
@@ -452,7 +452,9 @@ UNDETERMINED = 1.0
 """Standard error along a direction above which the flights do not determine it at all."""
 
 
-def weakest(covariance: Array, reference: Array, names: Sequence[str]) -> tuple[Direction, ...]:
+def worst_directions(
+    covariance: Array, reference: Array, names: Sequence[str]
+) -> tuple[Direction, ...]:
     """Return the worst-determined combinations, worst first.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Everything that follows from one Jacobian at the end of a fit."""
+"""The examination of a fit, from one Jacobian: uncertainty, sensitivity, bias and residuals."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from tuner.objective.normal import Objective, portion, portions
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import LACK, Uncertainty, at_rest, references, uncertainty_at
-from tuner.uncertainty.lacking import Lack
 from tuner.uncertainty.local_sensitivity import LocalSensitivity, local_sensitivity
+from tuner.uncertainty.model_error import Lack
 from tuner.uncertainty.records import (
     CoefficientKnowledge,
     Knowledge,

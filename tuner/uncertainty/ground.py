@@ -1,4 +1,4 @@
-"""Ground measurements beside flights: each alone, both together, and whether they contradict."""
+"""Ground measurements against flights: each coefficient by either alone and by both together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""How much larger than noise says errors may be: from stretches of time, flights and residuals."""
+"""Overdispersion: how much larger errors may be than noise says, by stretches of time and flights.
+
+`overdispersion_factors` weighs an observed scatter against noise, `IndependentErrors` is what noise
+says, and `Stretches` are the pieces whose scatter is observed.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,9 @@ FREEDOM = (1.0, 200.0)
 HALVINGS = 40
 
 
-def allowed_for(ratio: Array, freedom: Array, correlation: Array, expected: Array) -> Array:
+def overdispersion_factors(
+    ratio: Array, freedom: Array, correlation: Array, expected: Array
+) -> Array:
     """Return the factors (K,) on the standard errors that noise says.
 
     With them, 1.96 standard errors are 95 % intervals of errors whose variance is 1 + τ² times the
@@ -135,7 +141,7 @@ class IndependentErrors:
         observed
             (K,) the variances that the flights are seen to have.
         freedom
-            (K,) degrees of freedom of what was observed; see `allowed_for`.
+            (K,) degrees of freedom of what was observed; see `overdispersion_factors`.
         """
         variance = np.diag(self.matrix)
         # where the prior alone speaks, what is left of the flights' share is rounding, of any sign
@@ -143,7 +149,9 @@ class IndependentErrors:
         ratio = np.where(speaks, observed / np.where(speaks, self.from_flights, 1.0), 1.0)
         covariance = self.inverse.matrix
         own = np.sqrt(np.diag(covariance))
-        allowed = allowed_for(ratio, freedom, covariance / np.outer(own, own), self.disturbed)
+        allowed = overdispersion_factors(
+            ratio, freedom, covariance / np.outer(own, own), self.disturbed
+        )
         beyond = np.where(speaks, self.from_flights * (allowed**2 - 1.0), 0.0)
         return np.asarray(np.sqrt(variance + beyond))
 

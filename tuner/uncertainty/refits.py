@@ -1,4 +1,4 @@
-"""A fit to other flights: with folds left out, and with flights drawn with replacement."""
+"""Cross-validation and bootstrap: the fit repeated without a flight, or with flights redrawn."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from tuner.config.job import JobFile
 from tuner.core.errors import ConfigError
 from tuner.core.validation import FORMS, OF_ANOTHER_FORM, complaint, expected
 from tuner.core.yaml_section import Section, build
-from tuner.engine.selection import JobQueue
+from tuner.engine.cluster_file import JobQueue
 from tuner.ground.plan import BenchFile
 from tuner.recordings.topics import TopicMap
 from tuner.vehicle import ControllerFile, VehicleFile
@@ -50,7 +50,7 @@ def models() -> list[type[BaseModel]]:
             (
                 "tuner.config",
                 "tuner.ground.plan",
-                "tuner.engine.selection",
+                "tuner.engine.cluster_file",
                 "tuner.recordings.topics",
                 "tuner.service.request",
                 "tuner.evaluate.simulate",

@@ -45,7 +45,7 @@ from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.estimates import STEP
 from tuner.uncertainty.examination import examine
-from tuner.uncertainty.lacking import alternatives_of
+from tuner.uncertainty.model_error import alternatives_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

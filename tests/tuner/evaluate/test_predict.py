@@ -7,7 +7,7 @@ import pytest
 
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.predict import hold, predict, summary
-from tuner.findings.composed import PREDICTED
+from tuner.findings.sentences import PREDICTED
 from tuner.recordings.flight import Series
 from tuner.recordings.states import AROUND
 from tuner.search.job_flights import Recording

@@ -16,7 +16,7 @@ from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.search.progress import beginning, criterion_of
 from tuner.search.stages import WHOLE, plan
-from tuner.uncertainty.holding import with_undetermined_held
+from tuner.uncertainty.identifiability import with_undetermined_held
 from tuner.vehicle import values_of, with_values
 
 WRONG = {"inertia_xx": 1.3, "inertia_yy": 0.8, "motor_constant": 1.1, "moment_constant": 0.8}

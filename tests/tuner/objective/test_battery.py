@@ -31,7 +31,7 @@ from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.search.normal_equations import normal_equations
 from tuner.uncertainty.estimates import DRAWS, STEP
-from tuner.uncertainty.lacking import alternatives_of
+from tuner.uncertainty.model_error import alternatives_of
 
 NOISE = 0.02
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tuner.core.numerics import scaled_solve
 from tuner.objective.information import FisherInformation
 from tuner.uncertainty.covariance import covariance_of
-from tuner.uncertainty.estimates import _shares, left_out, parts_of, quoted
+from tuner.uncertainty.estimates import _shares, left_out, parts_of, total_error
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def test_every_error_is_a_number(fit: Fit) -> None:
     covariance = covariance_of(information)
     size = len(fit.decades)
     parts = parts_of(information, covariance.error, np.zeros(size))
-    for errors in (covariance.error, covariance.data_error, quoted(parts)):
+    for errors in (covariance.error, covariance.data_error, total_error(parts)):
         assert np.isfinite(errors).all()
         assert (errors > 0.0).all()
     shares, of_priors = _shares(information, len(fit.tells))

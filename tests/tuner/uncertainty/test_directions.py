@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuner.uncertainty.estimates import is_common_scale, weakest
+from tuner.uncertainty.estimates import is_common_scale, worst_directions
 
 NAMES = ("mass", "inertia_xx", "motor_constant", "input_scaling")
 
@@ -16,14 +16,14 @@ def covariance_of(vector: list[float], error: float) -> np.ndarray:
 
 
 def test_a_common_scale_is_named_as_such() -> None:
-    worst = weakest(covariance_of([1, 1, 1, 0], 30.0), np.ones(4), NAMES)[0]
+    worst = worst_directions(covariance_of([1, 1, 1, 0], 30.0), np.ones(4), NAMES)[0]
     assert worst.null
     assert worst.common_scale
     assert set(worst.moves) == {"mass", "inertia_xx", "motor_constant"}
 
 
 def test_a_trade_off_is_named_with_its_proportion_and_size() -> None:
-    worst = weakest(covariance_of([0, 0, 1, -0.5], 0.1), np.ones(4), NAMES)[0]
+    worst = worst_directions(covariance_of([0, 0, 1, -0.5], 0.1), np.ones(4), NAMES)[0]
     assert not worst.null
     assert worst.moves == pytest.approx({"motor_constant": 1.0, "input_scaling": -0.5})
     # one standard error along the eigenvector moves its largest member by 0.1·1/√1.25
@@ -31,7 +31,7 @@ def test_a_trade_off_is_named_with_its_proportion_and_size() -> None:
 
 
 def test_one_coefficient_alone() -> None:
-    worst = weakest(covariance_of([0, 1, 0, 0], 0.2), np.ones(4), NAMES)[0]
+    worst = worst_directions(covariance_of([0, 1, 0, 0], 0.2), np.ones(4), NAMES)[0]
     assert worst.moves == {"inertia_xx": 1.0}
     assert worst.error == pytest.approx(0.2, rel=1e-3)
 
@@ -39,7 +39,7 @@ def test_one_coefficient_alone() -> None:
 def test_the_reference_says_what_counts_as_a_hundred_percent() -> None:
     covariance = np.diag([1e-4, 1e-4, 1e-4, 4e-6])
     reference = np.array([1.0, 1.0, 1.0, 0.01])
-    worst = weakest(covariance, reference, NAMES)[0]
+    worst = worst_directions(covariance, reference, NAMES)[0]
     assert set(worst.moves) == {"input_scaling"}
     assert worst.error == pytest.approx(0.2)
 

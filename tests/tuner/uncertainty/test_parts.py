@@ -9,8 +9,15 @@ import pytest
 from scipy import stats
 
 from tuner.objective.information import FisherInformation
-from tuner.uncertainty.estimates import DRAWS, READINGS, left_out, noise_alone, parts_of, quoted
-from tuner.uncertainty.overdispersion import allowed_for
+from tuner.uncertainty.estimates import (
+    DRAWS,
+    READINGS,
+    left_out,
+    noise_alone,
+    parts_of,
+    total_error,
+)
+from tuner.uncertainty.overdispersion import overdispersion_factors
 
 COUNT, FLIGHTS, LENGTH = 3, 4, 80
 ONE, ALIKE = np.ones((1, 1)), np.ones(1)
@@ -99,7 +106,7 @@ def test_flights_do_not_disagree_because_the_search_stopped_short(one_tells):
     at_minimum, off = (parts_of(each, exact, lags) for each in made)
     assert at_minimum["search"] == pytest.approx(0.0, abs=1e-9)
     assert off["search"] == pytest.approx(0.02)
-    assert quoted(off) == pytest.approx(np.hypot(quoted(at_minimum), 0.02))
+    assert total_error(off) == pytest.approx(np.hypot(total_error(at_minimum), 0.02))
     where = np.array([True, False, False])
     assert made[1].resting(where).slope[0] == pytest.approx(0.0, abs=1e-9)
     assert made[1].resting(where).slope[1:] == pytest.approx(made[1].slope[1:])
@@ -128,10 +135,12 @@ def test_the_quoted_error_holds_every_part():
         np.zeros(COUNT),
     )
     assert spread["step"] == pytest.approx(np.abs(step), abs=1e-9)
-    assert quoted(spread) == pytest.approx(np.hypot(spread["left_out"], np.abs(step)), rel=1e-6)
+    assert total_error(spread) == pytest.approx(
+        np.hypot(spread["left_out"], np.abs(step)), rel=1e-6
+    )
     doubt = 10.0 * spread["left_out"]
     doubted = parts_of(replace(information, in_doubt=doubt), np.full(COUNT, 0.01), np.zeros(COUNT))
-    assert quoted(doubted) == pytest.approx(np.hypot(spread["left_out"], doubt))
+    assert total_error(doubted) == pytest.approx(np.hypot(spread["left_out"], doubt))
 
 
 def test_a_lag_is_known_no_better_than_half_a_simulators_step():
@@ -163,7 +172,7 @@ def test_readings_drawn_again_count_as_far_as_they_scatter_the_estimates():
     assert np.mean(held) == pytest.approx(0.95, abs=0.015)
     without = parts_of(replace(information, changes={}), np.full(COUNT, 1e-9), np.zeros(COUNT))
     assert "readings" not in without
-    assert quoted(spread) == pytest.approx(np.hypot(quoted(without), spread["readings"]))
+    assert total_error(spread) == pytest.approx(np.hypot(total_error(without), spread["readings"]))
 
 
 @pytest.mark.parametrize("excess", [0.0, 1.0, 5.0, 1e4])
@@ -173,7 +182,10 @@ def test_what_is_allowed_for_covers_whatever_adds_to_noise(freedom, excess):
     variance = 1.0 + excess**2
     ratio = variance * generator.chisquare(freedom, 2000) / freedom
     factor = np.concatenate(
-        [allowed_for(one[None], np.array([float(freedom)]), ONE, ALIKE) for one in ratio[:300]]
+        [
+            overdispersion_factors(one[None], np.array([float(freedom)]), ONE, ALIKE)
+            for one in ratio[:300]
+        ]
     )
     covered = np.abs(np.sqrt(variance) * generator.normal(size=len(factor))) < 1.96 * factor
     assert covered.mean() > 0.88
@@ -190,10 +202,10 @@ def test_coefficients_share_what_is_known_of_the_disturbance(excess, width):
     for _ in range(100):
         sd = np.sqrt(1.0 + (excess * np.exp(0.5 * generator.normal(size=12))) ** 2)
         ratio, freedom = sd**2 * generator.chisquare(3, 12) / 3.0, np.full(12, 3.0)
-        factor = allowed_for(ratio, freedom, own, np.ones(12))
+        factor = overdispersion_factors(ratio, freedom, own, np.ones(12))
         covered.append(np.abs(sd * generator.normal(size=12)) < 1.96 * factor)
         shared.append(factor / sd)
-        alone.append(allowed_for(ratio[:1], freedom[:1], ONE, ALIKE) / sd[:1])
+        alone.append(overdispersion_factors(ratio[:1], freedom[:1], ONE, ALIKE) / sd[:1])
     assert 0.91 < np.mean(covered) < 0.99
     assert np.median(shared) < width
     assert np.median(shared) < np.median(alone) + 0.1
@@ -201,7 +213,7 @@ def test_coefficients_share_what_is_known_of_the_disturbance(excess, width):
 
 def test_one_coefficient_that_scatters_is_not_lost_among_others():
     ratio = np.append(np.ones(11), 400.0)
-    factor = allowed_for(ratio, np.full(12, 3.0), np.eye(12), np.ones(12))
+    factor = overdispersion_factors(ratio, np.full(12, 3.0), np.eye(12), np.ones(12))
     assert factor[-1] > 15.0
     assert factor[:-1].max() < 1.4
 
@@ -209,10 +221,10 @@ def test_one_coefficient_that_scatters_is_not_lost_among_others():
 def test_coefficients_that_go_together_are_one_observation():
     ratio, freedom = np.full(6, 0.5), np.full(6, 3.0)
     as_one, apart = (
-        allowed_for(ratio, freedom, correlation, np.ones(6))[0]
+        overdispersion_factors(ratio, freedom, correlation, np.ones(6))[0]
         for correlation in (np.ones((6, 6)), np.eye(6))
     )
-    assert as_one == pytest.approx(allowed_for(ratio[:1], freedom[:1], ONE, ALIKE)[0])
+    assert as_one == pytest.approx(overdispersion_factors(ratio[:1], freedom[:1], ONE, ALIKE)[0])
     assert apart < as_one
 
 
@@ -223,9 +235,9 @@ def test_how_disturbed_the_channels_are_says_how_the_coefficients_differ():
     covered, widths = [], {"alike": [], "apart": []}
     for _ in range(100):
         ratio, freedom = sd**2 * generator.chisquare(1.5, 12) / 1.5, np.full(12, 1.5)
-        alike = allowed_for(ratio, freedom, own, np.ones(12)) / sd
-        apart = allowed_for(ratio, freedom, own, 0.1 * sd**2) / sd
-        assert apart == pytest.approx(allowed_for(ratio, freedom, own, sd**2) / sd)
+        alike = overdispersion_factors(ratio, freedom, own, np.ones(12)) / sd
+        apart = overdispersion_factors(ratio, freedom, own, 0.1 * sd**2) / sd
+        assert apart == pytest.approx(overdispersion_factors(ratio, freedom, own, sd**2) / sd)
         widths["alike"].append(alike)
         widths["apart"].append(apart)
         covered.append(np.abs(generator.normal(size=12)) < 1.96 * apart)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse
-from tuner.findings.composed import PREDICTED
+from tuner.findings.sentences import PREDICTED
 from tuner.recordings.flight import Array
 from tuner.report.chart import (
     FITTED,

@@ -1,4 +1,4 @@
-"""A fit in linear approximation about a point: what adding, freeing or leaving out would change.
+"""A fit linearised about its point: what adding a term, freeing or leaving out would change.
 
 The loss of each stretch of time is a quadratic in the coefficients, from one Jacobian:
 ``L(x + δ) = L(x) + sᵀδ + ½ δᵀHδ`` in the scaled coordinates, each segment's start and each flight's

@@ -1,4 +1,4 @@
-"""How far a fit would move with terms that are not in it, by what the flights say of them."""
+"""Bayesian model averaging: how far a fit would move with the terms that are not in it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuner.core.numerics import scaled_solve, symmetric_eigen
-from tuner.terms.linear import RIDGE, Array, Columns, Linear
+from tuner.terms.linearisation import RIDGE, Array, Columns, Linear
 from tuner.uncertainty.covariance import scatter
-from tuner.uncertainty.overdispersion import STRETCH, allowed_for
+from tuner.uncertainty.overdispersion import STRETCH, overdispersion_factors
 
 HIDDEN, SMALLEST = 0.4, 0.1
 """Of the standard error with which the flights tell a term, and of its usual size (its prior's
@@ -102,7 +102,7 @@ class Evidence:
         )
         seen, freedom = np.diag(meat)[len(model) :] / values, freedom[len(model) :]
         alike = np.ones(len(group))
-        allowed = allowed_for(seen, freedom, np.diag(alike), alike)
+        allowed = overdispersion_factors(seen, freedom, np.diag(alike), alike)
         return Evidence(moves, -slope / values, allowed**2 / values)
 
     def mean_square(self, presence: float) -> Array:

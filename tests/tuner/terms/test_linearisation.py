@@ -6,7 +6,7 @@ from tests.tuner.uncertainty.making import controller_file, vehicle_file
 from tuner.config import JobFile
 from tuner.objective.information import BLOCK, FisherInformation
 from tuner.objective.space import space_of
-from tuner.terms.linear import linear_of, neutral_of
+from tuner.terms.linearisation import linear_of, neutral_of
 from tuner.terms.score import score
 
 FLIGHTS, SECONDS, WINDOW, STRIDE, RATE = 3, 24.0, 0.5, 0.25, 40

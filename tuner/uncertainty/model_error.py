@@ -1,7 +1,7 @@
-"""The same problem simulated differently: finer, fed otherwise, or with what its model lacks.
+"""Model error: a fit's problem simulated finer, fed otherwise, or with what its model lacks.
 
-By how much coefficients then have to move is a part of their standard errors. What flights hold
-that the model does not: the laws that `tuner.equation_error.unexplained` finds push the simulated
+By how much coefficients then have to move is a part of their standard errors. What the model lacks
+is seen in the recordings: the laws that `tuner.equation_error.unexplained` finds push the simulated
 flights, each along its recording, and a rate controller that answers otherwise than its file
 (`tuner.equation_error.rate_controller`) flies them so.
 """

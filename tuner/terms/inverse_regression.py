@@ -1,4 +1,4 @@
-"""Inertia at which recorded motion and measured rotor speeds balance, unless it misleads.
+"""Inverse regression: the inertia at which recorded motion and measured rotor speeds balance.
 
 A simulation that is fed measured rotor speeds is fed their errors too: noise, and a drift within
 seconds. Least squares on what comes out then shrinks what the rotors do, the more the noisier they
@@ -63,7 +63,7 @@ from tuner.search.optimiser import Free, StageProblem
 from tuner.search.problem import Job
 from tuner.search.stages import Stage
 from tuner.uncertainty.examination import Examination, examine
-from tuner.uncertainty.lacking import alternatives_of
+from tuner.uncertainty.model_error import alternatives_of
 
 STRETCH = 0.2
 """s that the equations are weighed over: noise beyond some 5 Hz is averaged out."""

@@ -11,8 +11,8 @@ from tests.tuner.job.test_windows import fitted_through, job_through
 from tuner.findings.findings import Code
 from tuner.objective.criterion import Point
 from tuner.recordings.flight import Series
-from tuner.terms import balanced_inertia as balanced
-from tuner.terms.balanced_inertia import balance_of, with_inputs_balanced
+from tuner.terms import inverse_regression as balanced
+from tuner.terms.inverse_regression import balance_of, with_inputs_balanced
 from tuner.uncertainty.examination import examine
 from tuner.vehicle import values_of
 

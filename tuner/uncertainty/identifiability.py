@@ -1,4 +1,4 @@
-"""Coefficients that the flights do not identify are held at initial values, the rest refitted.
+"""Identifiability: what the flights do not identify is held at initial values, the rest refitted.
 
 Coefficients that trade off exactly keep their product however far they drift. Setting each back to
 its initial value would worsen the fit; so one of every such group, the stand-in, is held, and the
@@ -31,7 +31,7 @@ from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
-from tuner.uncertainty.lacking import alternatives_of, lack_of
+from tuner.uncertainty.model_error import alternatives_of, lack_of
 from tuner.uncertainty.verdict import IDENTIFIABLE_ERROR, ReasonCode
 from tuner.vehicle import COEFFICIENTS
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tuner.terms.candidates import presence_of
-from tuner.terms.doubt import Evidence, in_doubt
-from tuner.terms.linear import Linear
+from tuner.terms.linearisation import Linear
+from tuner.terms.model_averaging import Evidence, in_doubt
 
 MODEL, TERM = np.array([0]), np.array([1])
 PRESENT = (TERM, 1.0)

@@ -7,8 +7,8 @@ import pytest
 
 from tuner.config import JobFile
 from tuner.terms.selection_state import Selected
-from tuner.uncertainty import holding
-from tuner.uncertainty.holding import stand_ins_of, with_undetermined_held
+from tuner.uncertainty import identifiability
+from tuner.uncertainty.identifiability import stand_ins_of, with_undetermined_held
 from tuner.uncertainty.verdict import Reason, ReasonCode
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
@@ -51,17 +51,17 @@ def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, afte
     fitted = SimpleNamespace(objective=objective, criterion=None, point=1000.0, held={})
     traded = {"motor_constant": "input_scaling", "input_scaling": "input_scaling"}
     alone = {"time_constant_up": "time_constant_up"}  # open by itself: predicting fits keep it
-    monkeypatch.setattr(holding, "alternatives_of", lambda *_: None)
-    monkeypatch.setattr(holding, "lack_of", lambda *_: None)
+    monkeypatch.setattr(identifiability, "alternatives_of", lambda *_: None)
+    monkeypatch.setattr(identifiability, "lack_of", lambda *_: None)
     nothing = SimpleNamespace(uncertainty=SimpleNamespace(names=()))
-    monkeypatch.setattr(holding, "examine", lambda *_, **__: nothing)
-    monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded | alone)
+    monkeypatch.setattr(identifiability, "examine", lambda *_, **__: nothing)
+    monkeypatch.setattr(identifiability, "stand_ins_of", lambda _: traded | alone)
 
     def hold(_, fitted, stand_ins, __, **___):
         assert stand_ins == traded
         return SimpleNamespace(**vars(fitted) | {"point": after, "held": stand_ins})
 
-    monkeypatch.setattr(holding, "hold", hold)
+    monkeypatch.setattr(identifiability, "hold", hold)
     said = []
     job = SimpleNamespace(settings=SimpleNamespace(job=JobFile()), fitted=())
     rest, _ = with_undetermined_held(job, fitted, lambda *_: None, said.append)
@@ -97,15 +97,15 @@ def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
     examined = SimpleNamespace(
         uncertainty=SimpleNamespace(names=(name,), estimates={name: estimate})
     )
-    monkeypatch.setattr(holding, "alternatives_of", lambda *_: None)
-    monkeypatch.setattr(holding, "lack_of", lambda *_: None)
-    monkeypatch.setattr(holding, "examine", lambda *_, **__: examined)
-    monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded)
+    monkeypatch.setattr(identifiability, "alternatives_of", lambda *_: None)
+    monkeypatch.setattr(identifiability, "lack_of", lambda *_: None)
+    monkeypatch.setattr(identifiability, "examine", lambda *_, **__: examined)
+    monkeypatch.setattr(identifiability, "stand_ins_of", lambda _: traded)
 
     def hold(_, fitted, stand_ins, __, **___):
         return SimpleNamespace(**vars(fitted) | {"held": stand_ins})
 
-    monkeypatch.setattr(holding, "hold", hold)
+    monkeypatch.setattr(identifiability, "hold", hold)
     terms = {"ground_effect": ("ground_effect",)}
     settings = SimpleNamespace(job=file)
     job, said = SimpleNamespace(settings=settings, first_terms=terms, fitted=()), []

@@ -30,7 +30,7 @@ from tuner.objective.segments import Measured, Segments
 from tuner.objective.space import space_of
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.uncertainty.examination import examine
-from tuner.uncertainty.lacking import Lack, lack_found, lack_of
+from tuner.uncertainty.model_error import Lack, lack_found, lack_of
 from tuner.vehicle import with_values
 from tuner.vehicle.model import model_of, schedule_of
 
