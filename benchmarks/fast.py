@@ -1,4 +1,4 @@
-"""Fast flights by rotor speed, half of whose turning no recording shows: what ``tune`` finds.
+"""Fast flights, half of whose turning neither rotor speeds nor commands show: what is found.
 
 Each vehicle of `benchmarks.fast_flights` is fitted from what scaling laws say of it. Seeds on which
 nothing was chosen begin at 10.
@@ -25,8 +25,12 @@ from tuner.search.inlet_choice import regressors
 from tuner.search.job_flights import read_usable
 from tuner.vehicle import VehicleFile
 
-LABS = ((10, 400.0), (11, 100.0))
-"""Seeds, and Hz at which rotor speeds are recorded."""
+LABS: tuple[tuple[int, float, fast_flights.Fed], ...] = (
+    (10, 400.0, "rotor_speed"),
+    (11, 100.0, "rotor_speed"),
+    (12, 400.0, "command"),
+)
+"""Seeds, and what is recorded of the rotors at how many Hz."""
 SECONDS = 10.0
 """s of each flight."""
 PHYSICAL = ("inertia_xx", "inertia_yy", "inertia_zz", "motor_constant", "moment_constant")
@@ -41,24 +45,25 @@ def measure() -> Section:
         f"{what} after {ahead:g} s" for ahead in AHEAD for what in ("fit", "regression", "hold")
     ]
     rows = []
-    for seed, rate in LABS:
+    for seed, rate, fed in LABS:
         with tempfile.TemporaryDirectory() as name:
-            cells = _row(seed, rate, Path(name))
-            rows.append([str(seed), f"{rate:.0f} Hz", *cells])
+            cells = _row(seed, rate, fed, Path(name))
+            rows.append([str(seed), f"{fed.replace('_', ' ')}, {rate:.0f} Hz", *cells])
     text = (
         "Coefficients over the truth, with half their 95 % interval; how many whose truth is known "
         "lie within theirs; and the mean error of body rate in rad/s of the two flights held "
         "out, predicted open loop from recorded states. *regression* is one line of least squares "
         "of angular acceleration on rotor torque, airspeed and rate times the rotors' speeds, and "
-        "a steady part, added up along the recorded motion; *hold* lets the rate be."
+        "a steady part, added up along the recorded motion, where rotor speeds were recorded; "
+        "*hold* lets the rate be."
     )
-    return Section("Fast flights by rotor speed", text, head, rows)
+    return Section("Fast flights by rotor speed or command", text, head, rows)
 
 
-def _row(seed: int, rate: float, folder: Path) -> Iterator[str]:
+def _row(seed: int, rate: float, fed: fast_flights.Fed, folder: Path) -> Iterator[str]:
     racer = fast_flights.drawn(seed)
     flown = fast_flights.fly(racer, seed=seed, seconds=SECONDS)
-    paths = fast_flights.write(racer, flown, folder, seed=seed, rotor_rate=rate)
+    paths = fast_flights.write(racer, flown, folder, seed=seed, rotor_rate=rate, fed=fed)
     options = Options([str(path) for path in paths], config=str(folder / "tune.yaml"))
     clock = time.perf_counter()
     _, result = run(options, out=folder / "run")
@@ -79,7 +84,7 @@ def _row(seed: int, rate: float, folder: Path) -> Iterator[str]:
     vehicle = settle(options).vehicle
     for ahead in AHEAD:
         yield figure(_predicted(result, "predicted_best", ahead))
-        yield figure(_regression(fitted, held_out, vehicle, ahead))
+        yield figure(_regression(fitted, held_out, vehicle, ahead)) if fed == "rotor_speed" else "–"
         yield figure(_predicted(result, "predicted_holding", ahead))
 
 

@@ -1,4 +1,4 @@
-"""Simulated fast flights of a racing quadcopter by rotor speed: truth known, half of it hidden.
+"""Simulated fast flights of a racing quadcopter: truth known, half of what turns it hidden.
 
 Gusts and torques that no recording shows push the vehicle, and its own loop answers them with its
 rotors: what the recorded rotors do is then as much an answer to what is hidden as a cause of what
@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,8 @@ from tuner.core.disk import write_text
 from tuner.vehicle.scaling_laws import INCH, Airframe, new_vehicle
 
 Numbers = NDArray[np.float64]
+Fed = Literal["rotor_speed", "command"]
+"""What is recorded of the rotors."""
 
 PHYSICS, RATE = 800, 400
 """Hz of the physics, and of the recording."""
@@ -32,8 +35,10 @@ NOISE: Mapping[str, float] = {
     "attitude": 1e-3,
     "body_rate": 0.02,
     "rotor_speed": 6.0,
+    "command": 0.0,
 }
 """White, in each signal's unit; of the attitude about each axis, in rad."""
+POSE = ("position", "velocity", "attitude", "body_rate")
 MOTOR_LAG, FASTEST, IDLE = 0.025, 2700.0, 150.0
 """s, and rad/s between which rotors turn."""
 TURNING, STIFFNESS, DAMPING = 0.09, 6.0, 4.0
@@ -49,7 +54,7 @@ signals:
   velocity: [vx, vy, vz]
   attitude: [qw, qx, qy, qz]
   body_rate: [wx, wy, wz]
-  rotor_speed: [m1, m2, m3, m4]
+  {fed}: [m1, m2, m3, m4]
 """
 
 
@@ -118,7 +123,13 @@ def paths(seconds: float) -> dict[str, Numbers]:
 
 
 def write(
-    racer: Racer, flown: Mapping[str, Numbers], folder: Path, *, seed: int, rotor_rate: float = RATE
+    racer: Racer,
+    flown: Mapping[str, Numbers],
+    folder: Path,
+    *,
+    seed: int,
+    rotor_rate: float = RATE,
+    fed: Fed = "rotor_speed",
 ) -> list[Path]:
     """Write a table of each flight beside its topic map, its vehicle as first guessed and its job.
 
@@ -129,17 +140,20 @@ def write(
     seed
         Of the noise.
     rotor_rate
-        Hz at which rotor speeds are recorded.
+        Hz at which rotor speeds are recorded, or commands.
+    fed
+        Which of both.
     """
     random = np.random.default_rng([seed, 2])
-    write_text(folder / "topics.yaml", TOPICS)
+    write_text(folder / "topics.yaml", TOPICS.format(fed=fed))
     write_job(racer, folder)
     written = []
     for number, name in enumerate(paths(1.0)):
         columns = _measured({key: rows[:, number] for key, rows in flown.items()}, random)
+        columns = {name: columns[name] for name in (*POSE, fed)}
         every = round(RATE / rotor_rate)
-        kept = np.arange(len(columns["rotor_speed"])) % every == 0
-        columns["rotor_speed"] = np.where(kept[:, None], columns["rotor_speed"], np.nan)
+        kept = np.arange(len(columns[fed])) % every == 0
+        columns[fed] = np.where(kept[:, None], columns[fed], np.nan)
         time = np.arange(len(kept))[:, None] / RATE
         table = np.hstack([time, *columns.values()])
         rows = [",".join("" if np.isnan(cell) else f"{cell:.7g}" for cell in row) for row in table]
@@ -179,14 +193,16 @@ def fly(racer: Racer, *, seed: int, seconds: float = 12.0) -> dict[str, Numbers]
     weight = racer.values["mass"] * GRAVITY
     rotors = np.full((path.shape[1], 4), np.sqrt(weight / 4.0 / racer.values["motor_constant"]))
     log: dict[str, list[Numbers]] = {
-        name: [] for name in ("position", "velocity", "attitude", "body_rate", "rotor_speed")
+        name: []
+        for name in ("position", "velocity", "attitude", "body_rate", "rotor_speed", "command")
     }
     steady = rest
     for step in range(len(path)):
         if step % (PHYSICS // RATE) == 0:
-            for name, rows in zip(log, [*state, rotors], strict=True):
-                log[name].append(rows)
             goal, steady = _loop(racer, state, (path[step], speeds[step], pulls[step]), steady)
+            command = (goal - IDLE) / (FASTEST - IDLE)
+            for name, rows in zip(log, [*state, rotors, command], strict=True):
+                log[name].append(rows)
         moved = goal + (rotors - goal) * np.exp(-1.0 / PHYSICS / MOTOR_LAG)
         faster = 1.0 + np.linalg.norm(state[1], axis=1, keepdims=True) / 5.0
         hidden = pushed[step].T * racer.torques * faster

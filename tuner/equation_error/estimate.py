@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from tuner.equation_error.driven import Driven
 from tuner.equation_error.measured import Mask, Measured
-from tuner.equation_error.model import Accelerations, values_at
+from tuner.equation_error.model import Accelerations, Made, values_at
 from tuner.equation_error.regression import (
     MEMORY,
     Regression,
@@ -18,7 +20,7 @@ from tuner.equation_error.regression import (
     regress,
 )
 from tuner.objective.space import Space
-from tuner.recordings.flight import Array
+from tuner.recordings.flight import Array, Series
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import Model, with_terms_computed
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
@@ -70,7 +72,11 @@ class Estimate:
 
 
 def estimate(
-    model: Model, space: Space, candidates: Groups, flights: Sequence[Measured]
+    model: Model,
+    space: Space,
+    candidates: Groups,
+    flights: Sequence[Measured],
+    commands: Sequence[Series] = (),
 ) -> Estimate:
     """Return what some flights' accelerations say.
 
@@ -84,9 +90,16 @@ def estimate(
         Groups that are added if flights left out are predicted better with them.
     flights
         What was recorded.
+    commands
+        Of each flight, where its rotors follow these (`tuner.equation_error.driven`).
     """
     model = with_terms_computed(model, [n for n in space.free if _may_be_absent(model, n)])
-    made = Accelerations(model, space.parameters, tuple(flights))
+    parts, noisy = tuple(flights), not commands
+    made: Made = (
+        Accelerations(model, space.parameters, parts)
+        if noisy
+        else Driven(model, space.parameters, tuple(commands), parts)
+    )
     names = np.array(space.names)
     begin = np.array([p.scaled(p.initial) for p in space.parameters])
     acts = np.any(
@@ -98,12 +111,13 @@ def estimate(
         for group, members in candidates.items()
         if np.all(free[np.isin(names, members)])
     }
-    full = regress(made, begin, free=free)
+    full = regress(made, begin, free=free, noisy=noisy)
     rows, out = _selected(full, groups, candidates, begin, free)
     free = free & ~out
-    found = regress(made, np.where(out, begin, full.point), free=free)
-    halved = regress(made, found.point, free=free, memory=0.5 * MEMORY)
-    noiseless = regress(made, found.point, free=free, noisy=False)
+    near = partial(regress, made, free=free, near=True)
+    found = near(np.where(out, begin, full.point), noisy=noisy)
+    halved = near(found.point, memory=0.5 * MEMORY, noisy=noisy)
+    noiseless = near(found.point, noisy=False) if noisy else found
     errors = np.sqrt(
         np.diag(found.covariance)
         + (halved.point - found.point) ** 2
@@ -195,7 +209,7 @@ def _row(
     )
 
 
-def _explained(made: Accelerations, point: Array) -> Array:
+def _explained(made: Made, point: Array) -> Array:
     """Return the shares (6,) of recorded accelerations that are explained."""
     left, there = [], []
     for one, part in zip(made.at(point, noise=False), made.flights, strict=True):
@@ -205,7 +219,7 @@ def _explained(made: Accelerations, point: Array) -> Array:
     return np.asarray(1.0 - np.mean(np.concatenate(left) ** 2, axis=0) / varies)
 
 
-def _horizon(made: Accelerations, point: Array) -> float | None:
+def _horizon(made: Made, point: Array) -> float | None:
     """Return the s up to which predictions of roll and pitch rate beat holding them."""
     linear, reached = made.at(point, noise=False), None
     for seconds in HORIZONS:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,14 +75,24 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
     input_late
         s by which rotor speeds are stamped later than the state.
     """
-    series = flight.series
-    if not {"position", "attitude", "body_rate", "rotor_speed"} <= set(series):
+    rotors = flight.series.get("rotor_speed")
+    if rotors is None:
         return None
-    gyro, rotors = series["body_rate"], series["rotor_speed"]
     known = np.isfinite(rotors.values).all(axis=1)
-    if known.sum() < FEWEST or not np.isfinite(gyro.values).all():
+    if known.sum() < FEWEST:
         return None
     rotors = Series(rotors.time[known] - input_late, rotors.values[known])
+    return measured_with(flight, rotors, noise=_noise(rotors))
+
+
+def measured_with(flight: Flight, rotors: Series, *, noise: float) -> Measured | None:
+    """Return the same with rotor speeds on the clock of the state, of so much white noise."""
+    series = flight.series
+    if not {"position", "attitude", "body_rate"} <= set(series):
+        return None
+    gyro = series["body_rate"]
+    if not np.isfinite(gyro.values).all():
+        return None
     rate = min(FASTEST, gyro.rate, rotors.rate)
     inside = max(1, round(rotors.rate / rate))
     begin = max(0.0, gyro.time[0], rotors.time[0])
@@ -94,9 +104,6 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
     middle = 0.5 * (edges[1:] + edges[:-1])
     weights = np.ones(inside + 1) / inside
     weights[[0, -1]] *= 0.5
-    fine = edges[:-1, None] + np.arange(inside + 1) / inside / rate
-    speeds = _read(rotors, fine.ravel()).reshape(count, inside + 1, 4)
-    mean = np.einsum("nir,i->nr", speeds, weights)
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import, seldom needed)
 
     state = states_at(series, middle)
@@ -107,9 +114,8 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
     pull = np.diff(velocity, axis=0) * rate + np.array([0.0, 0.0, GRAVITY])
     turning = np.diff(_read(gyro, edges), axis=0) * rate
     accelerations = np.hstack([turned.inv().apply(pull), turning])
-    unknown = ~(np.isfinite(speeds).all(axis=(1, 2)) & np.isfinite(state.body_rate).all(axis=1))
-    accelerations[unknown] = np.nan
-    return Measured(
+    accelerations[~np.isfinite(state.body_rate).all(axis=1)] = np.nan
+    part = Measured(
         step=1.0 / rate,
         time=middle,
         motion=Motion(
@@ -118,12 +124,28 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
             Quaternion.of(state.attitude.T),
             Vec3.of(np.nan_to_num(state.body_rate).T),
         ),
-        # where it is unknown, one that some rotor might have: derivatives by none are not finite
-        rotor_speed=np.where(np.isfinite(mean), mean, np.nanmean(mean)),
-        rotor_acceleration=np.nan_to_num((speeds[:, -1] - speeds[:, 0]) * rate),
+        rotor_speed=np.zeros((count, 4)),
+        rotor_acceleration=np.zeros((count, 4)),
         accelerations=accelerations,
         weights=weights,
-        noise=_noise(rotors),
+        noise=noise,
+    )
+    return with_rotors(part, rotors)
+
+
+def with_rotors(part: Measured, rotors: Series) -> Measured:
+    """Return the steps with other rotor speeds; where these are unknown, so is the step."""
+    inside = len(part.weights) - 1
+    fine = part.time[:, None] + (np.arange(inside + 1) / inside - 0.5) * part.step
+    speeds = _read(rotors, fine.ravel()).reshape(*fine.shape, 4)
+    mean = np.einsum("nir,i->nr", speeds, part.weights)
+    known = np.isfinite(mean).all(axis=1, keepdims=True)
+    return replace(
+        part,
+        # where it is unknown, one that some rotor might have: derivatives by none are not finite
+        rotor_speed=np.where(np.isfinite(mean), mean, np.nanmean(mean)),
+        rotor_acceleration=np.nan_to_num((speeds[:, -1] - speeds[:, 0]) / part.step),
+        accelerations=np.where(known, part.accelerations, np.nan),
     )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,24 @@ class Linear:
     columns: Array
     moved: Array
     crossed: Array
+
+
+class Made(Protocol):
+    """The model's accelerations at all steps of several flights, see `Accelerations`."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The K that move."""
+        ...
+
+    @property
+    def flights(self) -> tuple[Measured, ...]:
+        """Their steps."""
+        ...
+
+    def at(self, point: Array, *, noise: bool = True) -> tuple[Linear, ...]:
+        """Return each flight's accelerations about a point (K,) of scaled coordinates."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,13 @@ from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to 
 
 from tuner.core.numerics import Z95, robust_sd
 from tuner.equation_error.measured import Mask, Measured
-from tuner.equation_error.model import Accelerations, Linear
+from tuner.equation_error.model import Linear, Made
 from tuner.recordings.flight import Array
 
 MEMORY = 0.1
 """s of errors from which the next one is predicted."""
-ROUNDS, NOISY_ROUNDS = 8, 4
-"""Of weighing and solving, at most; the last ones with the noise of rotor speeds."""
+ROUNDS = 8
+"""Of solving at most: plainly, then weighed, then with the noise of rotor speeds."""
 LONGEST = 0.7
 """Step of a logarithm, or of a number over its prior's deviation, in a round."""
 SETTLED = 1e-3
@@ -112,12 +112,13 @@ class Regression:
 
 
 def regress(
-    made: Accelerations,
+    made: Made,
     begin: Array,
     *,
     free: Mask,
     memory: float = MEMORY,
     noisy: bool = True,
+    near: bool = False,
 ) -> Regression:
     """Return the coordinates that meet recorded accelerations best.
 
@@ -133,6 +134,8 @@ def regress(
         s, as `MEMORY`.
     noisy
         Whether the noise of rotor speeds is taken off.
+    near
+        Whether it begins near its end, so that errors are filtered from the first step on.
     """
     mean = np.array([p.prior_mean for p in made.parameters])
     prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
@@ -141,26 +144,25 @@ def regress(
         pairs = zip(linear, made.flights, strict=True)
         return [whitening(one, part, memory) for one, part in pairs]
 
-    point, white = np.array(begin, float), False
-    for last in (False, True) if noisy else (False,):
-        for _ in range(NOISY_ROUNDS if last else ROUNDS):
+    point = np.array(begin, float)
+    stages = ((False, False), (True, False), (True, True))[: 3 if noisy else 2]
+    for white, last in stages[-1:] if near else stages:
+        for _ in range(ROUNDS):
             linear = made.at(point, noise=last)
             kernels = whitened(linear) if white else [PLAIN] * len(linear)
             sums = sums_of(linear, made.flights, kernels, noisy=last)
             point, arrived = _stepped(
                 made, point, sums, pull=prior * (mean - point), prior=prior, free=free
             )
-            if white and arrived:
+            if arrived:
                 break
-            white = white or arrived
-        white = True
     linear = made.at(point, noise=noisy)
     sums = sums_of(linear, made.flights, whitened(linear), noisy=noisy)
     pull = prior * (mean - point)
     return Regression(point, sums, prior, pull, _covariance(sums, prior, pull, free))
 
 
-def predicting(made: Accelerations, begin: Array, *, free: Mask, seconds: float) -> Array:
+def predicting(made: Made, begin: Array, *, free: Mask, seconds: float) -> Array:
     """Return the coordinates (K,) that predict velocity and body rate best, so many s ahead.
 
     Along the recorded motion, which is not simulated: errors are added up over the stretch, as an
@@ -186,7 +188,7 @@ def adding(part: Measured, seconds: float) -> Kernels:
 
 
 def _stepped(
-    made: Accelerations, point: Array, sums: Sums, *, pull: Array, prior: Array, free: Mask
+    made: Made, point: Array, sums: Sums, *, pull: Array, prior: Array, free: Mask
 ) -> tuple[Array, bool]:
     """Return the point a step on, inside the bounds, and whether it has arrived there."""
     unit = np.array([p.usual or 1.0 for p in made.parameters])

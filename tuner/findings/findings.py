@@ -274,7 +274,7 @@ class Code(Worded):
     TURNING_REGRESSED = (
         "turning_regressed",  # explained_AXIS (shares), gain_AXIS, seconds
         (
-            "Not all turning is recorded: rotor speeds and forces of the air explain "
+            "Not all turning is recorded: rotors and forces of the air explain "
             "{explained_x_percent}, {explained_y_percent} and {explained_z_percent} of the angular "
             "acceleration about forward, left and up. The rest is not recorded, and the loop's "
             "rotors answer it. Moments of inertia and other physical coefficients are those of a "
@@ -286,7 +286,7 @@ class Code(Worded):
     TURNING_NOT_PREDICTED = (
         "turning_not_predicted",  # likewise, no seconds
         (
-            "Most turning is not recorded: rotor speeds and forces of the air explain "
+            "Most turning is not recorded: rotors and forces of the air explain "
             "{explained_x_percent}, {explained_y_percent} and {explained_z_percent} of the angular "
             "acceleration about forward, left and up, too little to predict roll and pitch 0.1 s "
             "ahead better than that they stay. Physical coefficients are those of a regression of "

@@ -34,7 +34,8 @@ from scipy import linalg, optimize, signal
 from sim_jax.constants import GRAVITY
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Inverse
-from tuner.inertial.signals import Lags, Stretch, blocks_of, low_passed, rotor_speeds, smoothed
+from tuner.inertial.signals import Stretch, blocks_of, low_passed, smoothed
+from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.objective.rotor_signals import levers
 from tuner.recordings.flight import Array
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
@@ -274,7 +275,8 @@ def _moving(problem: _Problem, place: Array) -> Tables:
     height = places[:, 2].mean()
     tables: Tables = {name: [] for name in OUTPUTS}
     for stretch, shared in zip(problem.stretches, problem.shared, strict=True):
-        speed, inside = rotor_speeds(stretch, problem.motor, Lags.at(place)), stretch.inside[:-1]
+        speed = rotor_speeds(stretch.command, step, problem.motor, Lags.at(place))
+        inside = stretch.inside[:-1]
         square = 0.5 * (speed[1:] ** 2 + speed[:-1] ** 2)
         lift, torque = square.sum(axis=1), square @ arms
         each = shared[:, 2] / low_passed(lift[:, None], step, SHARED)[:, 0]

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.inertial.signals import Lags, Stretch, rotor_speeds, smoothed
+from tuner.inertial.signals import Stretch, smoothed
+from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.objective.rotor_signals import levers
 from tuner.recordings.flight import Array
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
@@ -87,4 +88,4 @@ def _missed(
 def _squares(stretch: Stretch, vehicle: VehicleFile) -> Array:
     motor, value = model_of(vehicle, ControllerFile()).vehicle.motor, values_of(vehicle)
     lags = Lags(value["time_constant_up"], value["time_constant_down"], value["actuator_latency"])
-    return np.square(rotor_speeds(stretch, motor, lags))
+    return np.square(rotor_speeds(stretch.command, stretch.step, motor, lags))

@@ -1,24 +1,14 @@
-"""Gyro, accelerometer and commands on one clock, and the rotor speeds that follow the commands.
-
-They are compared in the band in which rotors turn a vehicle; rotor speeds follow by the simulator's
-own curve and lag.
-"""
+"""Gyro, accelerometer and commands on one clock, in the band in which rotors turn a vehicle."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from sim_jax.motor import Lag, reference_speed
-from sim_jax.vehicle import Motor
 from tuner.recordings.flight import Array, Series
 
 CUTOFF = 30.0
@@ -117,62 +107,3 @@ def _on(time: Array, series: Series) -> Array:
     return np.column_stack(
         [np.interp(time, series.time[known], column) for column in series.values[known].T]
     )
-
-
-@dataclass(frozen=True)
-class Lags:
-    """How rotors follow commands.
-
-    Attributes
-    ----------
-    up, down
-        s, time constants.
-    late
-        s from a command to its effect.
-    """
-
-    up: float
-    down: float
-    late: float
-
-    @property
-    def coordinates(self) -> Array:
-        """Logarithms of the time constants, and the latency in s."""
-        return np.array([np.log(self.up), np.log(self.down), self.late])
-
-    @staticmethod
-    def at(coordinates: Array) -> Lags:
-        """Return the lags of some coordinates."""
-        up, down, late = coordinates
-        return Lags(float(np.exp(up)), float(np.exp(down)), float(late))
-
-
-def rotor_speeds(stretch: Stretch, motor: Motor, lags: Lags) -> Array:
-    """Return (n, 4) rad/s at the samples' times, settled at the first command.
-
-    A command holds until the next: over each step its mean is followed.
-    """
-    command, late = stretch.command, stretch.time - lags.late
-    held = np.vstack([np.zeros(command.shape[1]), np.cumsum(command[:-1], axis=0)]) * stretch.step
-    total = np.column_stack([np.interp(late, stretch.time, column) for column in held.T])
-    total += np.minimum(late - stretch.time[0], 0.0)[:, None] * command[0]
-    mean = np.diff(total, axis=0) / stretch.step
-    return np.asarray(_followed(mean, motor, lags.up, lags.down, stretch.step))
-
-
-@jax.jit
-def _followed(command: Array, motor: Motor, up: float, down: float, step: float) -> jax.Array:
-    lagging = eqx.tree_at(
-        lambda m: (m.time_constant_up, m.time_constant_down),
-        motor,
-        (jnp.asarray(up), jnp.asarray(down)),
-    )
-    lag = Lag.over(lagging, step)
-    asked = jax.vmap(lambda row: reference_speed(motor, row))(jnp.asarray(command))
-
-    def advance(speed: Any, reference: Any) -> tuple[Any, Any]:
-        after, _ = lag.advance(speed, reference)
-        return after, after
-
-    speeds: jax.Array = jax.lax.scan(advance, asked[0], asked)[1]
-    return jnp.concatenate([asked[:1], speeds])

@@ -13,10 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.errors import ConfigError
+from tuner.equation_error.driven import OF_MOTORS, driven
 from tuner.equation_error.estimate import GAINS, Estimate, estimate
-from tuner.equation_error.measured import measured
+from tuner.equation_error.measured import Measured, measured
 from tuner.findings.findings import Code, Finding
+from tuner.objective.inlets import sparse
 from tuner.objective.space import extended
+from tuner.recordings.flight import Series
 from tuner.search.problem import Job, job_of
 from tuner.terms.candidates import candidate_groups, start_of
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, with_values
@@ -33,30 +36,46 @@ INFLOW = "max_relative_airspeed"
 def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     """Return the job that begins with what accelerations say, or as it is; what to say of it.
 
-    Only where all fitted flights enter by rotor speed, the job leaves the choice of coefficients
-    and terms, and little of the turning is explained.
+    Only where all fitted flights enter by rotor speed, or all by commands, the job leaves the
+    choice of coefficients and terms, and little of the turning is explained.
     """
     settings = job.settings
     own = settings.job
     free_choice = own.terms == "auto" and own.free is None and own.search.criterion != "output"
-    if not free_choice or any(inlet != "rotor_speed" for inlet in job.inlets):
+    if not free_choice or len(set(job.inlets)) > 1:
         return job, ()
-    parts = [measured(r.flight, input_late=r.input_late) for r in job.recordings if not r.holdout]
-    known = tuple(part for part in parts if part is not None)
-    if len(known) < len(parts):
+    steps = _steps(job)
+    if steps is None:
         return job, ()
     candidates = _candidates(job)
     names = [name for group in candidates.values() for name in group]
     effects = start_of([n for n in (*names, *GAINS) if COEFFICIENTS[n].is_effect])
     given = initial_values(settings.vehicle, settings.controller, names)
     space = extended(job.space, [*names, *GAINS], settings.job, {**given, **effects})
-    found = estimate(job.objective.model, space, candidates, known)
+    found = estimate(job.objective.model, space, candidates, *steps)
     if found.turning >= ENOUGH:
         return job, ()
     begun = _begun(job, found)
     if begun is None:
         return job, ()
     return begun, (_finding(found),)
+
+
+def _steps(job: Job) -> tuple[tuple[Measured, ...], tuple[Series, ...]] | None:
+    """Return the steps of the fitted flights, with commands where these turn the rotors.
+
+    None where they say too little: commands of which some were not recorded do not tell what turned
+    the vehicle between them.
+    """
+    fitted = [(r.flight, r.input_late) for r in job.recordings if not r.holdout]
+    if job.inlets[0] == "rotor_speed":
+        parts = [measured(flight, input_late=late) for flight, late in fitted]
+        known = tuple(part for part in parts if part is not None)
+        return (known, ()) if len(known) == len(parts) else None
+    rate = float(job.objective.schedule.rate_control_rate)
+    if job.inlets[0] != "actuator" or sparse(job.fitted, "command", rate):
+        return None
+    return driven(job.objective.model, fitted, rate)
 
 
 def _candidates(job: Job) -> Groups:
@@ -69,7 +88,7 @@ def _candidates(job: Job) -> Groups:
 def _begun(job: Job, found: Estimate) -> Job | None:
     """Return the job with its search's coefficients, start and windows; None for no rigid body."""
     settings = job.settings
-    moving = tuple(name for name in found.values if name not in OF_INERTIA)
+    moving = tuple(name for name in found.values if name not in (*OF_INERTIA, *OF_MOTORS))
     try:
         vehicle = with_values(settings.vehicle, found.values)
     except ConfigError:

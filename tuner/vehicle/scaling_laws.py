@@ -162,8 +162,9 @@ def _input_scaling(airframe: Airframe, motor_constant: float) -> tuple[float, fl
 SPINS = ("ccw", "ccw", "cw", "cw")
 """Of the quad X in PX4's order: front right, rear left, front left, rear right."""
 SIDES = ((1, -1), (-1, 1), (1, 1), (-1, -1))
-HEADROOM = 1.05
-"""Largest rotor speed over that of full command."""
+HEADROOM = 2.5
+"""Largest rotor speed over that of full command, which is known to a factor of two: a fit has to
+reach what its vehicle flew at, and no command exceeds one."""
 HEADER = """By scaling laws from what can be read off the vehicle: where a fit starts, not measured.
 {priors} beside it holds a prior as wide as each law is crude:
 tune --flights lab/*.bag --config {priors}"""

@@ -1,0 +1,123 @@
+"""Accelerations of flights whose rotors follow recorded commands: by the motors' curve and lags.
+
+What moves a motor moves its rotor's speeds, and these the accelerations: by differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from tuner.equation_error.measured import Measured, measured_with, with_rotors
+from tuner.equation_error.model import Accelerations, Linear, values_at
+from tuner.objective.inlets import zero_order_hold
+from tuner.objective.rotor_response import Lags, rotor_speeds
+from tuner.recordings.flight import Array, Flight, Series
+from tuner.vehicle.coefficient import Parameter
+from tuner.vehicle.model import Model, with_coefficients
+
+OF_MOTORS = (
+    "input_scaling",
+    "zero_position_armed",
+    "time_constant_up",
+    "time_constant_down",
+    "actuator_latency",
+)
+"""What moves a rotor's speed."""
+NUDGE = 1e-2
+"""Step of a logarithm, or of a number over its usual size, for derivatives."""
+
+
+@dataclass(frozen=True)
+class Driven:
+    """As `tuner.equation_error.model.Accelerations`, with commands in place of rotor speeds.
+
+    Attributes
+    ----------
+    model, parameters
+        As there; of the parameters those of `OF_MOTORS` move rotor speeds.
+    commands
+        Of each flight (n, 4), held from tick to tick of a clock.
+    flights
+        Their steps, whose rotor speeds are those that the model has.
+    """
+
+    model: Model
+    parameters: tuple[Parameter, ...]
+    commands: tuple[Series, ...]
+    flights: tuple[Measured, ...]
+    _moving: tuple[int, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        moving = tuple(n for n, p in enumerate(self.parameters) if p.name in OF_MOTORS)
+        object.__setattr__(self, "_moving", moving)
+
+    def at(self, point: Array, *, noise: bool = True) -> tuple[Linear, ...]:
+        """Return each flight's accelerations about a point (K,) of scaled coordinates.
+
+        ``noise``: commands have none.
+        """
+        del noise
+        here = self._flown(point)
+        linear = Accelerations(self.model, self.parameters, here).at(point, noise=False)
+        nudges = [NUDGE * (self.parameters[n].usual or 1.0) for n in self._moving]
+        beside = [
+            part
+            for number, nudge in zip(self._moving, nudges, strict=True)
+            for part in self._flown(point + nudge * np.eye(len(point))[number])
+        ]
+        if not beside:
+            return linear
+        ends = Accelerations(self._model(point), (), tuple(beside)).at(np.zeros(0), noise=False)
+        columns = [one.columns.copy() for one in linear]
+        for place, (number, nudge) in enumerate(zip(self._moving, nudges, strict=True)):
+            for flight, one in enumerate(linear):
+                end = ends[place * len(linear) + flight]
+                columns[flight][:, :, number] = (one.left - end.left) / nudge
+        return tuple(replace(one, columns=c) for one, c in zip(linear, columns, strict=True))
+
+    def _model(self, point: Array) -> Model:
+        values = values_at(self.parameters, point)
+        return with_coefficients(self.model, {n: np.asarray(v) for n, v in values.items()})
+
+    def _flown(self, point: Array) -> tuple[Measured, ...]:
+        """Return the steps with the rotor speeds that a point's motors have."""
+        model, parts = self._model(point), zip(self.flights, self.commands, strict=True)
+        return tuple(with_rotors(part, followed(model, command)) for part, command in parts)
+
+
+def followed(model: Model, command: Series) -> Series:
+    """Return the rotor speeds (n, 4) that follow commands on a clock."""
+    motor, late = model.vehicle.motor, float(model.vehicle.setup.actuator_latency)
+    lags = Lags(float(motor.time_constant_up), float(motor.time_constant_down), late)
+    step = float(command.time[1] - command.time[0])
+    return Series(command.time, rotor_speeds(command.values, step, motor, lags))
+
+
+def driven(
+    model: Model, flights: Sequence[tuple[Flight, float]], rate: float
+) -> tuple[tuple[Measured, ...], tuple[Series, ...]] | None:
+    """Return the steps of some flights, and their commands; None where one says too little.
+
+    Parameters
+    ----------
+    model
+        Whose motors follow the commands.
+    flights
+        Each with the s by which its commands are stamped late.
+    rate
+        Hz of the loop that computes commands, which were recorded as often.
+    """
+    parts, commands = [], []
+    for flight, late in flights:
+        clock = np.arange(int(flight.duration * rate)) / rate
+        recorded = flight.series["command"]
+        held = zero_order_hold(Series(recorded.time - late, recorded.values), clock)
+        commands.append(Series(clock, held))
+        part = measured_with(flight, followed(model, commands[-1]), noise=0.0)
+        if part is None:
+            return None
+        parts.append(part)
+    return tuple(parts), tuple(commands)
