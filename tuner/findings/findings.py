@@ -456,10 +456,10 @@ class Code(Worded):
     RATE_NOT_PREDICTED = (
         "rate_not_foretold",  # before, after, hold (rad/s), seconds
         (
-            "From its commands alone the fitted coefficients predict the body rate of this flight "
-            "{seconds:g} s ahead to {after:.3g} rad/s ({before:.3g} rad/s with the initial ones), "
-            "and that it stays as it is would be right to {hold:.3g} rad/s: commands answer "
-            "disturbances that are not recorded, and an open loop adds them up."
+            "From {seconds:g} s ahead on its body rate is better taken to stay as it is "
+            "({hold:.3g} rad/s off) than predicted from its commands ({after:.3g} rad/s, "
+            "{before:.3g} with the initial coefficients): these answer disturbances "
+            "that are not recorded, and an open loop adds them up."
         ),
         "Predict less far ahead, or simulate the loop that flew.",
     )

@@ -1,17 +1,19 @@
-"""How well a vehicle's body rate is predicted from its commands alone, half a second ahead.
+"""How well a vehicle's body rate is predicted from its commands alone, and how far ahead.
 
 From the measured body rate on, open loop::
 
     I dω/dt = Σ lever·k·Ω² + trim - ω × Iω
 
 with Ω the rotor speeds that follow the commands. Air is left out: without a pose it is not known
-how fast the vehicle flies.
+how fast the vehicle flies. What commands do not say of the torque adds up, so that holding the body
+rate is right more nearly from some time on: beyond it errors say nothing of a vehicle.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import starmap
 
 import numpy as np
 
@@ -22,7 +24,7 @@ from tuner.recordings.flight import Array
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
 from tuner.vehicle.model import model_of
 
-AHEAD = 0.5
+AHEAD = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 """s."""
 STRIDE = 0.1
 """s from one prediction to the next."""
@@ -30,16 +32,19 @@ STRIDE = 0.1
 
 @dataclass(frozen=True)
 class RateErrors:
-    """Mean errors, rad/s, of body rates predicted `AHEAD` s ahead.
+    """Mean errors, rad/s, of body rates predicted so far ahead.
 
     Attributes
     ----------
+    seconds
+        One of `AHEAD`.
     initial, fitted
         By the vehicle that the fit began with, and by the one that it ended with.
     hold
         By the body rate that was measured at the beginning.
     """
 
+    seconds: float
     initial: float
     fitted: float
     hold: float
@@ -47,22 +52,23 @@ class RateErrors:
 
 def rate_errors(
     stretches: Sequence[Stretch], initial: VehicleFile, fitted: VehicleFile
-) -> RateErrors | None:
-    """Return how well a flight's body rates are predicted; None where none flies long enough."""
+) -> tuple[RateErrors, ...]:
+    """Return how well a flight's body rates are predicted; none where none flies long enough."""
     beginnings = [_beginnings(stretch) for stretch in stretches]
     if not sum(len(begin) for begin in beginnings):
-        return None
+        return ()
     pairs = list(zip(stretches, beginnings, strict=True))
     missed = [
-        np.concatenate([_missed(stretch, begin, vehicle) for stretch, begin in pairs])
+        np.concatenate([_missed(stretch, begin, vehicle) for stretch, begin in pairs], axis=1)
         for vehicle in (initial, fitted, None)
     ]
-    return RateErrors(*(float(np.linalg.norm(each, axis=1).mean()) for each in missed))
+    errors = np.linalg.norm(missed, axis=-1).mean(axis=-1)
+    return tuple(starmap(RateErrors, zip(AHEAD, *errors.tolist(), strict=True)))
 
 
 def _beginnings(stretch: Stretch) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
     inside = np.flatnonzero(stretch.inside)
-    steps, stride = round(AHEAD / stretch.step), round(STRIDE / stretch.step)
+    steps, stride = round(AHEAD[-1] / stretch.step), round(STRIDE / stretch.step)
     return np.asarray(inside[: max(0, len(inside) - steps) : stride])
 
 
@@ -71,18 +77,19 @@ def _missed(
     begin: np.ndarray[tuple[int], np.dtype[np.intp]],
     vehicle: VehicleFile | None,
 ) -> Array:
-    """Return the errors (n, 3) rad/s of predictions that begin at some samples."""
-    measured, steps = smoothed(stretch.body_rate, stretch.step), round(AHEAD / stretch.step)
-    rate = measured[begin]
+    """Return the errors (S, n, 3) rad/s of predictions that begin at n samples."""
+    measured = smoothed(stretch.body_rate, stretch.step)
+    places = [round(seconds / stretch.step) for seconds in AHEAD]
+    rates = [measured[begin]]
     if vehicle is not None:
         value = values_of(vehicle)
         inertia = np.array([value[f"inertia_{axis}{axis}"] for axis in "xyz"])
         trim = np.array([value.get(f"torque_trim_{axis}", 0.0) for axis in "xyz"])
         torque = value["motor_constant"] * _squares(stretch, vehicle) @ levers(vehicle) + trim
-        for step in range(steps):
-            moment = torque[begin + step] - np.cross(rate, inertia * rate)
-            rate = rate + stretch.step * moment / inertia
-    return np.asarray(rate - measured[begin + steps])
+        for step in range(places[-1]):
+            moment = torque[begin + step] - np.cross(rates[-1], inertia * rates[-1])
+            rates.append(rates[-1] + stretch.step * moment / inertia)
+    return np.stack([rates[min(n, len(rates) - 1)] - measured[begin + n] for n in places])
 
 
 def _squares(stretch: Stretch, vehicle: VehicleFile) -> Array:

@@ -61,6 +61,7 @@ from tuner.uncertainty.verdict import (
 )
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, write_vehicle
 from tuner.vehicle.selection_table import SelectionRow
+from tuner.vehicle.vehicle import sized
 
 METRICS_FILE = "metrics.csv"
 CONTROLLER_FILE = "controller.yaml"
@@ -169,7 +170,8 @@ def _coefficients(
     for name, value in initial_of(job).items():
         initial, regressed = began.get(name, value), None
         if name in errors:
-            regressed = _regressed(name, initial, best.get(name, value), errors[name])
+            bounded = sized(COEFFICIENTS[name], job.space.size).limits(initial)
+            regressed = _regressed(name, initial, best.get(name, value), errors[name], bounded)
         if name not in best:
             coefficients[name] = regressed or CoefficientResult.judged(
                 name, value, value, Verdict.FIXED, NOT_FITTED
@@ -242,7 +244,9 @@ def with_errors_of_refits(
     return result.model_copy(update={"coefficients": coefficients})
 
 
-def _regressed(name: str, initial: float, best: float, error: float) -> CoefficientResult:
+def _regressed(
+    name: str, initial: float, best: float, error: float, bounds: tuple[float, float]
+) -> CoefficientResult:
     """Return a coefficient by regression of accelerations, its error that of the scaled number."""
     row = COEFFICIENTS[name]
     if row.scale == "log":
@@ -259,7 +263,7 @@ def _regressed(name: str, initial: float, best: float, error: float) -> Coeffici
         verdict,
         reason,
         std_error=std_error,
-        ci95=interval,
+        ci95=(max(interval[0], min(bounds[0], best)), min(interval[1], max(bounds[1], best))),
         identifiable=reason.identifiable,
     )
 

@@ -12,11 +12,12 @@ import numpy as np
 from tuner.config import Settings
 from tuner.core.disk import folder_for
 from tuner.core.errors import ConfigError, InputError, RecordingError
-from tuner.findings.findings import Code, Finding
+from tuner.evaluate.held_out import WORSE
+from tuner.findings.findings import Code, Finding, Level
 from tuner.ground.bench_json import Combination, combine
 from tuner.ground.measurement import Measurement, value_of
 from tuner.inertial.measurement import agreeing, measure_inertial
-from tuner.inertial.prediction import AHEAD, rate_errors
+from tuner.inertial.prediction import RateErrors, rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.ground import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.job.listener import SILENT, Listener
@@ -125,28 +126,34 @@ def _predicted(
     *,
     held_out: bool = False,
 ) -> tuple[Finding, ...]:
-    """Return of which flights body rate is predicted worse than before, or than by holding it.
+    """Return from when on the body rate of a flight is better held, or until then predicted worse.
 
-    Of flights that were held out it is said how well it is predicted in any case.
+    Of flights that were held out it is said how well it is predicted until then in any case.
     """
     findings = []
     for flight in flights:
-        errors = rate_errors(stretches_of(flight.series, flight.flying), start, vehicle)
-        if errors is None:
-            continue
-        numbers = {
-            "before": errors.initial,
-            "after": errors.fitted,
-            "hold": errors.hold,
-            "seconds": AHEAD,
-        }
-        if errors.fitted > errors.initial:
-            findings.append(Finding(Code.RATE_WORSE, "warning", flight.name, numbers))
-        elif errors.fitted > errors.hold:
-            findings.append(Finding(Code.RATE_NOT_PREDICTED, "info", flight.name, numbers))
-        elif held_out:
-            findings.append(Finding(Code.RATE_PREDICTED, "info", flight.name, numbers))
+        told: RateErrors | None = None
+        for errors in rate_errors(stretches_of(flight.series, flight.flying), start, vehicle):
+            if min(errors.fitted, errors.initial) > errors.hold:
+                findings.append(_foretold(Code.RATE_NOT_PREDICTED, flight, errors))
+                break
+            told = errors
+        if told is not None and told.fitted > (1.0 + WORSE) * told.initial:
+            findings.append(_foretold(Code.RATE_WORSE, flight, told))
+        elif told is not None and held_out:
+            findings.append(_foretold(Code.RATE_PREDICTED, flight, told))
     return tuple(findings)
+
+
+def _foretold(code: Code, flight: InertialFlight, errors: RateErrors) -> Finding:
+    numbers = {
+        "before": errors.initial,
+        "after": errors.fitted,
+        "hold": errors.hold,
+        "seconds": errors.seconds,
+    }
+    level: Level = "warning" if code is Code.RATE_WORSE else "info"
+    return Finding(code, level, flight.name, numbers)
 
 
 def _as_flat(vehicle: VehicleFile, combination: Combination) -> VehicleFile:

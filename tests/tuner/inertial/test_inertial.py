@@ -165,7 +165,7 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
     # the file that leaves the trims out foretells the body rate worse
     ((flight,), _) = without_pose(settings)
     stretches = stretches_of(flight.series, flight.flying)
-    foretold = rate_errors(stretches, flown, read_vehicle(fitted.folder / BEST_FIT_FILE))
+    *_, foretold = rate_errors(stretches, flown, read_vehicle(fitted.folder / BEST_FIT_FILE))
     assert foretold.fitted < 0.5 * foretold.initial
     codes = {finding.code for finding in fitted.result.findings}
     assert Code.RATE_WORSE not in codes
@@ -179,6 +179,20 @@ def test_a_fit_that_foretells_worse_says_so(simulation, flown, tmp_path, monkeyp
     (worse,) = [f for f in fitted.result.findings if f.code is Code.RATE_WORSE]
     assert worse.level == "warning"
     assert worse.numbers["after"] > worse.numbers["before"]
+
+
+def test_a_moment_that_commands_do_not_say_adds_up_until_holding_is_better(
+    simulation, flown, tmp_path, monkeypatch
+):
+    wrong = with_values(flown, {"torque_trim_x": 5.0 * values_of(flown)["inertia_xx"]})
+    settings = settings_for(log_file(simulation, tmp_path / "log00"), wrong)
+    monkeypatch.setattr("tuner.job.without_pose.vehicle_of", lambda *_: wrong)
+    ((flight,), _) = without_pose(settings)
+    fitted = fit_without_pose(settings, [flight], out=tmp_path / "run")
+    (held,) = [f for f in fitted.result.findings if f.code is Code.RATE_NOT_PREDICTED]
+    for errors in rate_errors(stretches_of(flight.series, flight.flying), wrong, wrong):
+        assert (errors.fitted < errors.hold) == (errors.seconds < held.numbers["seconds"])
+    assert held.numbers["seconds"] > 0.1
 
 
 @pytest.mark.slow
