@@ -61,7 +61,6 @@ class Inlet(eqx.Module):
 
     def next_setpoints(self, stages: Stages, state: State, step: Step) -> Setpoints:
         """Return what the rate controller is to follow."""
-        del stages, step
         return state.setpoints
 
     def next_command(self, stages: Stages, state: State, step: Step) -> State:
@@ -79,12 +78,10 @@ class Inlet(eqx.Module):
 
         An integrator asks for forces in a motion that it predicts within the step.
         """
-        del step
         return motion
 
     def next_motion(self, moved: Motion, step: Step) -> Motion:
         """Return the motion after a step, of which an inlet may replace a part."""
-        del step
         return moved
 
     def batch_shape(self) -> tuple[int, ...]:
@@ -139,7 +136,6 @@ class BodyRateInlet(Inlet):
         return True
 
     def next_setpoints(self, stages: Stages, state: State, step: Step) -> Setpoints:
-        del stages
         return like(row_of(Setpoints(self.rate, self.thrust), step), state.setpoints)
 
     def next_command(self, stages: Stages, state: State, step: Step) -> State:
@@ -165,13 +161,11 @@ class RotorSpeedInlet(Inlet):
     speed: PerRotor
 
     def next_command(self, stages: Stages, state: State, step: Step) -> State:
-        del stages, step
         return state
 
     def next_rotor_speeds(
         self, stages: Stages, state: State, step: Step
     ) -> tuple[PerRotor, PerRotor]:
-        del stages
         before = like(row_of(self.speed, step), state.rotor_speed)
         after = like(row_of(self.speed, step + 1), state.rotor_speed)
         return after, tuple(0.5 * (old + new) for old, new in zip(before, after, strict=True))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -91,9 +91,8 @@ def read_yaml(path: str | Path) -> Document:
         node = loader.get_single_node()
         if node is None:
             return Document(path, {}, {})
-        _check_size(path, node)
         lines: dict[Place, int] = {}
-        _check_keys(path, node, (), lines)
+        _check(path, node, (), lines, ())
         return Document(path, loader.construct_document(node), lines)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -129,36 +128,25 @@ def _set_style(node: yaml.Node, depth: int) -> None:
         _set_style(child, depth + 1)
 
 
-def _check_size(path: Path, root: yaml.Node) -> None:
-    """Refuse aliases that refer to themselves or multiply beyond `MAX_NODES` values."""
-    sizes: dict[int, int] = {}
-    open_nodes: set[int] = set()
-
-    def size(node: yaml.Node) -> int:
-        if id(node) in open_nodes:
-            raise ConfigError(path, "has an alias inside its own anchor", "write the values out")
-        if id(node) not in sizes:
-            open_nodes.add(id(node))
-            sizes[id(node)] = 1 + sum(size(child) for child in _children(node))
-            open_nodes.remove(id(node))
-        return sizes[id(node)]
-
-    if size(root) > MAX_NODES:
-        raise ConfigError(path, f"holds more than {MAX_NODES} values", "give a configuration file")
-
-
 def _children(node: yaml.Node) -> list[yaml.Node]:
     if isinstance(node, yaml.MappingNode):
         return [child for pair in node.value for child in pair]
     return list(node.value) if isinstance(node, yaml.SequenceNode) else []
 
 
-def _check_keys(path: Path, node: yaml.Node, place: Place, lines: dict[Place, int]) -> None:
-    """Refuse keys that are not words or stand twice; note the line of each value."""
+def _check(
+    path: Path, node: yaml.Node, place: Place, lines: dict[Place, int], above: Sequence[yaml.Node]
+) -> None:
+    """Refuse keys that are no words or stand twice, and endless aliases; note each value's line."""
+    if any(node is one for one in above):
+        raise ConfigError(path, "has an alias inside its own anchor", "write the values out")
+    if len(lines) > MAX_NODES:
+        raise ConfigError(path, f"holds more than {MAX_NODES} values", "give a configuration file")
     lines[place] = node.start_mark.line + 1
+    inside = (*above, node)
     if isinstance(node, yaml.SequenceNode):
         for index, child in enumerate(node.value):
-            _check_keys(path, child, (*place, index), lines)
+            _check(path, child, (*place, index), lines, inside)
     if not isinstance(node, yaml.MappingNode):
         return
     seen: dict[str, int] = {}
@@ -170,5 +158,5 @@ def _check_keys(path: Path, node: yaml.Node, place: Place, lines: dict[Place, in
             what = f"line {line}: key '{key.value}' already stands in line {seen[key.value]}"
             raise ConfigError(path, what, "keep one of them")
         seen[key.value] = line
-        _check_keys(path, child, (*place, key.value), lines)
+        _check(path, child, (*place, key.value), lines, inside)
         lines[*place, key.value] = line

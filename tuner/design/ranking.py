@@ -25,7 +25,7 @@ from sim_jax.trajectory import Shape, shapes
 from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
-from tuner.core.numerics import log_determinant, scaled_inverse, unit_diagonal
+from tuner.core.numerics import log_determinant, scaled_inverse
 from tuner.design.proposals import Proposal, Proposals
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_from_jacobian
@@ -367,11 +367,7 @@ def _ratio(now: Array, gain: Array, place: int, count: int) -> float:
 
 def _volume(now: Array, gain: Array, count: int) -> float:
     """Return the factor on the geometric mean of the half axes of the fitted ones' ellipsoid."""
-    unit = unit_diagonal(now[:count, :count])
-    before, after = (
-        log_determinant(matrix[:count, :count] * np.outer(unit, unit))
-        for matrix in (now, now + gain)
-    )
+    before, after = (log_determinant(matrix[:count, :count]) for matrix in (now, now + gain))
     return float(np.exp(-0.5 * (after - before) / count))
 
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -79,14 +80,10 @@ class Engine(ABC):
         on_report
             Called with the number of a task and its report.
         """
-
-        def listener(number: int) -> Report:
-            return lambda report: on_report(number, report)
-
         futures: list[Future[R]] = []
         try:
             for number, task in enumerate(tasks):
-                futures.append(self.submit(function, task, listener(number)))
+                futures.append(self.submit(function, task, partial(on_report, number)))
             return [future.result() for future in futures]
         except BaseException:
             for future in futures:

@@ -86,6 +86,21 @@ class FisherInformation:
     pull: Array | None = None
     nuisance_pull: Array | None = None
 
+    def in_stretches(
+        self, numbers: NDArray[np.intp]
+    ) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
+        """Return information (S, K, K), score (S, K), flight and number (S,) of stretches of time.
+
+        ``numbers`` (N, B) says in which stretch of its flight each block of each segment lies.
+        """
+        size = self.score.shape[-1]
+        keys = np.stack([np.repeat(self.flight, numbers.shape[1]), numbers.ravel()], axis=-1)
+        found, member = np.unique(keys, axis=0, return_inverse=True)
+        known, score = np.zeros((len(found), size, size)), np.zeros((len(found), size))
+        np.add.at(known, member, self.blocks.sum(axis=0).reshape(-1, size, size))
+        np.add.at(score, member, self.score.sum(axis=0).reshape(-1, size))
+        return known, score, found[:, 0], found[:, 1]
+
     @staticmethod
     def joined(parts: Sequence[FisherInformation]) -> FisherInformation:
         """Return the information of all flights from that of consecutive groups of them."""

@@ -354,7 +354,11 @@ def linear_of(
     """
     size = information.score.shape[-1]
     count, flights = size - around, int(information.flight.max()) + 1
-    hessian, score, flight, number = _stretches(information)
+    # windows that begin in the same stretch are one: their residuals are no more independent than
+    # those of a flight that is flown whole
+    blocks = information.begins[:, None] / BLOCK + np.arange(information.blocks.shape[2])
+    numbers = np.floor(blocks + 1e-9).astype(np.intp)
+    hessian, score, flight, number = information.in_stretches(numbers)
     section = np.minimum(number * SECTIONS // (number.max() + 1), SECTIONS - 1)
     flown = np.einsum("spp->s", hessian) > 0
     flight = flight[flown]
@@ -381,25 +385,6 @@ def linear_of(
         seen=seen if around else None,
         around=around * flights,
     )
-
-
-def _stretches(
-    information: FisherInformation,
-) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
-    """Return Hessian (S, L, L), score (S, L), flight (S,) and number in it of every `BLOCK` s.
-
-    Windows that begin in the same stretch are one: their residuals are no more independent than
-    those of a flight that is flown whole.
-    """
-    size, blocks = information.score.shape[-1], information.blocks.shape[2]
-    begins = information.begins[:, None] / BLOCK + np.arange(blocks)
-    numbers = np.floor(begins + 1e-9).astype(np.intp).ravel()
-    keys = np.stack([np.repeat(information.flight, blocks), numbers], axis=-1)
-    found, member = np.unique(keys, axis=0, return_inverse=True)
-    hessian, score = np.zeros((len(found), size, size)), np.zeros((len(found), size))
-    np.add.at(hessian, member, information.blocks.sum(axis=0).reshape(-1, size, size))
-    np.add.at(score, member, information.score.sum(axis=0).reshape(-1, size))
-    return hessian, score, found[:, 0], found[:, 1]
 
 
 def _loss_of(objective: Objective, criterion: Criterion, jacobian: Jacobian) -> float:

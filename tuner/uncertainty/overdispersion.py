@@ -6,7 +6,7 @@ says, and `Stretches` are the pieces whose scatter is observed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,15 +249,7 @@ def _ends(information: FisherInformation) -> Array:
 def _cut(information: FisherInformation, seconds: float) -> Stretches:
     blocks = information.blocks.shape[2]
     times = information.begins[:, None] + (np.arange(blocks) + 0.5) * BLOCK
-    numbers = np.floor(times / seconds).astype(int)
-    flights = np.broadcast_to(information.flight[:, None], numbers.shape)
-    keys = np.stack([flights.ravel(), numbers.ravel()], axis=-1)
-    found, member = np.unique(keys, axis=0, return_inverse=True)
-    count = information.score.shape[-1]
-    sums = Stretches(np.zeros((len(found), count, count)), np.zeros((len(found), count)))
-    np.add.at(sums.information, member, information.blocks.sum(axis=0).reshape(-1, count, count))
-    np.add.at(sums.score, member, information.score.sum(axis=0).reshape(-1, count))
+    known, score, *_ = information.in_stretches(np.floor(times / seconds).astype(np.intp))
     to_minimum = -Inverse.of(information.total, information.given).matrix @ information.slope
-    sums = replace(sums, score=sums.score + sums.information @ to_minimum)
-    flown = np.any(sums.information != 0.0, axis=(1, 2))
-    return Stretches(sums.information[flown], sums.score[flown])
+    flown = np.any(known != 0.0, axis=(1, 2))
+    return Stretches(known[flown], (score + known @ to_minimum)[flown])
