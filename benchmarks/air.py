@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.signal import lfilter
 
 from sim_jax.constants import GRAVITY
-from sim_jax.disturbance import Disturbance
-from sim_jax.vector import Vec3
+from sim_jax.environment import Disturbance
+from sim_jax.geometry import Vec3
 
 GUST, GUST_TIME = 0.1, 1.0
 """m/s, standard deviation of the wind along x and y, half as much along z; s, it forgets."""

@@ -45,8 +45,8 @@ from tuner.search.problem import Job, job_of
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import plan
 from tuner.terms.candidates import with_terms
-from tuner.uncertainty.calibration import FILE, LEVELS, Calibration, Held
 from tuner.uncertainty.estimates import uncertainty_of
+from tuner.uncertainty.records import CALIBRATION, COVERAGE_LEVELS, Calibration, Held
 from tuner.vehicle.model import with_terms_computed
 
 DRAWS = int(os.environ.get("TUNE_CALIBRATION_DRAWS", "20"))
@@ -128,7 +128,7 @@ def measure() -> Section:
     kinds = tuple(_held(name, _converged(sets)) for name, sets in found.items())
     today = datetime.date.today().isoformat()
     text = Calibration(date=today, kinds=kinds).model_dump_json(indent=2)
-    FILE.write_text(f"{text}\n", encoding="utf-8")
+    CALIBRATION.write_text(f"{text}\n", encoding="utf-8")
     return section(found, today)
 
 
@@ -153,7 +153,7 @@ def section(found: Mapping[str, Sequence[Ranked]], date: str) -> Section:
         "median of how many times as large the quoted error is. "
         f"{np.mean(seconds):.0f} s of processor time a set."
     )
-    head = ["flights", "coefficient", "sets", *(f"{level} %" for level in LEVELS)]
+    head = ["flights", "coefficient", "sets", *(f"{level} %" for level in COVERAGE_LEVELS)]
     head += ["mean", "RMS", "of an oracle's"]
     return Section("Calibration of the intervals", text, head, rows)
 
@@ -300,7 +300,7 @@ def _held(name: str, sets: Sequence[Ranked]) -> Held:
         flights=name,
         sets=len(sets),
         intervals=sum(len(ranked.off) for ranked in sets),
-        coverage={level: _share_of_all(sets, level) for level in LEVELS},
+        coverage={level: _share_of_all(sets, level) for level in COVERAGE_LEVELS},
         least=min(shares.values()),
     )
 
@@ -313,14 +313,14 @@ def _rows(name: str, sets: Sequence[Ranked]) -> list[list[str]]:
     """Return a kind's rows, all coefficients together first."""
     together = [
         f"{_percent(_share_of_all(sets, level))} ± {figure(200 * scatter(sets, level))} %"
-        for level in LEVELS
+        for level in COVERAGE_LEVELS
     ]
     moments = _moments(off for ranked in sets for off in ranked.off.values())
     rows = [[name, "all", str(len(sets)), *together, *moments, _wider(sets, list(sets[0].off))]]
     for coefficient in sets[0].off:
         off = [ranked.off[coefficient] for ranked in sets]
         shares = []
-        for level in LEVELS:
+        for level in COVERAGE_LEVELS:
             low, high = band(level, len(sets))
             shares.append(
                 f"{_percent(share_within(off, level))} ({100 * low:.0f}–{100 * high:.0f})"

@@ -27,12 +27,12 @@ from sim_jax.control.gains import (
     RateGains,
 )
 from sim_jax.control.position import ReferencePoint
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import begun, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import State, hover
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 
 SCHEDULE = Schedule(

@@ -21,16 +21,15 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
 from benchmarks.lab_effects import NOTHING, Effect, controller_with, inlet_with, logged_speeds
-from sim_jax.autopilot import gyro_of
 from sim_jax.constants import GRAVITY
-from sim_jax.disturbance import Disturbance
-from sim_jax.environment import Environment
+from sim_jax.environment import Disturbance, Environment
+from sim_jax.frames import gyro_of
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
 from sim_jax.trim import in_trim
-from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.disk import write_text
 from tuner.core.shipped import find_config

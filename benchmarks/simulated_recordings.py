@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
-from sim_jax.disturbance import Disturbance
+from sim_jax.environment import Disturbance
 from sim_jax.numeric import Array as JaxArray
 from sim_jax.rollout import rollout
 from sim_jax.state import Setpoints

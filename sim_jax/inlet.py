@@ -17,12 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
 from sim_jax.control.position import ReferencePoint
-from sim_jax.numeric import Array, Scalar
+from sim_jax.geometry import Quaternion, Vec3
+from sim_jax.numeric import Array, Scalar, like, replaced, row_of, where
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
 from sim_jax.state import Setpoints, State
-from sim_jax.trees import like, replaced, row_of, where
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor
 
 T = TypeVar("T")

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Int, PyTree
 
-from sim_jax.autopilot import Gyro
 from sim_jax.control import attitude, mixer, rate
 from sim_jax.control.gains import Controller
 from sim_jax.control.position import (
@@ -19,14 +18,13 @@ from sim_jax.control.position import (
     thrust_setpoint,
     wanted_acceleration,
 )
-from sim_jax.crash import Limits
 from sim_jax.environment import Environment
+from sim_jax.frames import Gyro, estimated
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import Inlet, ReferenceInlet
-from sim_jax.markers import estimated
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
-from sim_jax.numeric import Array
+from sim_jax.numeric import Array, forgetful, like, repeat, replaced, row_of, where
 from sim_jax.rigid_body import Integrator, Motion, Wrench, step_midpoint, step_semi_implicit
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import (
     GyroFilter,
@@ -38,11 +36,9 @@ from sim_jax.sensing import (
     switched,
     unpacked,
 )
-from sim_jax.state import Setpoints, State
+from sim_jax.state import Limits, Setpoints, State
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
-from sim_jax.trees import forgetful, like, repeat, replaced, row_of, where
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 
 T = TypeVar("T")

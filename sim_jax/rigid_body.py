@@ -8,8 +8,7 @@ from typing import TypeAlias
 import equinox as eqx
 
 from sim_jax.constants import GRAVITY
-from sim_jax.rotation import Quaternion
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.vehicle import Body
 
 

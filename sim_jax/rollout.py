@@ -8,21 +8,18 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Int
 
-from sim_jax.autopilot import gyro_of
 from sim_jax.constants import GRAVITY
 from sim_jax.control import mixer
 from sim_jax.control.gains import Controller, with_gains_of
-from sim_jax.crash import Limits
 from sim_jax.environment import NOTHING_AROUND, Environment
+from sim_jax.frames import estimated, gyro_of
 from sim_jax.inlet import Inlet
-from sim_jax.markers import estimated
 from sim_jax.motor import Lag, LagSlope, SwitchedLag
-from sim_jax.numeric import Array, Scalar
+from sim_jax.numeric import Array, Precision, Scalar, forgetful, in_precision, precision_of
 from sim_jax.plant import Plant, Sample
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter, Tachometer
-from sim_jax.state import Start, State, first_state, hover_speed
-from sim_jax.trees import Precision, forgetful, in_precision, precision_of
+from sim_jax.state import Limits, Start, State, first_state, hover_speed
 from sim_jax.vehicle import Vehicle
 
 SECOND_LAG = "time_constant_second"

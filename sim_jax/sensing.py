@@ -13,11 +13,10 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from sim_jax.control.gains import Filters
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import INSTANT
 from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
-from sim_jax.vector import Vec3
 
 
 def history_length(longest: float, step: float) -> int:

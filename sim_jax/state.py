@@ -1,4 +1,7 @@
-"""Everything that changes during a flight: the carry of the rollout's loop."""
+"""Everything that changes during a flight: the carry of the rollout's loop, and its limits.
+
+A flight that ends badly is frozen there, so that every number stays finite.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,12 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from sim_jax.constants import GRAVITY
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import command_of, reference_speed
-from sim_jax.numeric import Array, Scalar
+from sim_jax.numeric import Array, Flag, Scalar
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter, GyroMemory, history_length, past_of
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Motor, PerRotor, Vehicle
 
 
@@ -58,6 +60,31 @@ class State(eqx.Module):
     reference_history: Float[Array, "past_references rotors *batch"] | None
     crash_time: Scalar
     """s, infinite while flying."""
+
+
+class Limits(eqx.Module):
+    """The space in which a flight counts as flying; static."""
+
+    floor: float = eqx.field(static=True, default=0.227)
+    """m, height of the landing gear below which the vehicle has hit the ground."""
+    half_width: float = eqx.field(static=True, default=50.0)
+    """m from the origin along any axis beyond which the vehicle has flown away."""
+    fastest_rate: float = eqx.field(static=True, default=60.0)
+    """rad/s of body rate about any axis beyond which the vehicle tumbles."""
+
+    def broken_by(self, motion: Motion) -> Flag:
+        """Return which vehicles are outside the limits; not-a-number counts as outside."""
+        position, rate = motion.position, motion.body_rate
+        inside = position.z >= self.floor
+        for distance in (position.x, position.y, position.z):
+            inside &= jnp.abs(distance) <= self.half_width
+        for speed in (rate.x, rate.y, rate.z):
+            inside &= jnp.abs(speed) <= self.fastest_rate
+        return ~inside
+
+
+AIRBORNE = Limits(floor=-1e3, half_width=1e3)
+"""For recordings that leave the ground or an origin elsewhere: only tumbling ends the flight."""
 
 
 def hover_speed(vehicle: Vehicle, *, gravity: float = GRAVITY) -> Scalar:

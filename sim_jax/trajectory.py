@@ -17,8 +17,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Int
 
 from sim_jax.control.position import ReferencePoint
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import Array, Scalar
-from sim_jax.vector import Vec3
 
 TICK_RATE = 100
 """Hz at which the publisher ticks."""

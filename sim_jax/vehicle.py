@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import Scalar
-from sim_jax.vector import Vec3
 
 PerRotor: TypeAlias = tuple[Scalar, ...]
 """One value per rotor, in the vehicle's order of rotors."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from sim_jax.control.gains import AttitudeGains
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Scalar
-from sim_jax.rotation import Quaternion
-from sim_jax.vector import Vec3
 
 
 def quaternion_law(attitude: Quaternion, wanted: Quaternion, time_constant: Scalar) -> Vec3:

@@ -7,8 +7,8 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import Scalar
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from sim_jax.control.gains import MixerSettings
 from sim_jax.control.rate import Saturation
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import (
     Flag,
     Scalar,
@@ -22,7 +23,6 @@ from sim_jax.numeric import (
     saturate,
     smaller,
 )
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor
 
 ROTORS = 4

@@ -6,10 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from sim_jax.control.gains import AttitudeGains, PositionGains
-from sim_jax.numeric import Scalar, safe_divide, safe_sqrt, saturate
-from sim_jax.rotation import Quaternion
-from sim_jax.trees import where
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Quaternion, Vec3
+from sim_jax.numeric import Scalar, safe_divide, safe_sqrt, saturate, where
 
 CONTROLLER_GRAVITY = 9.8
 """m/s²: the controller's own value, not the plant's 9.81."""

@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from sim_jax.control.gains import RateGains
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import Flag, Scalar, saturate
-from sim_jax.vector import Vec3
 
 INTEGRAL_FADE = radians(400.0)
 """rad/s of rate error at which the integral stops (PX4 RateControl)."""

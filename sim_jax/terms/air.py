@@ -5,9 +5,9 @@ from __future__ import annotations
 import equinox as eqx
 
 from sim_jax.environment import NOTHING_AROUND, Environment
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import Scalar
 from sim_jax.rigid_body import Motion
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 
 

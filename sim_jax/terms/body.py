@@ -5,9 +5,9 @@ v is the velocity of the centre of mass through the air and ω the body rate, bo
 
 from __future__ import annotations
 
+from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.terms.air import Air
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 
 

@@ -6,9 +6,9 @@ through the air, v∥ along body z and v⊥ across it.
 
 from __future__ import annotations
 
+from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.terms.air import Air
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 
 

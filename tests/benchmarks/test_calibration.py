@@ -21,7 +21,7 @@ def ranked(*off, converged=True):
 
 def test_of_truths_that_are_where_the_interval_says_the_level_lies_inside():
     off = np.random.default_rng(1).normal(size=20_000)
-    for level in cal.LEVELS:
+    for level in cal.COVERAGE_LEVELS:
         assert cal.share_within(off, level) == pytest.approx(float(level) / 100, abs=0.01)
 
 

@@ -6,7 +6,7 @@ from math import sqrt
 
 import jax.numpy as jnp
 
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Vec3
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 
 ARM = 0.25

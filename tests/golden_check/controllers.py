@@ -12,7 +12,7 @@ from sim_jax.control.gains import (
     PositionGains,
     RateGains,
 )
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Vec3
 
 
 def _axes(roll: float, pitch: float, yaw: float) -> Vec3:

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.control.gains import Filters, MixerSettings
+from sim_jax.geometry import Quaternion
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rollout import rollout
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
 from sim_jax.trajectory import Publication, publish

@@ -6,8 +6,7 @@ import jax.numpy as jnp
 
 from sim_jax.control import attitude, position
 from sim_jax.control.gains import AttitudeGains, PositionGains
-from sim_jax.rotation import Quaternion
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Quaternion, Vec3
 from tests.golden_check.table import Deviation, Table, deviation, merged
 
 EXACT = 1e-12

@@ -8,8 +8,8 @@ from jax import Array
 
 from sim_jax.control import mixer, rate
 from sim_jax.control.gains import Filters, MixerSettings, RateGains
+from sim_jax.geometry import Vec3
 from sim_jax.sensing import GyroFilter, GyroMemory, filtered
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor
 from tests.golden_check import stepwise_mixer
 from tests.golden_check.controllers import hovergames_rates

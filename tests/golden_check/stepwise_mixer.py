@@ -14,8 +14,8 @@ import jax.numpy as jnp
 
 from sim_jax.control.gains import MixerSettings
 from sim_jax.control.mixer import HALF_SQRT2, YAW_HEADROOM
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import Scalar, safe_sqrt, saturate
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor
 
 Scales: TypeAlias = tuple[float, float, float, float]

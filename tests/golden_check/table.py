@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 from jax import Array
 
-from sim_jax.rotation import Quaternion
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Quaternion, Vec3
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from sim_jax.geometry import Vec3
 from sim_jax.trajectory import Circle, Diagonal, Hover, Lemniscate, Straight, publish
-from sim_jax.vector import Vec3
 from tests.golden_check.table import Deviation, Table, deviation, merged
 
 SHAPE = 1e-12

@@ -10,14 +10,13 @@ from jax import Array
 
 from sim_jax.control.gains import Controller, Filters, MixerSettings
 from sim_jax.control.position import ReferencePoint
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import ActuatorInlet
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import Rollout, rollout
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
 from sim_jax.trajectory import publish, shapes
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 from tests.golden_check.coefficients import golden_vehicle
 from tests.golden_check.controllers import golden_controller

@@ -11,14 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim_jax.autopilot import gyro_of
 from sim_jax.constants import GRAVITY
 from sim_jax.control.gains import with_gains_of
 from sim_jax.control.position import ReferencePoint
+from sim_jax.frames import estimated, gyro_of
+from sim_jax.geometry import rotation
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.markers import estimated
 from sim_jax.rollout import rollout
-from sim_jax.rotation import rotation
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
 from tests.sim_jax.support import (

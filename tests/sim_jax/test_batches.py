@@ -12,13 +12,12 @@ from jax import Array
 from sim_jax.control import mixer
 from sim_jax.control.gains import Filters, MixerSettings
 from sim_jax.control.position import ReferencePoint
-from sim_jax.crash import Limits
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet, ReferenceInlet
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import look_back, push
-from sim_jax.state import hover
-from sim_jax.vector import Vec3
+from sim_jax.state import Limits, hover
 from sim_jax.vehicle import Setup
 from tests.golden_check.coefficients import golden_vehicle
 from tests.golden_check.controllers import golden_controller

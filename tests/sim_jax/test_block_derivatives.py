@@ -14,14 +14,13 @@ from sim_jax.control import attitude, mixer, position, rate
 from sim_jax.control.gains import Filters, MixerSettings, PositionGains
 from sim_jax.control.mixer import HALF_SQRT2
 from sim_jax.control.position import ReferencePoint
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
-from sim_jax.rotation import Quaternion
 from sim_jax.sensing import GyroFilter, GyroMemory, filtered, look_back
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.trajectory import Circle, publish
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Rotor, Vehicle
 from tests.sim_jax.derivatives import Differences, assert_derivatives
 from tests.sim_jax.support import controller, hover, quaternion, vec, vehicle

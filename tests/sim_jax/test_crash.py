@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import pytest
 from jax import Array
 
-from sim_jax.crash import AIRBORNE, Limits
 from sim_jax.inlet import ActuatorInlet, ReferenceInlet
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
-from sim_jax.state import hover
+from sim_jax.state import AIRBORNE, Limits, hover
 from sim_jax.vehicle import Vehicle
 from tests.sim_jax.support import (
     apart,

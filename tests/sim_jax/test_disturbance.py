@@ -10,13 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim_jax.disturbance import Disturbance
-from sim_jax.environment import NOTHING_AROUND, Environment
+from sim_jax.environment import NOTHING_AROUND, Disturbance, Environment
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import RotorSpeedInlet
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
-from sim_jax.vector import Vec3
 from tests.sim_jax.support import apart, controller, moving_start, vec, vehicle, wobble
 
 SCHEDULE = Schedule(log_rate=400)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from sim_jax.constants import GRAVITY
+from sim_jax.geometry import Quaternion
 from sim_jax.inlet import ActuatorInlet, Inlet, MixedInlet, Stages, Step
+from sim_jax.numeric import like, row_of
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.state import State
-from sim_jax.trees import like, row_of
 from sim_jax.vehicle import PerRotor
 from tests.sim_jax.support import (
     apart,

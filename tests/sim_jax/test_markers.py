@@ -7,13 +7,12 @@ import pytest
 
 from sim_jax.constants import GRAVITY
 from sim_jax.control.position import ReferencePoint
+from sim_jax.frames import Markers, markers_of
+from sim_jax.geometry import Quaternion, Vec3, rotation
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.markers import Markers, markers_of
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import rollout
-from sim_jax.rotation import Quaternion, rotation
 from sim_jax.state import Start, hover
-from sim_jax.vector import Vec3
 from tests.sim_jax.derivatives import assert_derivatives
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
 from tuner.vehicle.model import model_of, schedule_of

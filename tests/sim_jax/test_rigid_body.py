@@ -8,8 +8,8 @@ import jax
 import pytest
 
 from sim_jax.constants import GRAVITY
+from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Body
 from tests.golden_check.runge_kutta import step_rk4
 from tests.sim_jax.support import apart, quaternion, vec

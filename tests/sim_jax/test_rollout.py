@@ -9,12 +9,12 @@ import pytest
 from jax import Array
 
 from sim_jax.control.position import ReferencePoint
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet, BodyRateInlet, Inlet, ReferenceInlet, RotorSpeedInlet
 from sim_jax.plant import Sample
 from sim_jax.rollout import Rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Setup, Vehicle
 from tests.golden_check.coefficients import golden_vehicle
 from tests.sim_jax.support import (

@@ -8,8 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_jax.rotation import Quaternion
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Quaternion, Vec3
 from tests.sim_jax.derivatives import assert_derivatives
 
 component = st.floats(-1.0, 1.0, allow_subnormal=False)

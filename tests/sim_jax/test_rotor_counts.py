@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sim_jax.constants import GRAVITY
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet, BodyRateInlet, Inlet, ReferenceInlet, RotorSpeedInlet
 from sim_jax.rollout import Rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Rotor, Vehicle
 from tests.sim_jax.support import (
     apart,

@@ -12,13 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_jax.control.position import ReferencePoint
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import ActuatorInlet, ReferenceInlet
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import Rollout
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 from tests.sim_jax.support import (
     apart,

@@ -21,12 +21,12 @@ from cyclopts import App
 import tuner
 from docs.generate.models import sections_of
 from sim_jax.environment import Environment
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import safe_sqrt
 from sim_jax.rigid_body import Wrench
 from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
 from sim_jax.terms import total
-from sim_jax.vector import Vec3
 from tests.memory import BEFORE_A_FIT, give_back
 from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
 from tuner.cli.options import EACH, EVERY

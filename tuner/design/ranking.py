@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.control.position import ReferencePoint
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.state import hover
 from sim_jax.trajectory import Shape, shapes
-from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.core.numerics import log_determinant, scaled_inverse

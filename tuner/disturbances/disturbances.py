@@ -22,9 +22,9 @@ from jax import Array
 from jaxtyping import Float
 
 from sim_jax.constants import GRAVITY
-from sim_jax.disturbance import Disturbance
+from sim_jax.environment import Disturbance
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import Scalar
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 
 STRENGTHS = (

@@ -26,10 +26,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from lanes import Argument, Program, Run
+from sim_jax.numeric import row_of
 from sim_jax.schedule import Schedule
 from sim_jax.state import State
 from sim_jax.terms import total
-from sim_jax.trees import row_of
 from tuner.disturbances.covariance import (
     Samples,
     Sparse,

@@ -15,18 +15,16 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
-from sim_jax.crash import AIRBORNE
-from sim_jax.disturbance import Disturbance
-from sim_jax.markers import markers_of
+from sim_jax.environment import Disturbance
+from sim_jax.frames import markers_of
+from sim_jax.geometry import Quaternion, Vec3
+from sim_jax.numeric import replaced, row_of
 from sim_jax.plant import Plant
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import begun
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroMemory
-from sim_jax.state import State
-from sim_jax.trees import replaced, row_of
-from sim_jax.vector import Vec3
+from sim_jax.state import AIRBORNE, State
 from tuner.disturbances.disturbances import (
     Processes,
     disturbance_of,

@@ -12,9 +12,9 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import BodyRateInlet
 from sim_jax.schedule import Schedule
-from sim_jax.vector import Vec3
 from tuner.objective.noise import repeats
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured
 from tuner.recordings.flight import Flight

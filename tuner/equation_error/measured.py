@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
-from sim_jax.vector import Vec3
 from tuner.objective.noise import white_noise
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.recordings.states import filtered, states_at

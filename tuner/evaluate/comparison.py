@@ -19,7 +19,7 @@ from pathlib import Path
 import equinox as eqx
 import numpy as np
 
-from sim_jax.crash import AIRBORNE
+from sim_jax.state import AIRBORNE
 from tuner.config import Settings, settle
 from tuner.config.job import InletName
 from tuner.core.errors import InputError

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
-from sim_jax.crash import AIRBORNE
 from sim_jax.schedule import Schedule
+from sim_jax.state import AIRBORNE
 from tuner.config.job import InletName
 from tuner.findings.sentences import PREDICTED
 from tuner.objective.battery import with_reference_voltage

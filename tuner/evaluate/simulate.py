@@ -19,13 +19,13 @@ from jax import lax
 from lanes import Argument, Program
 from sim_jax.constants import GRAVITY
 from sim_jax.environment import NOTHING_AROUND
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import Inlet
+from sim_jax.numeric import Precision
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from sim_jax.state import State, hover
 from sim_jax.terms import total
-from sim_jax.trees import Precision
-from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError, did_you_mean
 from tuner.core.shipped import find_config

@@ -15,19 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_jax.crash import Limits
-from sim_jax.markers import estimated
+from sim_jax.frames import estimated
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import SwitchedLag
 from sim_jax.numeric import Array as JaxArray
+from sim_jax.numeric import replaced
 from sim_jax.plant import Plant, Sample
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import begun
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import packed, push, switched
-from sim_jax.state import State
-from sim_jax.trees import replaced
-from sim_jax.vector import Vec3
+from sim_jax.state import Limits, State
 from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.flown import Flown
 from tuner.objective.segments import Segments

@@ -33,10 +33,10 @@ from tuner.search.problem import Job, job_of
 from tuner.search.progress import beginning, plain_criterion
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
-from tuner.uncertainty.global_indices import global_sensitivity
 from tuner.uncertainty.model_error import alternatives_of
 from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.records import Knowledge, Profiles
+from tuner.uncertainty.sensitivity import global_sensitivity
 from tuner.vehicle import check_names, initial_values
 
 

@@ -9,10 +9,10 @@ from types import MappingProxyType
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from sim_jax.autopilot import gyro_of
 from sim_jax.environment import Environment
+from sim_jax.frames import gyro_of, markers_of
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import Inlet
-from sim_jax.markers import markers_of
 from sim_jax.numeric import Array
 from sim_jax.plant import Sample
 from sim_jax.rigid_body import Motion
@@ -21,7 +21,6 @@ from sim_jax.state import Start
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.trim import in_trim
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.objective.battery import relative_log_voltage
 from tuner.objective.initial_conditions import ROWS, moved, spun_up, trimmed, whole

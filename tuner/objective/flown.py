@@ -21,12 +21,11 @@ from jax import lax
 from numpy.typing import NDArray
 
 from lanes import Argument, Program
-from sim_jax.crash import Limits
 from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
-from sim_jax.state import Start, State
+from sim_jax.state import Limits, Start, State
 from sim_jax.terms import total
 from tuner.objective.flight import (
     MOTION,

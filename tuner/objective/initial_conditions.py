@@ -18,13 +18,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import Inlet, MixedInlet
 from sim_jax.motor import reference_speed
 from sim_jax.numeric import Array
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
 from sim_jax.state import Start
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 from tuner.objective.inlets import recorded_inlet_of
 from tuner.recordings.flight import Flight, InitialState, Series

@@ -17,6 +17,7 @@ import numpy as np
 
 from sim_jax.control.mixer import ROTORS
 from sim_jax.control.position import ReferencePoint
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import (
     ActuatorInlet,
     AttitudeInlet,
@@ -26,9 +27,7 @@ from sim_jax.inlet import (
     ReferenceInlet,
     RotorSpeedInlet,
 )
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
-from sim_jax.vector import Vec3
 from tuner.config.job import InletName
 from tuner.recordings.flight import SIGNALS, Array, Flight, Series
 from tuner.recordings.interpolation import body_rate_from, without_gaps

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
 
-from sim_jax.crash import Limits
 from sim_jax.schedule import Schedule
+from sim_jax.state import Limits
 from tuner.objective.criterion import (
     OFFSET_UNIT,
     Criterion,

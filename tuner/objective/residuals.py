@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanes import Argument, Program, joined
+from sim_jax.geometry import Quaternion
 from sim_jax.numeric import Array as JaxArray
-from sim_jax.rotation import Quaternion
 from tuner.core.numerics import huber_weights
 from tuner.objective.flown import CODE, Flown
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Segments

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from sim_jax.disturbance import Disturbance
+from sim_jax.environment import Disturbance
 from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.numeric import Array
 from sim_jax.schedule import Schedule

@@ -25,9 +25,8 @@ from sim_jax.control.position import (
     heading_of,
     wanted_acceleration,
 )
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Array as JaxArray
-from sim_jax.rotation import Quaternion
-from sim_jax.vector import Vec3
 from tuner.findings.findings import Code, Finding
 from tuner.objective.flown import CODE
 from tuner.objective.inlets import linear_interpolation, zero_order_hold

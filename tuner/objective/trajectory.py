@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from lanes import Argument, Program
 from sim_jax.control.position import ReferencePoint
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.numeric import Array, Scalar
 from sim_jax.trajectory import TICK_RATE, Shape, publish, shapes
-from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.objective.flown import CODE

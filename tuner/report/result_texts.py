@@ -10,7 +10,7 @@ from tuner.core.errors import InputError
 from tuner.core.phrases import listed, percent
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.result import EffectiveResult, Ending, FlightResult, PoseRmse, RunResult
-from tuner.uncertainty.calibration import Calibration
+from tuner.uncertainty.records import Calibration
 from tuner.vehicle import REGISTRY, Coefficient, NotCarried, Written
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sim_jax.crash import AIRBORNE, Limits
+from sim_jax.state import AIRBORNE, Limits
 from tuner.config import CHANNELS, JobFile, Settings
 from tuner.config.job import ErrorOf, InletName
 from tuner.core.errors import ConfigError, RecordingError

@@ -27,8 +27,7 @@ from tuner.terms.candidates import (
     with_free,
     with_groups,
 )
-from tuner.terms.held_out_score import vector_after
-from tuner.terms.linearisation import Columns, Linear, linear_of, neutral_of
+from tuner.terms.linearisation import Columns, Linear, linear_of, neutral_of, vector_after
 from tuner.terms.model_averaging import SMALLEST, in_doubt
 from tuner.terms.score import EARNING, score, surviving
 from tuner.terms.selection_state import Selected

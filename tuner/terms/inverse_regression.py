@@ -36,16 +36,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
 
-from sim_jax.autopilot import gyro_of
 from sim_jax.constants import GRAVITY
-from sim_jax.crash import AIRBORNE
-from sim_jax.markers import markers_of
+from sim_jax.frames import gyro_of, markers_of
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Array
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
+from sim_jax.state import AIRBORNE
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.core.numerics import huber_weights, robust_sd, scaled_solve
 from tuner.findings.findings import Code, Finding, Level

@@ -9,8 +9,7 @@ import numpy as np
 
 from tuner.core.numerics import scaled_solve, symmetric_eigen
 from tuner.terms.linearisation import RIDGE, Array, Columns, Linear
-from tuner.uncertainty.covariance import scatter
-from tuner.uncertainty.overdispersion import STRETCH, overdispersion_factors
+from tuner.uncertainty.covariance import STRETCH, overdispersion_factors, scatter
 
 HIDDEN, SMALLEST = 0.4, 0.1
 """Of the standard error with which the flights tell a term, and of its usual size (its prior's
@@ -49,7 +48,7 @@ def in_doubt(linear: Linear, model: Columns, groups: Iterable[tuple[Columns, flo
     group, by how much stretches of time scatter about it, corrected for what it takes out of them
     (`tuner.uncertainty.covariance.scatter`; a fit of twenty coefficients and a group to a minute of
     flight leaves a fraction). They are weighed against those of noise as a fit's own are
-    (`tuner.uncertainty.overdispersion`), along axes that noise chooses: of a few stretches' scatter
+    (`tuner.uncertainty.covariance`), along axes that noise chooses: of a few stretches' scatter
     there is always an axis along which it is far too small. What a refit would do is no measure
     where the flights can hardly tell a term from the model: that is chance.
     """

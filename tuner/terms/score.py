@@ -15,7 +15,7 @@ from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to im
 from tuner.core.numerics import scaled_inverse, scaled_solve, symmetric_eigen, unit_diagonal
 from tuner.objective.information import BLOCK
 from tuner.terms.linearisation import RIDGE, SECTIONS, Columns, Linear
-from tuner.uncertainty.overdispersion import STRETCH
+from tuner.uncertainty.covariance import STRETCH
 from tuner.vehicle.selection_table import SelectionCode
 
 

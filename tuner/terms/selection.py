@@ -43,8 +43,7 @@ from tuner.terms.candidates import (
     with_groups,
     with_terms,
 )
-from tuner.terms.held_out_score import predicted_losses, vector_after
-from tuner.terms.linearisation import linear_at
+from tuner.terms.linearisation import linear_at, predicted_losses, vector_after
 from tuner.terms.model_averaging import in_doubt
 from tuner.terms.score import Score, score, surviving
 from tuner.terms.selection_state import LinearisedFit, Selected, offsets_of, row_of

@@ -16,8 +16,7 @@ from tuner.objective.criterion import Point
 from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
-from tuner.uncertainty.covariance import Covariance, covariance_of
-from tuner.uncertainty.overdispersion import IndependentErrors, flights_apart
+from tuner.uncertainty.covariance import Covariance, IndependentErrors, covariance_of, flights_apart
 from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict, judge
 from tuner.vehicle import COEFFICIENTS, scale_group, term_groups

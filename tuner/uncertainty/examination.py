@@ -18,13 +18,13 @@ from tuner.objective.normal import Objective, portion, portions
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import LACK, Uncertainty, at_rest, references, uncertainty_at
-from tuner.uncertainty.local_sensitivity import LocalSensitivity, local_sensitivity
 from tuner.uncertainty.model_error import Lack
 from tuner.uncertainty.records import (
     CoefficientKnowledge,
     Knowledge,
     Residual,
 )
+from tuner.uncertainty.sensitivity import LocalSensitivity, local_sensitivity
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.vehicle import Size, sized

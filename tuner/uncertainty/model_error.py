@@ -19,15 +19,13 @@ from scipy.spatial.transform import Rotation
 
 from sim_jax.control.gains import MixerSettings, RateGains
 from sim_jax.control.mixer import torque_of
-from sim_jax.disturbance import Disturbance
-from sim_jax.environment import Environment
+from sim_jax.environment import Disturbance, Environment
+from sim_jax.frames import markers_of
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.markers import markers_of
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Motor
 from tuner.equation_error.measured import FEWEST, Measured, measured
 from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, answers

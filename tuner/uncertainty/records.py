@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -247,7 +248,7 @@ class CoefficientKnowledge(Part):
     verdict, reason
         How well it is known, and why.
     step
-        Change that counts as one hundred percent, see `tuner.uncertainty.local_sensitivity`.
+        Change that counts as one hundred percent, see `tuner.uncertainty.sensitivity`.
     shares
         Channel -> flight -> share in the information about it.
     prior_share
@@ -440,3 +441,44 @@ def _shares(knowledge: Knowledge) -> Iterable[Sequence[object]]:
             for flight, share in flights.items():
                 yield [name, flight, channel, share]
         yield [name, "", "prior", known.prior_share]
+
+
+CALIBRATION = Path(__file__).with_name("calibration.json")
+"""How often intervals held the truth where it was known; `benchmarks.calibration` writes it."""
+COVERAGE_LEVELS = ("50", "80", "95")
+"""Per cent that intervals are meant to hold."""
+
+
+class Held(Part):
+    """How often the intervals of one kind of flight held the truth.
+
+    Attributes
+    ----------
+    flights
+        What they had beside measurement noise.
+    sets, intervals
+        How many sets were flown, and how many intervals of coefficients looked at.
+    coverage
+        Level in per cent -> share that held the truth.
+    least
+        That of the coefficient whose 95 % intervals held it least often.
+    """
+
+    flights: str
+    sets: int
+    intervals: int
+    coverage: dict[str, float]
+    least: float
+
+
+class Calibration(Part):
+    """What was measured of every kind of flight, and when."""
+
+    date: str
+    kinds: tuple[Held, ...]
+
+
+@lru_cache(maxsize=1)
+def calibration() -> Calibration:
+    """Return what was measured."""
+    return Calibration.model_validate_json(CALIBRATION.read_text(encoding="utf-8"))

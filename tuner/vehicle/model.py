@@ -17,9 +17,9 @@ from sim_jax.control.gains import (
     PositionGains,
     RateGains,
 )
+from sim_jax.geometry import Vec3
 from sim_jax.numeric import Scalar
 from sim_jax.schedule import Schedule
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 from tuner.vehicle import COEFFICIENTS, Coefficient, ControllerFile, VehicleFile, initial_values
 from tuner.vehicle.vehicle import size_of

@@ -10,7 +10,7 @@ import pytest
 from sim_jax.control import mixer
 from sim_jax.control.gains import MixerSettings
 from sim_jax.control.mixer import HALF_SQRT2
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Vec3
 from tests.golden_check import stepwise_mixer
 from tests.golden_check.stepwise_mixer import PITCH, ROLL, YAW, exact
 

@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sim_jax.control.position import attitude_from_acceleration
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Vec3
 from tests.sim_jax.support import apart, vec
 
 component = st.floats(-1.0, 1.0, allow_subnormal=False)

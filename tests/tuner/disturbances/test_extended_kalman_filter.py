@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from lanes import keep_code_in
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import BodyRateInlet
 from sim_jax.state import hover
-from sim_jax.vector import Vec3
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
 from tuner.config import JobFile
 from tuner.core.disk import cache_folder

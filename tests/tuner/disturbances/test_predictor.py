@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim_jax.disturbance import Disturbance
+from sim_jax.environment import Disturbance
+from sim_jax.geometry import Vec3
 from sim_jax.rollout import rollout
-from sim_jax.vector import Vec3
 from tests.tuner.uncertainty import making
 from tuner.disturbances.disturbances import (
     COMMAND_NOISE,

@@ -16,7 +16,7 @@ SQUIRCLE = '''
 import jax.numpy as jnp
 
 from sim_jax.trajectory import Shape
-from sim_jax.vector import Vec3
+from sim_jax.geometry import Vec3
 
 
 class Squircle(Shape):

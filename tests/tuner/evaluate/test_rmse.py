@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim_jax.crash import AIRBORNE, Limits
+from sim_jax.state import AIRBORNE, Limits
 from tuner.config import TrajectorySettings
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.rmse import FlightErrors, SignalErrors, laps_of, rmse_of, short_way

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Wrench
 from sim_jax.terms import total
-from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder

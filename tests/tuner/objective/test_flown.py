@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from lanes import Run, joined
-from sim_jax.crash import AIRBORNE
 from sim_jax.inlet import ActuatorInlet
 from sim_jax.rollout import rollout
-from sim_jax.state import hover
+from sim_jax.state import AIRBORNE, hover
 from tests.sim_jax.support import controller, vec
 from tests.sim_jax.test_rotor_counts import SCHEDULE, STEPS, round_airframe
 from tuner.config import Options, settle

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim_jax.geometry import Vec3
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
-from sim_jax.vector import Vec3
 from tests.tuner.uncertainty.making import (
     PHYSICS,
     controller_file,

@@ -14,7 +14,7 @@ from tuner.report.result_texts import (
     what_is_lost,
 )
 from tuner.result import PoseRmse
-from tuner.uncertainty.calibration import LEVELS, Calibration, Held, calibration
+from tuner.uncertainty.records import COVERAGE_LEVELS, Calibration, Held, calibration
 from tuner.vehicle import Written
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
@@ -62,7 +62,7 @@ def test_a_gain_is_a_share_of_the_loss():
 
 
 def held(flights, share):
-    coverage = dict(zip(LEVELS, (0.6, 0.8, share), strict=True))
+    coverage = dict(zip(COVERAGE_LEVELS, (0.6, 0.8, share), strict=True))
     return Held(flights=flights, sets=12, intervals=144, coverage=coverage, least=0.8)
 
 
@@ -80,6 +80,6 @@ def test_what_is_shipped_is_of_every_kind_of_flight():
     assert [kind.flights for kind in shipped.kinds] == [kind.name for kind in KINDS]
     for kind in shipped.kinds:
         assert kind.intervals >= 12 * kind.sets
-        shares = [kind.coverage[level] for level in LEVELS]
+        shares = [kind.coverage[level] for level in COVERAGE_LEVELS]
         assert shares == sorted(shares)
         assert 0.0 <= kind.least <= shares[-1] <= 1.0

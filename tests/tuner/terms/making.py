@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import BodyRateInlet
-from sim_jax.vector import Vec3
 from tests.tuner.uncertainty.making import (
     FLIGHTS,
     NOISE,

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.terms.held_out_score import lost_by_sections
-from tuner.terms.linearisation import Linear
+from tuner.terms.linearisation import Linear, lost_by_sections
 from tuner.terms.score import Score, _Gain, score, surviving
 from tuner.terms.selection_state import row_of
 from tuner.vehicle.selection_table import SelectionCode

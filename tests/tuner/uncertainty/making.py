@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.control.position import ReferencePoint
-from sim_jax.crash import AIRBORNE
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.state import hover
-from sim_jax.vector import Vec3
+from sim_jax.state import AIRBORNE, hover
 from tuner.config import JobFile
 from tuner.core.shipped import find_config
 from tuner.objective.criterion import Criterion, Point

@@ -14,8 +14,8 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.objective.normal import Objective, portions
 from tuner.uncertainty.examination import Examination, examine, knowledge_of
-from tuner.uncertainty.local_sensitivity import shortest_half
 from tuner.uncertainty.records import Knowledge, write_files
+from tuner.uncertainty.sensitivity import shortest_half
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant", "estimate_latency")
 UNIT = {"position": 1.0, "attitude": 180.0 / np.pi, "body_rate": 1.0, "rotor_speed": 1.0}

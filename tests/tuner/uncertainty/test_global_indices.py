@@ -9,11 +9,11 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.objective.normal import Objective
-from tuner.uncertainty.global_indices import _outputs, global_sensitivity
 from tuner.uncertainty.records import (
     GlobalSensitivity,
     Method,
 )
+from tuner.uncertainty.sensitivity import _log_rmse, global_sensitivity
 
 FREE = ("motor_constant", "moment_constant", "rolling_moment_coefficient")
 
@@ -67,7 +67,7 @@ def test_a_crash_counts_as_no_better_than_the_worst_that_flew(objective: Objecti
         sums[1] = 100.0
         sums[2] = np.nan
     crashed = np.array([[True, False], [False, False], [False, False]])
-    names, values = _outputs(objective, squares, crashed, making.FLIGHTS)
+    names, values = _log_rmse(objective, squares, crashed, making.FLIGHTS)
     swing = names.index(("swing", "position"))
     spin = names.index(("spin", "position"))
     assert values[0, swing] == values[1, swing]  # it fell on the swing

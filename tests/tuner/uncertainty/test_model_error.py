@@ -15,10 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
 from sim_jax.control.position import ReferencePoint
-from sim_jax.crash import AIRBORNE
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.state import hover
-from sim_jax.vector import Vec3
+from sim_jax.state import AIRBORNE, hover
 from tests.tuner.uncertainty import making
 from tuner.config import JobFile
 from tuner.equation_error.rate_controller import Answer

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from tuner.objective.information import FisherInformation
+from tuner.uncertainty.covariance import overdispersion_factors
 from tuner.uncertainty.estimates import (
     DRAWS,
     READINGS,
@@ -17,7 +18,6 @@ from tuner.uncertainty.estimates import (
     parts_of,
     total_error,
 )
-from tuner.uncertainty.overdispersion import overdispersion_factors
 
 COUNT, FLIGHTS, LENGTH = 3, 4, 80
 ONE, ALIKE = np.ones((1, 1)), np.ones(1)

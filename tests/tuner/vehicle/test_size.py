@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
-from sim_jax.vector import Vec3
 from tuner.config import JobFile
 from tuner.core.shipped import find_config
 from tuner.objective.space import space_of

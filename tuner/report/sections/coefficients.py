@@ -10,8 +10,7 @@ from tuner.report.contents import Contents
 from tuner.report.result_texts import calibration_in_words
 from tuner.report.section import Cell, Section, Table, figures, short
 from tuner.result import CoefficientResult
-from tuner.uncertainty.calibration import calibration
-from tuner.uncertainty.records import CoefficientKnowledge
+from tuner.uncertainty.records import CoefficientKnowledge, calibration
 from tuner.uncertainty.verdict import Verdict
 from tuner.uncertainty.verdict_texts import (
     half_width_in_words,

@@ -1,15 +1,27 @@
-"""The point and the axes of the body that motion capture records, which are not the vehicle's own.
+"""The frames of motion capture and of the autopilot's sensors, which are not the vehicle's own.
 
-A rigid body that is defined by hand has its point some millimetres beside the centre of mass, and
-its axes a degree off. What is simulated is the centre of mass in body axes; what is recorded is
+A rigid body that is defined by hand in motion capture has its point some millimetres beside the
+centre of mass, and its axes a degree off. What is simulated is the centre of mass in body axes;
+what is recorded is
 
     p_recorded = p + R(q)·marker_offset,    q_recorded = q ⊗ exp(marker_tilt / 2).
 
 Both numbers belong to the set-up and act where a simulation is compared with a recording: at its
 start, which comes from the recorded pose, and on what it gives. Position and attitude control see
 the same pose where the estimator is fed by motion capture and knows of no offset, and the velocity
-of that point; else the centre of mass in the autopilot's axes (`Controller.sees_markers`). The
-gyro, and what follows it, is the autopilot's own (`sim_jax.autopilot`).
+of that point; else the centre of mass in the autopilot's axes (`Controller.sees_markers`).
+
+An autopilot that sits askew has axes of its own, the body's turned by exp(autopilot_tilt / 2);
+its gyro reads, and the rate controller follows,
+
+    ω_gyro = gyro_scale · R(exp(autopilot_tilt / 2))ᵀ·ω,    axis by axis,
+
+and an estimator that levels itself by these sensors delivers q ⊗ exp(autopilot_tilt / 2). What the
+mixer asks for acts along the body's axes, where the rotors are; the pose that is recorded does not
+know of it.
+
+Source: PX4 SENS_BOARD_X_OFF and SENS_BOARD_Y_OFF, which are meant to take the tilt out; data sheets
+of MEMS gyros, whose sensitivity is off by a percent or two.
 """
 
 from __future__ import annotations
@@ -18,15 +30,43 @@ import equinox as eqx
 import jax
 from jaxtyping import Bool
 
-from sim_jax.autopilot import tilt_of
 from sim_jax.control.gains import Controller
-from sim_jax.numeric import Array, Scalar
+from sim_jax.geometry import Quaternion, Vec3, rotation
+from sim_jax.numeric import Array, Scalar, where
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion, rotation
 from sim_jax.state import Start
-from sim_jax.trees import where
-from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
+
+
+class Gyro(eqx.Module):
+    """What a gyro reads of a body rate; what is None is not off."""
+
+    turn: Quaternion | None
+    """From the autopilot's axes to the body's."""
+    scale: Vec3 | None
+
+    def reading(self, body_rate: Vec3) -> Vec3:
+        """Return what it reads of a body rate in rad/s."""
+        along = body_rate if self.turn is None else self.turn.to_body(body_rate)
+        return along if self.scale is None else self.scale.scaled_by(along)
+
+    def body_rate(self, reading: Vec3) -> Vec3:
+        """Return the body rate of which it reads something, in rad/s."""
+        along = reading
+        if self.scale is not None:
+            along = Vec3(along.x / self.scale.x, along.y / self.scale.y, along.z / self.scale.z)
+        return along if self.turn is None else self.turn.to_world(along)
+
+
+def gyro_of(vehicle: Vehicle) -> Gyro:
+    """Return a vehicle's gyro."""
+    return Gyro(tilt_of(vehicle), vehicle.along_axes("gyro_scale", neutral=1.0))
+
+
+def tilt_of(vehicle: Vehicle) -> Quaternion | None:
+    """Return the turn from the autopilot's axes to the body's; None where they are the same."""
+    tilt = vehicle.along_axes("autopilot_tilt")
+    return None if tilt is None else rotation(tilt)
 
 
 class Markers(eqx.Module):
