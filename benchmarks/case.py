@@ -26,7 +26,7 @@ from sim_jax.control.gains import (
     PositionGains,
     RateGains,
 )
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rigid_body import Motion

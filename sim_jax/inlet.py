@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Array, Scalar, like, replaced, row_of, where
 from sim_jax.rigid_body import Motion

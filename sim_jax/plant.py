@@ -10,11 +10,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Int, PyTree
 
-from sim_jax.control import attitude, mixer, rate
+from sim_jax.control import mixer, rate
 from sim_jax.control.gains import Controller
-from sim_jax.control.position import (
+from sim_jax.control.geometric import (
     attitude_from_acceleration,
     heading_of,
+    rate_setpoint,
     thrust_setpoint,
     wanted_acceleration,
 )
@@ -106,7 +107,7 @@ class Plant(eqx.Module):
             turns_freely = turns_freely & ~reference.level_held
         wanted = wanted_acceleration(gains.position, point, position, velocity, heading)
         goal = attitude_from_acceleration(wanted, heading)
-        turn = attitude.rate_setpoint(gains.attitude, estimate, goal)
+        turn = rate_setpoint(gains.attitude, estimate, goal)
         still = jnp.zeros_like(turn.x)
         return Setpoints(
             rate=Vec3(

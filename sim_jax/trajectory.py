@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Int
 
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Vec3
 from sim_jax.numeric import Array, Scalar
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Motion, Wrench
-from sim_jax.terms import body, inflow, rotor
+from sim_jax.terms import beyond, rotor
 from sim_jax.terms.air import Air
 from sim_jax.vehicle import PerRotor, Vehicle
 
@@ -24,13 +24,13 @@ TERMS: tuple[Term, ...] = (
     rotor.rotor_drag,
     rotor.rolling_moment,
     rotor.drag_torque,
-    body.fuselage_drag,
-    body.linear_drag,
-    inflow.thrust_inflow,
-    inflow.flapping_moment,
-    inflow.gyroscopic_moment,
-    body.angular_drag,
-    body.torque_trim,
+    beyond.fuselage_drag,
+    beyond.linear_drag,
+    beyond.thrust_inflow,
+    beyond.flapping_moment,
+    beyond.gyroscopic_moment,
+    beyond.angular_drag,
+    beyond.torque_trim,
 )
 """Everything that acts on the vehicle besides gravity; a term that is added here flies."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from sim_jax.control import attitude, position
+from sim_jax.control import geometric
 from sim_jax.control.gains import AttitudeGains, PositionGains
 from sim_jax.geometry import Quaternion, Vec3
 from tests.golden_check.table import Deviation, Table, deviation, merged
@@ -31,7 +31,7 @@ def quaternion_operations(table: Table) -> list[Deviation]:
 def attitude_of_acceleration(table: Table) -> list[Deviation]:
     yaw = table.column("yaw")
     heading = Vec3(jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw))
-    got = position.attitude_from_acceleration(table.vector("a"), heading)
+    got = geometric.attitude_from_acceleration(table.vector("a"), heading)
     wanted = table.quaternion("q")
     return [deviation("attitude", _signed_as(wanted, got), wanted, EXACT)]
 
@@ -45,17 +45,17 @@ def _signed_as(wanted: Quaternion, got: Quaternion) -> Quaternion:
 def attitude_laws(table: Table) -> list[Deviation]:
     now, wanted = table.quaternion("q"), table.quaternion("ref")
     constant = table.column("attctrl_tau")
-    thrust = position.thrust_setpoint(_attitude_gains(table), table.vector("acc_"), now)
+    thrust = geometric.thrust_setpoint(_attitude_gains(table), table.vector("acc_"), now)
     return [
         deviation(
             "quaternion law",
-            attitude.quaternion_law(now, wanted, constant),
+            geometric.quaternion_law(now, wanted, constant),
             table.vector("bres_w"),
             EXACT,
         ),
         deviation(
             "rotation-matrix law",
-            attitude.rotation_matrix_law(now, wanted, constant),
+            geometric.rotation_matrix_law(now, wanted, constant),
             table.vector("lee_w"),
             EXACT,
         ),
@@ -76,20 +76,20 @@ def _position_controller(table: Table) -> list[Deviation]:
         reference_drag=table.vector("drag_"),
         velocity_yaw=follows_velocity,
     )
-    reference = position.ReferencePoint(
+    reference = geometric.ReferencePoint(
         table.vector("tp_"), table.vector("tv_"), table.vector("ta_")
     )
     place, velocity, now = table.vector("p_"), table.vector("v_"), table.quaternion("q")
     yaw = table.column("yaw_in")
     given = Vec3(jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw))
-    heading = position.heading_of(gains, velocity) if follows_velocity else given
+    heading = geometric.heading_of(gains, velocity) if follows_velocity else given
     used = table.column("yaw_used")
-    feedback = position.feedback_acceleration(gains, reference, place, velocity)
-    wanted = position.wanted_acceleration(gains, reference, place, velocity, heading)
-    goal = position.attitude_from_acceleration(wanted, heading)
+    feedback = geometric.feedback_acceleration(gains, reference, place, velocity)
+    wanted = geometric.wanted_acceleration(gains, reference, place, velocity, heading)
+    goal = geometric.attitude_from_acceleration(wanted, heading)
     attitude_gains = _attitude_gains(table)
     constant = attitude_gains.time_constant
-    thrust = position.thrust_setpoint(attitude_gains, wanted, now)
+    thrust = geometric.thrust_setpoint(attitude_gains, wanted, now)
     return [
         deviation("heading", [heading.x, heading.y], [jnp.cos(used), jnp.sin(used)], EXACT),
         deviation("feedback acceleration", feedback, table.vector("afb_"), EXACT),
@@ -102,13 +102,13 @@ def _position_controller(table: Table) -> list[Deviation]:
         ),
         deviation(
             "rate, quaternion law",
-            attitude.quaternion_law(now, goal, constant),
+            geometric.quaternion_law(now, goal, constant),
             table.vector("bres_w"),
             EXACT,
         ),
         deviation(
             "rate, rotation-matrix law",
-            attitude.rotation_matrix_law(now, goal, constant),
+            geometric.rotation_matrix_law(now, goal, constant),
             table.vector("lee_w"),
             EXACT,
         ),

@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 
 from sim_jax.control.gains import Controller, Filters, MixerSettings
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import ActuatorInlet
 from sim_jax.rigid_body import Motion

@@ -13,7 +13,7 @@ import pytest
 
 from sim_jax.constants import GRAVITY
 from sim_jax.control.gains import with_gains_of
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.frames import estimated, gyro_of
 from sim_jax.geometry import rotation
 from sim_jax.inlet import ReferenceInlet

@@ -11,7 +11,7 @@ from jax import Array
 
 from sim_jax.control import mixer
 from sim_jax.control.gains import Filters, MixerSettings
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet, ReferenceInlet
 from sim_jax.rollout import Rollout, rollout

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import pytest
 from jax import Array
 
-from sim_jax.control import attitude, mixer, position, rate
+from sim_jax.control import geometric, mixer, rate
 from sim_jax.control.gains import Filters, MixerSettings, PositionGains
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.control.mixer import HALF_SQRT2
-from sim_jax.control.position import ReferencePoint
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
@@ -36,12 +36,12 @@ HALF = jnp.asarray(0.5)
 
 def steer(reference: ReferencePoint, place: Vec3, velocity: Vec3, now: Quaternion) -> object:
     gains = CONTROL.position
-    heading = position.heading_of(gains, velocity)
-    wanted = position.wanted_acceleration(gains, reference, place, velocity, heading)
-    goal = position.attitude_from_acceleration(wanted, heading)
+    heading = geometric.heading_of(gains, velocity)
+    wanted = geometric.wanted_acceleration(gains, reference, place, velocity, heading)
+    goal = geometric.attitude_from_acceleration(wanted, heading)
     return (
-        attitude.rate_setpoint(CONTROL.attitude, now, goal),
-        position.thrust_setpoint(CONTROL.attitude, wanted, now),
+        geometric.rate_setpoint(CONTROL.attitude, now, goal),
+        geometric.thrust_setpoint(CONTROL.attitude, wanted, now),
     )
 
 
@@ -61,7 +61,7 @@ def test_feedback_at_its_limit() -> None:
     reference = ReferencePoint(vec(1.0, 0.0, 1.0), STILL, STILL)
 
     def feedback(place: Vec3) -> Vec3:
-        return position.feedback_acceleration(CONTROL.position, reference, place, STILL)
+        return geometric.feedback_acceleration(CONTROL.position, reference, place, STILL)
 
     assert_derivatives(feedback, vec(0.0, 0.0, 1.0), kink=True, tolerance=1e-5)
     assert_derivatives(feedback, vec(-1.0, 0.5, 1.0))
@@ -70,7 +70,7 @@ def test_feedback_at_its_limit() -> None:
 @pytest.mark.parametrize("along", [-0.1 / 0.06, 0.9 / 0.06])
 def test_thrust_setpoint_at_its_limits(along: float) -> None:
     def thrust(acceleration: Vec3) -> Array:
-        return position.thrust_setpoint(CONTROL.attitude, acceleration, LEVEL)
+        return geometric.thrust_setpoint(CONTROL.attitude, acceleration, LEVEL)
 
     # where the clip itself rounds, stay on the limit by adding to it
     limit = (0.0 if along < 0 else 1.0) - float(thrust(vec(0.0, 0.0, along)))
@@ -81,7 +81,7 @@ def test_thrust_setpoint_at_its_limits(along: float) -> None:
 
 def test_attitude_of_no_acceleration_and_of_one_along_the_heading() -> None:
     heading = vec(1.0, 0.0, 0.0)
-    attitude_of = Differences(position.attitude_from_acceleration, STILL, heading)
+    attitude_of = Differences(geometric.attitude_from_acceleration, STILL, heading)
     for acceleration in (STILL, vec(3.0, 0.0, 0.0), vec(-1.0, 0.0, 0.0)):
         attitude_of.jacobian(acceleration, heading)
 
@@ -91,12 +91,12 @@ def test_heading_from_no_velocity() -> None:
     follows = PositionGains(
         gains.kp, gains.kv, gains.max_feedback_acceleration, gains.reference_drag, velocity_yaw=True
     )
-    heading = Differences(lambda v: position.heading_of(follows, v), STILL)
+    heading = Differences(lambda v: geometric.heading_of(follows, v), STILL)
     heading.jacobian(STILL)
     heading.hold(vec(0.3, -0.4, 1.0))
 
 
-@pytest.mark.parametrize("law", [attitude.quaternion_law, attitude.rotation_matrix_law])
+@pytest.mark.parametrize("law", [geometric.quaternion_law, geometric.rotation_matrix_law])
 def test_attitude_laws(law: Callable[..., Vec3]) -> None:
     tau = jnp.asarray(0.3)
     turn = Differences(law, LEVEL, LEVEL, tau)

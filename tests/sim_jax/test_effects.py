@@ -22,7 +22,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
 from sim_jax.terms import total
 from sim_jax.terms.air import Air
-from sim_jax.terms.body import fuselage_drag
+from sim_jax.terms.beyond import fuselage_drag
 from sim_jax.vehicle import Vehicle
 from tests.sim_jax.support import (
     apart,

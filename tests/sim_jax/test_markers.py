@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_jax.constants import GRAVITY
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.frames import Markers, markers_of
 from sim_jax.geometry import Quaternion, Vec3, rotation
 from sim_jax.inlet import ReferenceInlet

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 from jax import Array
 
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet, BodyRateInlet, Inlet, ReferenceInlet, RotorSpeedInlet
 from sim_jax.plant import Sample

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import ActuatorInlet, ReferenceInlet
 from sim_jax.rigid_body import Motion

@@ -11,7 +11,7 @@ from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.rigid_body import Motion
 from sim_jax.terms import total
 from sim_jax.terms.air import Air
-from sim_jax.terms.body import fuselage_drag
+from sim_jax.terms.beyond import fuselage_drag
 from tests.sim_jax.support import quaternion, vec, vehicle
 
 CRAFT = vehicle()

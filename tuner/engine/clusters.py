@@ -6,7 +6,6 @@ import contextlib
 import logging
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ SPARING = {
 }
 """What local workers' cores are spared, unless the user's Dask configuration says otherwise: looks
 at the stack a hundred times a second, and at each event loop's delay fifty times."""
+dask.config.update_defaults(SPARING)
 CLASSES = {
     "slurm": "SLURMCluster",
     "pbs": "PBSCluster",
@@ -49,7 +49,6 @@ def cluster_of(file: ClusterFile) -> AbstractContextManager[Any]:
         return _jobs(file, file.jobs)
     if file.kubernetes is not None:
         return _kubernetes(file, file.kubernetes)
-    _spare()
     cluster: AbstractContextManager[Any] = LocalCluster(
         n_workers=file.workers,
         threads_per_worker=1,
@@ -59,11 +58,6 @@ def cluster_of(file: ClusterFile) -> AbstractContextManager[Any]:
         silence_logs=logging.CRITICAL + 1,
     )
     return cluster
-
-
-@cache
-def _spare() -> None:
-    dask.config.update_defaults(SPARING)
 
 
 @contextlib.contextmanager

@@ -15,8 +15,8 @@ from typing import ClassVar
 import jax
 import numpy as np
 
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.control.mixer import ROTORS
-from sim_jax.control.position import ReferencePoint
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import (
     ActuatorInlet,

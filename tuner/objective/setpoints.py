@@ -17,12 +17,12 @@ import jax
 import numpy as np
 
 from lanes import Argument, Program
-from sim_jax.control import attitude
 from sim_jax.control.gains import Controller
-from sim_jax.control.position import (
+from sim_jax.control.geometric import (
     ReferencePoint,
     attitude_from_acceleration,
     heading_of,
+    rate_setpoint,
     wanted_acceleration,
 )
 from sim_jax.geometry import Quaternion, Vec3
@@ -224,7 +224,7 @@ def _rates(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int
     heading = heading_of(controller.position, velocity)
     wanted = wanted_acceleration(controller.position, point, position, velocity, heading)
     goal = attitude_from_acceleration(wanted, heading)
-    return attitude.rate_setpoint(controller.attitude, estimate, goal).stacked()
+    return rate_setpoint(controller.attitude, estimate, goal).stacked()
 
 
 def _velocity(flight: Flight) -> Series:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanes import Argument, Program
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.numeric import Array, Scalar

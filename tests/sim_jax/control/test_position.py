@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from sim_jax.control.position import attitude_from_acceleration
+from sim_jax.control.geometric import attitude_from_acceleration
 from sim_jax.geometry import Vec3
 from tests.sim_jax.support import apart, vec
 

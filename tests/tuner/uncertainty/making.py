@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.state import AIRBORNE, hover

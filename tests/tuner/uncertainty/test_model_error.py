@@ -14,7 +14,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
-from sim_jax.control.position import ReferencePoint
+from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.state import AIRBORNE, hover

@@ -1,4 +1,4 @@
-"""Geometric position control: reference and estimate to wanted acceleration and attitude."""
+"""Geometric control: from reference and estimate to acceleration, attitude, rates and thrust."""
 
 from __future__ import annotations
 
@@ -136,3 +136,27 @@ def thrust_setpoint(gains: AttitudeGains, acceleration: Vec3, attitude: Quaterni
     """Return clip(normalized_constant·a·z_body + normalized_offset, 0, 1)."""
     along = acceleration.dot(attitude.z_axis())
     return saturate(gains.normalized_constant * along + gains.normalized_offset, 0.0, 1.0)
+
+
+def quaternion_law(attitude: Quaternion, wanted: Quaternion, time_constant: Scalar) -> Vec3:
+    """Return (2/τ)·sgn(q_e,w)·(q_e,x, q_e,y, q_e,z), q_e = q⁻¹ ⊗ q_des (Brescianini)."""
+    error = attitude.conjugate().product(wanted)
+    gain = jnp.where(error.w < 0, -2.0, 2.0) / time_constant
+    return Vec3(gain * error.x, gain * error.y, gain * error.z)
+
+
+def rotation_matrix_law(attitude: Quaternion, wanted: Quaternion, time_constant: Scalar) -> Vec3:
+    """Return (2/τ)·½(RᵀR_des - R_desᵀR)ˇ (Lee), twice as stiff as the other law near zero.
+
+    The vee of the antisymmetric part of RᵀR_des is 2 q_e,w (q_e,x, q_e,y, q_e,z), the same product
+    without building the matrices.
+    """
+    error = attitude.conjugate().product(wanted)
+    gain = 4.0 * error.w / time_constant
+    return Vec3(gain * error.x, gain * error.y, gain * error.z)
+
+
+def rate_setpoint(gains: AttitudeGains, attitude: Quaternion, wanted: Quaternion) -> Vec3:
+    """Return the body-rate set-point in rad/s, FLU, by the law that is set."""
+    law = quaternion_law if gains.law == "quaternion" else rotation_matrix_law
+    return law(attitude, wanted, gains.time_constant)
