@@ -9,13 +9,28 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-MOST_MEMORY = 900 * 2**20
-"""bytes of a process at the end of a module beyond which its compiled programs are dropped."""
-MOST_IN_A_MODULE = 1100 * 2**20
+MIB = 2**20
+
+
+def _installed() -> int:
+    """Return the bytes of memory that the machine has, or 0 where the system does not say."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, AttributeError):
+        return 0
+
+
+MOST_MEMORY = min(max(_installed() // 8, 900 * MIB), 2000 * MIB)
+"""bytes of a process at the end of a module beyond which its compiled programs are dropped.
+
+An eighth of the machine's memory, for two processes and what they start: what is dropped is traced
+again.
+"""
+MOST_IN_A_MODULE = MOST_MEMORY + 200 * MIB
 """The same at the end of a test that others of its module follow, with which it shares programs."""
-BEFORE_A_FIT = 600 * 2**20
+BEFORE_A_FIT = MOST_MEMORY * 2 // 3
 """bytes beyond which a process gives back what it can before it fits recorded flights."""
-GROWTH = 150 * 2**20
+GROWTH = 150 * MIB
 """bytes by which a process grows beyond what it could not give back before it tries again."""
 
 grown = 0

@@ -142,6 +142,8 @@ def test_it_is_installed_and_works_in_a_clean_environment(
                 assert (site / file.relative_to(ROOT)).exists(), file
     assert run(str(python), "-c", SHIPPED).split() == ["hovergames", "2.243", "thesis_lab"]
     assert run(tune, "--version").strip() == VERSION
+    if source == "sdist":  # the same files, which have run
+        return
     flown = ("--trajectory", "circle", "--duration", "2", "--out", "c.csv", "--forces", "f.csv")
     assert "written to" in run(tune, "simulate", *flown)
     assert (tmp_path / "f.csv").read_text().startswith("time,thrust_fx")

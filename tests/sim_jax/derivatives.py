@@ -8,9 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 SMALL = 1e-6
+
+
+def raveled(tree: Any) -> np.ndarray:
+    """Return the leaves of a pytree one after the other."""
+    return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(tree)])
 
 
 class Differences:
@@ -21,32 +25,41 @@ class Differences:
     """
 
     def __init__(self, function: Callable[..., Any], *example: Any) -> None:
-        _, unravel = ravel_pytree(example)
+        leaves, structure = jax.tree.flatten(example)
+        ends = np.cumsum([jnp.size(leaf) for leaf in leaves])[:-1]
 
         def flat(values: jax.Array) -> jax.Array:
-            return ravel_pytree(function(*unravel(values)))[0]
+            parts = zip(jnp.split(values, ends), leaves, strict=True)
+            point = [part.reshape(jnp.shape(leaf)) for part, leaf in parts]
+            found = function(*jax.tree.unflatten(structure, point))
+            return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(found)])
 
-        self.value = jax.jit(flat)
-        self.forward = jax.jit(jax.jacfwd(flat))
-        self.reverse = jax.jit(jax.jacrev(flat))
+        def of(values: jax.Array) -> tuple[jax.Array, ...]:
+            value, pull = jax.vjp(flat, values)
+            (reverse,) = jax.vmap(pull)(jnp.eye(len(value)))
+            return value, jax.jacfwd(flat)(values), reverse
+
+        self._of = jax.jit(of)
+
+    def of(self, start: np.ndarray) -> list[np.ndarray]:
+        """Return the values at a point, and their derivatives in forward and in reverse mode."""
+        return [np.asarray(part) for part in self._of(start)]
 
     def jacobian(self, *point: Any) -> np.ndarray:
         """Return the derivatives at a point, finite and the same in both modes."""
-        start, _ = ravel_pytree(point)
-        forward, reverse = np.asarray(self.forward(start)), np.asarray(self.reverse(start))
+        _, forward, reverse = self.of(raveled(point))
         assert np.all(np.isfinite(forward))
         np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
         return forward
 
     def hold(self, *point: Any, kink: bool = False, tolerance: float = 1e-6) -> None:
         """Hold the derivatives at a point against differences, to a share of their size."""
-        start, _ = ravel_pytree(point)
-        slope = self.jacobian(*point)
+        start, slope = raveled(point), self.jacobian(*point)
         steps = SMALL * np.maximum(np.abs(start), 1.0)
-        axes = [(step, jnp.zeros(len(steps)).at[row].set(step)) for row, step in enumerate(steps)]
-        here = self.value(start)
-        above = np.stack([(self.value(start + move) - here) / h for h, move in axes], axis=-1)
-        below = np.stack([(here - self.value(start - move)) / h for h, move in axes], axis=-1)
+        here = self.of(start)[0]
+        above = np.stack([self.of(start + move)[0] - here for move in np.diag(steps)], axis=-1)
+        below = np.stack([here - self.of(start - move)[0] for move in np.diag(steps)], axis=-1)
+        above, below = above / steps, below / steps
         size = tolerance * np.maximum(1.0, np.abs(slope))
         if kink:
             assert np.any(np.abs(above - below) > 1e-3), "there is no kink at this point"

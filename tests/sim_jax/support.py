@@ -45,11 +45,12 @@ def controller(*, filters: bool = True, **mixer: object) -> Controller:
 
 
 def vec(x: float, y: float, z: float) -> Vec3:
-    return Vec3.of(jnp.asarray([x, y, z], dtype=float))
+    return Vec3(*(jnp.asarray(value, float) for value in (x, y, z)))
 
 
 def quaternion(w: float, x: float, y: float, z: float) -> Quaternion:
-    return Quaternion.of(jnp.asarray([w, x, y, z], dtype=float)).normalized()
+    values = np.asarray([w, x, y, z], float) / np.linalg.norm([w, x, y, z])
+    return Quaternion(*(jnp.asarray(value) for value in values))
 
 
 def moving_start(craft: Vehicle) -> Start:

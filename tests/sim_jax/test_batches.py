@@ -48,10 +48,13 @@ def fly(target: Array, schedule: Schedule = DELAYED, **options: object) -> Rollo
     return rollout(VEHICLE, CONTROLLER, schedule, inlet, start, samples=SAMPLES, **options)  # type: ignore[arg-type]
 
 
+compiled = eqx.filter_jit(fly)
+
+
 @pytest.fixture(scope="module")
 def batch() -> Rollout:
     """Vehicles that stay, go, saturate, and crash into a narrow wall."""
-    return eqx.filter_jit(fly)(jnp.asarray(TARGETS), limits=LIMITS)
+    return compiled(jnp.asarray(TARGETS), limits=LIMITS)
 
 
 def test_the_batch_holds_a_crash_and_flights(batch: Rollout) -> None:
@@ -60,9 +63,8 @@ def test_the_batch_holds_a_crash_and_flights(batch: Rollout) -> None:
 
 
 def test_neighbours_change_nothing(batch: Rollout) -> None:
-    alone = eqx.filter_jit(fly)
     for index, target in enumerate(TARGETS):
-        single = alone(jnp.asarray([target]), limits=LIMITS)
+        single = compiled(jnp.asarray([target]), limits=LIMITS)
         for got, want in zip(jax.tree.leaves(single), jax.tree.leaves(batch), strict=True):
             np.testing.assert_allclose(got[..., 0], want[..., index], rtol=1e-9, atol=1e-9)
 
@@ -86,11 +88,11 @@ def test_a_crashed_vehicle_stays_where_it_crashed(batch: Rollout) -> None:
 
 @pytest.mark.parametrize("log_rate", [50, 400])
 def test_logging_more_or_less_often_changes_nothing(log_rate: int) -> None:
-    usual = eqx.filter_jit(fly)(jnp.asarray([0.5])).log
+    usual = compiled(jnp.asarray([0.5])).log
     schedule = Schedule(
         log_rate=log_rate, longest_estimate_latency=0.03, longest_actuator_latency=0.01
     )
-    other = eqx.filter_jit(fly)(jnp.asarray([0.5]), schedule).log
+    other = compiled(jnp.asarray([0.5]), schedule).log
     ours, theirs = max(1, 100 // log_rate), max(1, log_rate // 100)
     for got, want in zip(jax.tree.leaves(other), jax.tree.leaves(usual), strict=True):
         rows = min(len(got[::theirs]), len(want[::ours]))
@@ -101,7 +103,7 @@ def test_control_rates_that_do_not_divide_still_fly() -> None:
     schedule = Schedule(physics_rate=400, rate_control_rate=250, position_control_rate=30)
     zero = jnp.zeros(1)
     assert schedule.steps_per_block == 1
-    hovering = eqx.filter_jit(fly)(zero, schedule)
+    hovering = compiled(zero, schedule)
     assert not bool(hovering.crashed[0])
     np.testing.assert_allclose(hovering.log.motion.position.z, 1.0, atol=0.2)
 

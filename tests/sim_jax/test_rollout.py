@@ -107,9 +107,9 @@ def test_rotor_speeds_fed_in_below_give_nearly_the_same_flight(
 
 def test_a_yaw_spin_turns_at_the_asked_rate() -> None:
     craft = vehicle()
-    points = reference("hover", ticks=300)
+    points = reference("hover", ticks=600)
     inlet = ReferenceInlet(points, jnp.asarray(True), jnp.asarray(2.0))
-    flown = fly(craft, inlet, at_first_point(craft, points), Schedule(), 300).log
+    flown = fly(craft, inlet, at_first_point(craft, points), Schedule(), 600).log
     assert float(flown.setpoints.rate.z[-1]) == 2.0
     assert float(flown.motion.body_rate.z[-1]) == pytest.approx(2.0, abs=0.02)
     assert float(jnp.max(jnp.abs(flown.motion.position.x))) < 1e-9

@@ -45,20 +45,31 @@ def in_fresh_python(tmp_path: Path, before: str = "", **environment: str) -> dic
     return json.loads(done.stdout)
 
 
-def test_one_thread_double_precision_and_a_kept_cache(tmp_path: Path) -> None:
-    report = in_fresh_python(tmp_path)
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object]]:
+    """Return a cache folder, and what a process said to which nothing else was given."""
+    cache = tmp_path_factory.mktemp("cache")
+    return cache, in_fresh_python(cache)
+
+
+def test_one_thread_double_precision_and_a_kept_cache(
+    plain: tuple[Path, dict[str, object]],
+) -> None:
+    cache, report = plain
     assert report["dtype"] == "float64"
     assert report["nproc"] == "1"
     assert report["answer"] == 6.0
-    assert any((tmp_path / "multirotor-tune" / "compiled").iterdir())
+    assert any((cache / "multirotor-tune" / "compiled").iterdir())
     assert "NPROC=1" in str(report["line"])
 
 
-def test_the_memory_of_arrays_stays_for_the_next_ones(tmp_path: Path) -> None:
+def test_the_memory_of_arrays_stays_for_the_next_ones(
+    plain: tuple[Path, dict[str, object]],
+) -> None:
     """Else each of these ten of a thousand pages is fetched from the system again."""
     if platform.libc_ver()[0] != "glibc":
         pytest.skip("another C library")
-    faults = in_fresh_python(tmp_path)["faults"]
+    faults = plain[1]["faults"]
     assert isinstance(faults, list)
     assert faults[1] < 1000
 
@@ -95,21 +106,13 @@ def test_garbage_is_looked_for_rarely_unless_the_user_wants_it_rarer_still() -> 
         gc.set_threshold(*before)
 
 
-@pytest.mark.parametrize(
-    "module",
-    [
-        "tuner.cli.results",
-        "tuner.cli.progress",
-        "tuner.report",
-        "tuner.result",
-        "tuner.client.client",
-    ],
-)
-def test_what_is_imported_before_jax_is_set_up_does_without_it(module: str) -> None:
+def test_what_is_imported_before_jax_is_set_up_does_without_it() -> None:
     # the environment that `configure` sets is read when jax is imported
-    code = f"import sys, {module}; print('jax' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "False\n"
+    names = ("cli.results", "cli.progress", "report", "result", "client.client")
+    code = "import sys\n" + "".join(
+        f"import tuner.{name}\nif 'jax' in sys.modules: sys.exit('{name}')\n" for name in names
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_command_keeps_algebra_on_one_thread_before_numpy_is_there() -> None:

@@ -5,16 +5,19 @@ from datetime import date
 import numpy as np
 import pytest
 
+import tuner
 from tests.tuner.exporters.conftest import MODELS
 from tuner.cli import main
 from tuner.core.errors import ExportError
 from tuner.core.shipped import EXPORT_TARGETS, configs_folder
 from tuner.evaluate.comparison import Comparison
+from tuner.evaluate.write import write_flights
 from tuner.exporters.export import export_vehicle
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import MUJOCO, SIMULATORS, hover_command, thrust_to_weight
 from tuner.exporters.target import target_of, write
 from tuner.options import ExportOptions
+from tuner.recordings.loader import load_flight
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, write_vehicle
 
@@ -110,7 +113,10 @@ class Gliding:
         return self.speeds
 
 
-def test_another_simulators_body_is_what_moves(flight, updated):
+def test_another_simulators_body_is_what_moves(updated, tmp_path):
+    flights = tuner.simulate("circle", vehicle=updated, radius=0.3, speed=1.2, duration=4.0)
+    write_flights(flights, tmp_path / "short.bag")
+    flight = load_flight(tmp_path / "short.bag")
     errors = Comparison([Recording(flight)], ControllerFile()).fly(updated, flier=flier(Gliding))
     (missed,) = errors.values()
     start = flight.signals["position"][0]
