@@ -22,8 +22,8 @@ from benchmarks.table import Bar, Section, figure
 from benchmarks.timing import ROOT
 from tuner.engine import Report, engine_for
 from tuner.search.problem import Job
+from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import with_disturbances
-from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Estimate
 
 DRAWS = int(os.environ.get("TUNE_GUSTS_DRAWS", "20"))

@@ -38,9 +38,9 @@ from tuner.recordings.flight import Array, Flight
 from tuner.search.explanation import Explanation
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
+from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import examined
 from tuner.terms.search_with_terms import search_with_terms
-from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Estimate, Uncertainty, terms_shown
 from tuner.uncertainty.model_error import lack_found
 from tuner.vehicle import COEFFICIENTS, values_of

@@ -214,12 +214,8 @@ class Lowering:
             )
             self.e.flags = CONTRACT
             return found
-        return rule(self.e, params, *self._alike(name, elements))
-
-    def _alike(self, name: str, elements: Sequence[ir.Value]) -> tuple[ir.Value, ...]:
-        if name == "select_n":
-            return (elements[0], *self.e.alike(*elements[1:]))
-        return self.e.alike(*elements)
+        own = 1 if name == "select_n" else 0  # what chooses need not be what is chosen from
+        return rule(self.e, params, *elements[:own], *self.e.alike(*elements[own:]))
 
     def is_long(self, shape: Sequence[int]) -> bool:
         """Return whether an array of a shape does not lie in registers."""

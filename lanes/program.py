@@ -188,17 +188,14 @@ class Program:
         """Return the kernel for so many lanes, or None where something has no rule."""
         vectors = 2 if lanes >= MANY and not self.moving else 1
         if vectors not in self._kernels:
-            self._kernels[vectors] = self._compiled(vectors)
+            self._kernels[vectors] = None
+            try:
+                self._kernels[vectors] = _Compiled(self, vectors)
+            except UnsupportedError as missing:
+                logger.debug("%s runs through XLA: no rule for %s", self.name, missing)
+                what = f"{self.name}: no rule for {missing}"
+                jax.monitoring.record_event_duration_secs(FALLBACK, 0.0, fun_name=what)
         return self._kernels[vectors]
-
-    def _compiled(self, vectors: int) -> _Compiled | None:
-        try:
-            return _Compiled(self, vectors)
-        except UnsupportedError as missing:
-            logger.debug("%s runs through XLA: no rule for %s", self.name, missing)
-            what = f"{self.name}: no rule for {missing}"
-            jax.monitoring.record_event_duration_secs(FALLBACK, 0.0, fun_name=what)
-            return None
 
     @property
     def is_kernel(self) -> bool:

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from sim_jax.numeric import Array, Scalar, safe_divide, safe_sqrt, saturate
+from sim_jax.numeric import Array, Scalar, safe_divide, safe_sqrt
 
 
 class Vec3(eqx.Module):
@@ -181,21 +181,6 @@ class Quaternion(eqx.Module):
         zero = jnp.zeros_like(length)
         return Vec3(
             jnp.where(upright, safe_divide(east, length), 1.0), safe_divide(north, length), zero
-        )
-
-    def roll_pitch_yaw(self) -> Vec3:
-        """Return roll, pitch, yaw in rad (yaw about world z first, then pitch, then roll)."""
-        sine = saturate(2.0 * (self.w * self.y - self.z * self.x), -1.0, 1.0)
-        return Vec3(
-            jnp.arctan2(
-                2.0 * (self.w * self.x + self.y * self.z),
-                1.0 - 2.0 * (self.x * self.x + self.y * self.y),
-            ),
-            jnp.arcsin(sine),
-            jnp.arctan2(
-                2.0 * (self.w * self.z + self.x * self.y),
-                1.0 - 2.0 * (self.y * self.y + self.z * self.z),
-            ),
         )
 
     def rotation_vector_to(self, other: Quaternion) -> Vec3:

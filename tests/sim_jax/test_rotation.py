@@ -80,12 +80,6 @@ def of_angles(roll: float, pitch: float, yaw: float) -> Quaternion:
     return about(yaw, "z").product(about(pitch, "y")).product(about(roll, "x"))
 
 
-@given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
-def test_roll_pitch_yaw_come_back(roll: float, pitch: float, yaw: float) -> None:
-    wanted = Vec3.of(jnp.asarray([roll, pitch, yaw]))
-    assert apart(of_angles(roll, pitch, yaw).roll_pitch_yaw(), wanted) < 1e-12
-
-
 @given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
 def test_the_heading_is_the_yaw_angle(roll: float, pitch: float, yaw: float) -> None:
     attitude = of_angles(roll, pitch, yaw)

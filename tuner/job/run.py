@@ -57,10 +57,10 @@ from tuner.search.job_flights import as_logged, read_usable
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import Progress
 from tuner.search.rotor_change import used_up_to_changes
+from tuner.terms.candidates import Selected
 from tuner.terms.inverse_regression import with_inputs_balanced
 from tuner.terms.refit_with_disturbances import Examined, examined
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
-from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import finer_than_steps, terms_shown
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import ground_conflicts, sources_of

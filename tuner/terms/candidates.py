@@ -1,12 +1,13 @@
-"""Candidate terms: the groups of coefficients that a fit may add, and problems with them free."""
+"""Candidate terms: the groups that a fit may add, problems with them free, and what is selected."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sim_jax.numeric import Array
 from tuner.config import JobFile
 from tuner.findings.findings import Finding
 from tuner.objective.criterion import Point
@@ -16,9 +17,9 @@ from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
 from tuner.search.loop import loop_of, with_loop
 from tuner.search.problem import Job
-from tuner.terms.selection_state import offsets_of
+from tuner.terms.score import EARNING
 from tuner.vehicle import COEFFICIENTS, conditions, term_groups, values_of
-from tuner.vehicle.selection_table import Groups
+from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 PRESENT = 0.5
 """Probability a priori that a vehicle has an effect in a size that flights could tell."""
@@ -200,3 +201,58 @@ def with_groups(
     )
     others = [finding for finding in fitted.findings if finding not in said]
     return job, replace(there, findings=(*others, *findings_at(job, there)))
+
+
+def offsets_of(fitted: Fitted, objective: Objective, *, gone: Collection[str] = ()) -> Array:
+    """Return a fit's offsets, without some, as the rows of another problem of the same flights."""
+    rows = np.asarray(fitted.point.offsets)
+    known = dict(zip(fitted.objective.of_flight, rows, strict=True))
+    known = {name: row for name, row in known.items() if name not in gone}
+    nothing = np.zeros(rows.shape[1])
+    return np.asarray(np.stack([known.get(name, nothing) for name in objective.of_flight]))
+
+
+@dataclass(frozen=True)
+class Selected:
+    """A job and its fit with the terms that were kept, and the table of all that were tried.
+
+    Attributes
+    ----------
+    in_doubt
+        Coefficient -> how far it would move, in the scaled coordinate, with terms that were tried
+        and not kept; empty where none was tried.
+    base
+        Job and fit without any of them; None where none was tried.
+    """
+
+    job: Job
+    fitted: Fitted
+    rows: tuple[SelectionRow, ...] = ()
+    in_doubt: Mapping[str, float] = field(default_factory=dict)
+    base: tuple[Job, Fitted] | None = None
+
+    @property
+    def kept(self) -> tuple[str, ...]:
+        """The groups that are in the fit."""
+        return tuple(row.group for row in self.rows if row.kept)
+
+    @property
+    def left_out(self) -> tuple[tuple[str, ...], ...]:
+        """Names of each group that was tried and not kept, if the flights say anything of it."""
+        return tuple(
+            row.names
+            for row in self.rows
+            if not row.kept and row.reason is not SelectionCode.NO_INFORMATION
+        )
+
+    def rows_given(self, held: Mapping[str, str]) -> tuple[SelectionRow, ...]:
+        """Return the table once coefficients are held: a term that was chosen and is, is out.
+
+        ``held`` is a coefficient -> its stand-in, as of `tuner.search.fitted.Fitted`.
+        """
+        return tuple(
+            row.model_copy(update={"kept": False, "reason": SelectionCode.NO_INFORMATION})
+            if row.reason in EARNING and all(held.get(name) == name for name in row.names)
+            else row
+            for row in self.rows
+        )

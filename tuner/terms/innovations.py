@@ -21,6 +21,7 @@ from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
 from tuner.terms.candidates import (
+    Selected,
     is_stand_in,
     names_in,
     presence_of,
@@ -30,7 +31,6 @@ from tuner.terms.candidates import (
 from tuner.terms.linearisation import Columns, Linear, linear_of, neutral_of, vector_after
 from tuner.terms.model_averaging import SMALLEST, in_doubt
 from tuner.terms.score import EARNING, score, surviving
-from tuner.terms.selection_state import Selected
 from tuner.vehicle import COEFFICIENTS, conditions
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 

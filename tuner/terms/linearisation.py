@@ -36,6 +36,7 @@ from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Stretches
 from tuner.vehicle import COEFFICIENTS, REGISTRY
 from tuner.vehicle.coefficient import Parameter
+from tuner.vehicle.selection_table import Groups
 
 Array = NDArray[np.float64]
 Columns = NDArray[np.intp]
@@ -128,21 +129,18 @@ class Linear:
         inside = np.ones(len(self.flight), bool) if inside is None else inside
         known, key = self._informations, inside.tobytes()
         if key not in known:
-            known[key] = self._information(inside)
+            total = np.zeros((len(self.scaled), len(self.scaled)))
+            for number in np.unique(self.flight[inside]):
+                of_flight = inside & (self.flight == number)
+                seen = self.columns[np.argmax(of_flight)]
+                total[np.ix_(seen, seen)] += self.hessian[of_flight].sum(axis=0)
+            known[key] = total
         return known[key]
 
     @cached_property
     def _informations(self) -> dict[bytes, Array]:
         """Which stretches, as bytes -> their information: every group is scored in a few folds."""
         return {}
-
-    def _information(self, inside: NDArray[np.bool_]) -> Array:
-        total = np.zeros((len(self.scaled), len(self.scaled)))
-        for number in np.unique(self.flight[inside]):
-            of_flight = inside & (self.flight == number)
-            seen = self.columns[np.argmax(of_flight)]
-            total[np.ix_(seen, seen)] += self.hessian[of_flight].sum(axis=0)
-        return total
 
     def slopes(self, change: Array) -> Array:
         """Return the gradient (S, P) of each stretch's loss after a change (P,)."""
@@ -214,6 +212,25 @@ class Linear:
         """Return which stretches (S,) each fold leaves out."""
         for number in np.unique(by):
             yield by == number
+
+
+@dataclass(frozen=True)
+class LinearisedFit:
+    """A fit with some groups in it, seen in linear approximation by all that could be in it.
+
+    Attributes
+    ----------
+    fitted
+        The fit; coefficients that only fill its space up stay at their neutral values.
+    added
+        Groups in it.
+    linear
+        The loss about it, by the base model's coefficients and all candidates.
+    """
+
+    fitted: Fitted
+    added: Groups
+    linear: Linear
 
 
 def linear_at(

@@ -23,10 +23,9 @@ from tuner.search.optimiser import Free
 from tuner.search.polish import LAST, polished
 from tuner.search.problem import Job
 from tuner.search.progress import Progress
-from tuner.terms.candidates import is_stand_in, names_in
+from tuner.terms.candidates import Selected, is_stand_in, names_in
 from tuner.terms.innovations import Innovations, outside
 from tuner.terms.search_with_terms import candidates_of
-from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine, full_problem_of
 from tuner.uncertainty.identifiability import with_undetermined_held

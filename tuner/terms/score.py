@@ -16,7 +16,7 @@ from tuner.core.numerics import scaled_inverse, scaled_solve, symmetric_eigen, u
 from tuner.objective.information import BLOCK
 from tuner.terms.linearisation import RIDGE, SECTIONS, Columns, Linear
 from tuner.uncertainty.covariance import STRETCH
-from tuner.vehicle.selection_table import SelectionCode
+from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 
 def chance_of_gusts(
@@ -151,6 +151,31 @@ class Score:
     def earns_place(self) -> bool:
         """Whether it may stay in the model, or come into it."""
         return self.reason in EARNING
+
+
+def row_of(
+    group: str,
+    names: tuple[str, ...],
+    found: Score,
+    reason: SelectionCode | None = None,
+    *,
+    kept: bool,
+) -> SelectionRow:
+    """Return the row of a group; its reason is the score's unless another is known.
+
+    One that would earn its place, and is not kept, did not hold it beside the others.
+    """
+    if not kept and found.earns_place:
+        reason = reason or SelectionCode.WORSE_AFTER_REFIT
+    return SelectionRow(
+        group=group,
+        names=names,
+        gain_fit=found.gain_fit,
+        gain_holdout=found.gain_holdout,
+        scatter=found.scatter,
+        kept=kept,
+        reason=reason or found.reason,
+    )
 
 
 def score(

@@ -21,9 +21,8 @@ from tuner.search.estimation import OnProgress, search
 from tuner.search.fitted import Fitted
 from tuner.search.iteration import PointEstimate
 from tuner.search.problem import Job
-from tuner.terms.candidates import candidate_groups, groups_around, groups_named, start_of
+from tuner.terms.candidates import Selected, candidate_groups, groups_around, groups_named, start_of
 from tuner.terms.selection import Selection
-from tuner.terms.selection_state import Selected
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.selection_table import Groups
 

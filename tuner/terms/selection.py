@@ -32,21 +32,22 @@ from tuner.search.polish import LAST, ROUGH, ROUGHLY, polished, searched_again
 from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.terms.candidates import (
+    Selected,
     coefficients_in,
     conditions_in,
     groups_in,
     is_stand_in,
     names_in,
+    offsets_of,
     presence_of,
     reads_recording,
     start_of,
     with_groups,
     with_terms,
 )
-from tuner.terms.linearisation import linear_at, predicted_losses, vector_after
+from tuner.terms.linearisation import LinearisedFit, linear_at, predicted_losses, vector_after
 from tuner.terms.model_averaging import in_doubt
-from tuner.terms.score import Score, score, surviving
-from tuner.terms.selection_state import LinearisedFit, Selected, offsets_of, row_of
+from tuner.terms.score import Score, row_of, score, surviving
 from tuner.vehicle.model import with_coefficients
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 

@@ -77,7 +77,7 @@ def test_a_start_moves_by_what_it_is_told(still):
     there = moved(start, jnp.asarray(change))
     assert np.asarray(there.motion.position.x) == pytest.approx(1.1)
     assert np.asarray(there.motion.velocity.y) == pytest.approx(0.2)
-    assert np.asarray(there.motion.attitude.roll_pitch_yaw().z) == pytest.approx(0.02, rel=1e-3)
+    assert np.asarray(there.motion.attitude.heading().y) == pytest.approx(0.02, rel=1e-3)
     assert np.asarray(there.rotor_speed[3] / start.rotor_speed[3]) == pytest.approx([1.0, 1.5])
 
 

@@ -17,10 +17,9 @@ from tuner.objective.space import Space, extended, space_of
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
 from tuner.terms import innovations
-from tuner.terms.candidates import start_of
+from tuner.terms.candidates import Selected, start_of
 from tuner.terms.innovations import Innovations
 from tuner.terms.linearisation import linear_of
-from tuner.terms.selection_state import Selected
 from tuner.vehicle import COEFFICIENTS, term_groups
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 

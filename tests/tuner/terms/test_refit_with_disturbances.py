@@ -16,8 +16,8 @@ from tuner.disturbances.refit import STEPS
 from tuner.search.fitted import COLOURED, Fitted
 from tuner.search.problem import Job
 from tuner.terms import refit_with_disturbances as disturbances
+from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import ROUGHLY, with_disturbances
-from tuner.terms.selection_state import Selected
 
 NOBODY = cast(Any, None)
 

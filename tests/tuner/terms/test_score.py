@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.terms.linearisation import Linear, lost_by_sections
-from tuner.terms.score import Score, _Gain, score, surviving
-from tuner.terms.selection_state import row_of
+from tuner.terms.score import Score, _Gain, row_of, score, surviving
 from tuner.vehicle.selection_table import SelectionCode
 
 MODEL, FIRST, SECOND, COPY = (np.array([i]) for i in range(4))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.config import JobFile
-from tuner.terms.selection_state import Selected
+from tuner.terms.candidates import Selected
 from tuner.uncertainty import identifiability
 from tuner.uncertainty.identifiability import stand_ins_of, with_undetermined_held
 from tuner.uncertainty.verdict import Reason, ReasonCode
