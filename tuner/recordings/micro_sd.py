@@ -12,11 +12,10 @@ from __future__ import annotations
 import zlib
 from array import array
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
@@ -46,14 +45,17 @@ TYPES = {
 _STAMPS = {1: ("<u4", NANOSECONDS["ms"]), 2: ("<u8", NANOSECONDS["us"])}
 #: Fields of every record that are no variables; a space is in no variable's name.
 _NUMBER, _STAMP = " number", " stamp"
+#: Size and places of an event that the header does not know.
+_UNKNOWN = (LARGEST + 1, array("I"))
 
 
 @dataclass(frozen=True)
 class _Event:
-    """One event type: its name, and how its records lie in the file."""
+    """One event type: its name, how its records lie in the file, and where they begin."""
 
     name: str
     layout: np.dtype[np.void]
+    places: array[int] = field(default_factory=lambda: array("I"))
 
 
 class MicroSdRecording(Recording):
@@ -73,33 +75,23 @@ class MicroSdRecording(Recording):
             raise RecordingError(path, "is larger than any log of a flight", "cut it")
         self._data = path.read_bytes()
         header = _Header(path, self._data)
-        self._events, self._unit = header.events(), header.unit
+        events, self._unit = header.events(), header.unit
         self._whole = zlib.crc32(self._data[:-4]) == int.from_bytes(self._data[-4:], "little")
         end = len(self._data) - (CHECKSUM if self._whole else 0)
-        self._offsets, self._reached = _records(self._data, header.at, end, self._events)
-        self._lost = end - self._reached
+        self._lost = end - _find_records(self._data, header.at, end, events)
+        self._events = {event.name: event for event in events.values()}
         self.topics = tuple(
-            Topic(event.name, "log", len(self._offsets[number]))
-            for number, event in self._events.items()
+            Topic(name, "log", len(event.places)) for name, event in self._events.items()
         )
 
     def fields(self, topic: str) -> list[str]:
         """Return the variables of an event."""
-        return [
-            name
-            for event in self._events.values()
-            if event.name == topic
-            for name in event.layout.names or ()
-            if name not in _OWN
-        ]
+        names = self._events[topic].layout.names if topic in self._events else ()
+        return [name for name in names or () if name not in (_NUMBER, _STAMP)]
 
     def read(self, wanted: Mapping[str, Request]) -> Contents:
         """Read the wanted variables of some events."""
-        samples = {
-            event.name: self._samples(number, event, wanted[event.name])
-            for number, event in self._events.items()
-            if event.name in wanted
-        }
+        samples = {name: self._samples(name, request) for name, request in wanted.items()}
         return Contents(samples, damage=self._damage())
 
     def _damage(self) -> tuple[Damage, ...]:
@@ -110,23 +102,21 @@ class MicroSdRecording(Recording):
             return (Damage(Cause.LOG_DAMAGED),)
         return (Damage(Cause.END_MISSING, bytes_lost=self._lost),)
 
-    def _samples(self, number: int, event: _Event, request: Request) -> Samples:
-        missing = self.lacking(event.name, request.fields)
+    def _samples(self, topic: str, request: Request) -> Samples:
+        event, missing = self._events[topic], self.lacking(topic, request.fields)
         if missing:
             raise RecordingError(
-                self.path, f"{event.name} has no variable '{missing[0]}'", "correct the topic map"
+                self.path, f"{topic} has no variable '{missing[0]}'", "correct the topic map"
             )
-        size = event.layout.itemsize
-        places = np.frombuffer(self._offsets[number], dtype=np.uint32).astype(np.intp)
+        places = np.frombuffer(event.places, dtype=np.uint32).astype(np.intp)
         data = np.frombuffer(self._data, dtype=np.uint8)
-        rows = data[places[:, None] + np.arange(size)].reshape(-1).view(event.layout)
+        rows = data[places[:, None] + np.arange(event.layout.itemsize)].reshape(-1)
+        rows = rows.view(event.layout)
         latest = np.uint64(np.iinfo(np.int64).max // self._unit)
         time = np.minimum(rows[_STAMP].astype(np.uint64), latest).astype(np.int64) * self._unit
-        fields = {name: _numbers(rows[name]) for name in request.fields}
+        with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged log
+            fields = {name: rows[name].astype(np.float64) for name in request.fields}
         return Samples(time, time, fields)
-
-
-_OWN = {_NUMBER, _STAMP}
 
 
 class _Header:
@@ -184,22 +174,13 @@ class _Header:
         )
 
 
-def _records(
-    data: bytes, at: int, end: int, events: Mapping[int, _Event]
-) -> tuple[dict[int, array[int]], int]:
-    """Return where the records of each event begin, and the place behind the last whole one."""
-    sizes = {number: event.layout.itemsize for number, event in events.items()}
-    places = {number: array("I") for number in events}
+def _find_records(data: bytes, at: int, end: int, events: Mapping[int, _Event]) -> int:
+    """Note where the records of each event begin; return the place behind the last whole one."""
+    found = {n: (event.layout.itemsize, event.places) for n, event in events.items()}
     while at + 2 <= end:
-        number = data[at] | data[at + 1] << 8
-        size = sizes.get(number)
-        if size is None or at + size > end:
+        size, places = found.get(data[at] | data[at + 1] << 8, _UNKNOWN)
+        if at + size > end:
             break
-        places[number].append(at)
+        places.append(at)
         at += size
-    return places, at
-
-
-def _numbers(column: NDArray[np.generic]) -> NDArray[np.float64]:
-    with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged log
-        return column.astype(np.float64)
+    return at

@@ -87,36 +87,23 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
     first, last = float(pose[0]), float(pose[-1])
     if "attitude" in series and series["attitude"].time[-1] < last - PAUSE:
         last = float(series["attitude"].time[-1])
-    flying = airborne(series)
     setpoints = next((series[n] for n in ("rate_setpoint", "thrust_setpoint") if n in series), None)
-    missions = []
+    spans = [(-np.inf, np.inf)]
     if setpoints is not None and len(setpoints.time) > 1:
         spans = stretches(setpoints.time, np.ones(len(setpoints.time), np.bool_), bridged=PAUSE)
-        whole = len(spans) == 1 and spans[0][0] < first + FROM_THE_START
-        if not whole:
-            for start, end in spans:
-                for up, down in flying:
-                    if start < up:  # they began on the ground
-                        begin, begins_with = _motion_or_flight(series, up, min(end, down))
-                    else:
-                        begin, begins_with = start, "attitude set-points"
-                    missions.append(Mission(begin, min(end, down, last), begins_with))
-            return _long_enough(missions)
-        flying = [(max(up, spans[0][0]), min(down, spans[0][1])) for up, down in flying]
-    for up, down in flying:
-        begin, begins_with = _motion_or_flight(series, up, down)
-        referred = series["reference_position"].time[-1] if "reference_position" in series else last
-        end = min(down, last, float(referred))
-        missions.append(Mission(begin, end, begins_with))
-    return _long_enough(missions)
-
-
-def _motion_or_flight(series: Mapping[str, Series], up: float, down: float) -> tuple[float, str]:
-    moves = _first_motion(series, up, down)
-    return (moves, "the reference's motion") if moves > up else (up, "flight")
-
-
-def _long_enough(missions: list[Mission]) -> tuple[Mission, ...]:
+    begun = len(spans) > 1 or spans[0][0] >= first + FROM_THE_START
+    if not begun and "reference_position" in series:
+        last = min(last, float(series["reference_position"].time[-1]))
+    missions, flying = [], airborne(series)
+    for start, end in spans:
+        for up, down in flying:
+            if begun and start >= up:
+                begin, begins_with = start, "attitude set-points"
+            else:  # they began on the ground, if at all
+                flown = max(up, start)
+                begin = _first_motion(series, flown, min(end, down))
+                begins_with = "the reference's motion" if begin > flown else "flight"
+            missions.append(Mission(begin, min(end, down, last), begins_with))
     return tuple(m for m in missions if m.end - m.start >= SHORTEST)
 
 

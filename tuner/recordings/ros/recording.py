@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 import weakref
@@ -46,6 +47,7 @@ from tuner.recordings.ros.messages import (
     USUAL,
     Block,
     Definitions,
+    Fields,
     decode,
     missing_fields,
 )
@@ -205,10 +207,7 @@ class RosRecording(Recording):
 
     def fields(self, topic: str) -> list[str]:
         """Return the names of the fields of a topic's messages."""
-        try:
-            return [name for name, _ in self._definitions.fields(self._kind(topic))]
-        except RecordingError:
-            return []
+        return [name for name, _ in self._type(topic) or ()]
 
     def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return those of some fields that a topic's messages do not have."""
@@ -219,11 +218,11 @@ class RosRecording(Recording):
 
     def undefined(self, topic: str) -> str | None:
         """Return the message type of a topic if its definition is nowhere; None if it is known."""
-        kind = self._kind(topic)
-        try:
-            self._definitions.fields(kind)
-        except RecordingError:
-            return kind
+        return self._kind(topic) if self._type(topic) is None else None
+
+    def _type(self, topic: str) -> Fields | None:
+        with contextlib.suppress(RecordingError):
+            return self._definitions.fields(self._kind(topic))
         return None
 
     def _kind(self, topic: str) -> str:
