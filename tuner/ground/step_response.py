@@ -12,7 +12,7 @@ from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import robust_sd
+from tuner.core.numerics import robust_sd, scaled_solve
 from tuner.ground.measurement import Array, Curve, Measurement, Remark
 from tuner.ground.rig_data import OUTLIER, student
 
@@ -172,9 +172,7 @@ class _Steps:
 
 def _levels(design: Array, speed: Array) -> Array:
     """Return the least squares solution; the columns are steps apart, hence never near parallel."""
-    normal = design.T @ design
-    ridge = 1e-12 * np.trace(normal) * np.eye(len(normal))
-    return np.asarray(np.linalg.solve(normal + ridge, design.T @ speed))
+    return scaled_solve(design.T @ design, design.T @ speed, ridge=1e-12)
 
 
 def _decay(time: Array, constant: float, lag: float) -> Array:

@@ -33,7 +33,7 @@ from scipy import linalg, optimize, signal
 
 from sim_jax.constants import GRAVITY
 from sim_jax.vehicle import Motor
-from tuner.core.numerics import Inverse
+from tuner.core.numerics import Inverse, scaled_solve
 from tuner.inertial.signals import Stretch, blocks_of, low_passed, smoothed
 from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.objective.rotor_signals import levers
@@ -45,6 +45,8 @@ OUTPUTS = ("roll", "pitch", "yaw", "thrust")
 """What is explained: three angular accelerations in rad/s², the specific force along z in m/s²."""
 STEADY = ("steady_roll", "steady_pitch", "steady_yaw")
 """The constants of the first three, in rad/s²."""
+NAMES = ("up", "down", "late", *OUTPUTS, *STEADY)
+"""The numbers of a `Response`: the lags' coordinates, the gains, the constants."""
 CONSTANT, RATE, DRAG = 0, 1, 3
 """The columns of a constant, of the rate, and about x and y of the drag, among those that no lag
 moves."""
@@ -98,11 +100,8 @@ class Response:
         squared rotor speed.
     steady
         Of `STEADY` -> rad/s².
-    names
-        Of the numbers in ``covariance``: ``up``, ``down`` (logarithms), ``late`` (s), `OUTPUTS`
-        (the gains), `STEADY`.
     covariance
-        (10, 10) of those.
+        (10, 10) of `NAMES`: of the lags' coordinates, the gains and what is steady.
     explained
         Output -> share of its variance that is explained, in the band of `smoothed`.
     curves
@@ -114,7 +113,6 @@ class Response:
     lags: Lags
     gains: Mapping[str, float]
     steady: Mapping[str, float]
-    names: tuple[str, ...]
     covariance: Array
     explained: Mapping[str, float]
     curves: Mapping[str, tuple[Array, Array]]
@@ -123,7 +121,8 @@ class Response:
 
 TINY = 1e-30
 """Size of a column that is none."""
-NAMES = ("up", "down", "late", *OUTPUTS, *STEADY)
+RIDGE = 1e-12
+"""What is added to the unit diagonal of normal equations, against columns that are alike."""
 Tables = dict[str, list[Array]]
 """Output -> a table of each stretch."""
 
@@ -197,10 +196,8 @@ class _Weighing:
         table = _filtered(moving, self.kernel)
         table = np.vstack([table, np.zeros((len(self.prior), table.shape[1]))])
         table = table - self.basis @ (self.basis.T @ table)
-        size = np.sqrt((table * table).sum(axis=0)) + TINY
-        table /= size
-        square = table.T @ table + 1e-12 * np.eye(len(size))
-        return np.asarray(self.target - table @ np.linalg.solve(square, table.T @ self.target))
+        found = scaled_solve(table.T @ table, table.T @ self.target, RIDGE)
+        return np.asarray(self.target - table @ found)
 
 
 def fit_response(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Response:
@@ -333,10 +330,7 @@ def _solved(weighing: _Weighing, table: Array, measured: Array) -> Array:
     """Return the best coefficients (k,) of a filtered table (n, k), moved columns first."""
     moved = table.shape[1] - len(weighing.prior)
     prior = np.concatenate([np.zeros(moved), weighing.prior])
-    size = np.sqrt((table * table).sum(axis=0) + prior) + TINY
-    scaled = table / size
-    square = scaled.T @ scaled + np.diag(prior / size**2 + 1e-12)
-    return np.asarray(np.linalg.solve(square, scaled.T @ measured) / size)
+    return scaled_solve(table.T @ table + np.diag(prior), table.T @ measured, RIDGE)
 
 
 def _columns(problem: _Problem, name: str, moving: Tables) -> list[Array]:
@@ -439,7 +433,6 @@ def _response(problem: _Problem, place: Array, weighings: Mapping[str, _Weighing
             name: float(found[output][firsts[output] + CONSTANT])
             for name, output in zip(STEADY, OUTPUTS, strict=False)
         },
-        names=NAMES,
         covariance=covariance,
         explained={
             name: float((np.var(seen) - np.var(seen - made)) / (np.var(seen) + BIAS**2))

@@ -19,7 +19,7 @@ from tuner.core.errors import RecordingError
 from tuner.core.phrases import clause
 from tuner.findings.findings import remedy, sentence
 from tuner.ground.measurement import Curve, Measurement, Remark
-from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
+from tuner.inertial.fit import NAMES, OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
 from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.loader import InertialFlight
@@ -86,7 +86,7 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
 
 def _shown(response: Response, dim: float) -> list[str]:
     """Return the outputs whose gains have relative standard errors below some."""
-    error = dict(zip(response.names, np.sqrt(np.diag(response.covariance)), strict=True))
+    error = dict(zip(NAMES, np.sqrt(np.diag(response.covariance)), strict=True))
     return [
         name
         for name in OUTPUTS
@@ -96,11 +96,11 @@ def _shown(response: Response, dim: float) -> list[str]:
 
 def _used(response: Response) -> tuple[str, ...]:
     """Return the names of the numbers that the flight shows at all."""
-    error = dict(zip(response.names, np.sqrt(np.diag(response.covariance)), strict=True))
+    error = dict(zip(NAMES, np.sqrt(np.diag(response.covariance)), strict=True))
     shown = {name for name in _shown(response, DIM) if response.gains[name] > 0.0}
     lags = {name for name in ("up", "down") if error[name] < 2.0 * DIM} | {"late"}
     steady = {name for name, output in TURNED.items() if output in shown}
-    return tuple(name for name in response.names if name in shown | lags | steady)
+    return tuple(name for name in NAMES if name in shown | lags | steady)
 
 
 def _measurement(
@@ -123,7 +123,7 @@ def _measurement(
         name: over[output] / gains[output] for name, output in TURNED.items() if name in used
     }
     values |= {name: response.steady[name] * moment for name, moment in inertia.items()}
-    places = [response.names.index(number) for number in used]
+    places = [NAMES.index(number) for number in used]
     # gains enter by their logarithms, constants as moments
     slope = np.array(
         [1.0 / gains[n] if n in OUTPUTS else inertia[n] if n in STEADY else 1.0 for n in used]
