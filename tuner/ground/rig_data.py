@@ -192,8 +192,9 @@ COLUMNS: Mapping[str, Mapping[str, float]] = {
     "qy": {"qy": 1.0},
     "qz": {"qz": 1.0},
 }
-TIMES = ("time", "t")
 """Quantity -> column name -> factor to SI units."""
+TIMES = ("time", "t")
+"""Columns that may hold the time, in s."""
 SHORTEST = 3.0
 """s of steady flight without which there is no mean."""
 STEP = 0.05

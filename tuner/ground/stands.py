@@ -21,7 +21,7 @@ STEP = 0.03
 """Change of the rotor speed, relative to its largest, that counts as a step."""
 FEWEST = 4
 """Levels without which slope, offset and drift cannot be told apart."""
-SPREAD = 1.3
+LEAST_SPEED_RATIO = 1.3
 """Ratio of the fastest to the slowest level without which an offset looks like another slope."""
 
 
@@ -76,7 +76,7 @@ def stand(
         what = f"holds {len(levels)} steady levels of rotor speed of {SHORTEST:g} s and more"
         raise RecordingError(path, what, f"record {FEWEST} or more, each for some seconds")
     fastest, slowest = max(v.speed for v in levels), min(v.speed for v in levels)
-    if fastest < SPREAD * slowest:
+    if fastest < LEAST_SPEED_RATIO * slowest:
         what = f"has levels from {slowest:.0f} to {fastest:.0f} rad/s, too alike for a slope"
         raise RecordingError(path, what, "step from slow to fast")
     design = np.array([[v.speed**2, 1.0, v.time - levels[0].time] for v in levels])
@@ -165,7 +165,7 @@ COMMAND_STEP = 0.015
 FEWEST_COMMANDS = 4
 VOLTAGE_RANGE = 1.015
 """Ratio of the highest to the lowest voltage without which its exponent is not asked for."""
-BENT = 3.0
+QUADRATIC_THRESHOLD = 3.0
 """Standard errors from which a quadratic term is believed."""
 
 
@@ -219,7 +219,7 @@ def rpm_curve(
         if len(u) > FEWEST_COMMANDS
         else None
     )
-    curved = bent is not None and abs(bent[0][2]) > BENT * math.sqrt(bent[1][2, 2])
+    curved = bent is not None and abs(bent[0][2]) > QUADRATIC_THRESHOLD * math.sqrt(bent[1][2, 2])
     solution, covariance = bent if curved and bent is not None else straight
     remarks = [Remark("levels", {"levels": len(u), "outliers": dropped})]
     if "voltage" in samples:

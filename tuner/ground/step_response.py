@@ -20,7 +20,7 @@ STEP = 0.02
 """Change of the command between two samples that counts as a step."""
 FEWEST = 2
 """Steps up, and steps down, without which a time constant has no error."""
-SETTLED = 3.0
+LEAST_TIME_CONSTANTS = 3.0
 """Time constants that a step must last for its level to be known."""
 NOT_FIRST_ORDER = 0.1
 """Share of the residuals' sum of squares that a second lag may explain in a first-order motor."""
@@ -81,7 +81,7 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     lags = _fit(steps, speed, kept, first, second=False)
     up, down, delay = np.exp(lags[0]), np.exp(lags[1]), lags[2]
     shortest = float(np.diff(time[edges]).min(initial=np.inf))
-    if shortest < SETTLED * max(up, down):
+    if shortest < LEAST_TIME_CONSTANTS * max(up, down):
         longest = max(up, down)
         what = f"has steps of {shortest:.2g} s, too short for a time constant of {longest:.2g} s"
         raise RecordingError(path, what, "hold each command longer")

@@ -50,25 +50,25 @@ NAMES = ("up", "down", "late", *OUTPUTS, *STEADY)
 CONSTANT, RATE, DRAG = 0, 1, 3
 """The columns of a constant, of the rate, and about x and y of the drag, among those that no lag
 moves."""
-LASTING = 0.1
+TRIM_VARIATION = 0.1
 """rad/s² by which what is steady in one flight is another in the next."""
 AIRSPEED = 25.0
 """m/s along its axis at which a rotor has lost its thrust, or earlier."""
-MEMORY = 0.15
+NOISE_MEMORY = 0.15
 """s of errors from which the next one is predicted."""
 GYRO, ACCELEROMETER = 1e-4, 0.02
 """rad/s and m/s² of white noise that any sensor has: a simulated log may hold none."""
 BIAS = 0.1
 """m/s², standard deviation of the accelerometer's error along z."""
-SHARED = 3.0
+THRUST_BAND = 3.0
 """Hz, up to which the accelerometer tells what is left of the rotors' thrust."""
-DRAGGED = 8.0
+DRAG_BAND = 8.0
 """Hz, up to which it tells what drags."""
 HEIGHT = 0.3
 """Standard deviation, in arms, of the height at which what goes with the airspeed acts."""
-TOLD = 0.02
+DRAG_MOMENT_ERROR = 0.02
 """Share to which it tells a moment of drag."""
-LATEST = 0.02
+LARGEST_PHASE_LAG = 0.02
 """s by which a phase may be off that is all wrong: a rotor's lag."""
 OFFSET = 0.03
 """Standard deviation, in arms, of the centre of mass across the rotors' axes."""
@@ -83,7 +83,7 @@ SIMPLEX = np.diag([0.2, 0.2, 0.003])
 """First steps of the search."""
 NUDGE = (1e-2, 1e-2, 2e-4)
 """Steps of the lags' coordinates for derivatives."""
-ROUNDS, ARRIVED = 5, np.array([0.02, 0.02, 5e-4])
+ROUNDS, CONVERGED = 5, np.array([0.02, 0.02, 5e-4])
 """Of weighing and searching, at most; steps of the lags' coordinates below which it has arrived."""
 
 
@@ -140,7 +140,8 @@ class _Problem:
     still
         Output -> (n, k) of each stretch, what explains it at any lags; the constant first.
     shared
-        (n, 3) m/s² of each stretch's all steps: f_x and f_y up to `DRAGGED`, f_z up to `SHARED`.
+        (n, 3) m/s² of each stretch's all steps: f_x and f_y up to `DRAG_BAND`, f_z up to
+        `THRUST_BAND`.
     """
 
     stretches: tuple[Stretch, ...]
@@ -185,15 +186,15 @@ class _Weighing:
     def of(
         kernel: Array, prior: Array, still: Sequence[Array], measured: Sequence[Array]
     ) -> _Weighing:
-        table = np.vstack([_filtered(still, kernel), np.diag(np.sqrt(prior))])
+        table = np.vstack([_filter(still, kernel), np.diag(np.sqrt(prior))])
         size = np.sqrt((table * table).sum(axis=0)) + TINY
         basis = np.linalg.qr(table / size)[0]
-        target = np.concatenate([_filtered(measured, kernel), np.zeros(len(prior))])
+        target = np.concatenate([_filter(measured, kernel), np.zeros(len(prior))])
         return _Weighing(kernel, prior, basis, target - basis @ (basis.T @ target))
 
     def left(self, moving: Sequence[Array]) -> Array:
         """Return what columns that lags move leave of the measured (n + k,)."""
-        table = _filtered(moving, self.kernel)
+        table = _filter(moving, self.kernel)
         table = np.vstack([table, np.zeros((len(self.prior), table.shape[1]))])
         table = table - self.basis @ (self.basis.T @ table)
         found = scaled_solve(table.T @ table, table.T @ self.target, RIDGE)
@@ -213,8 +214,8 @@ def fit_response(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Respon
     vehicle
         Of a known mass, geometry, and curve from command to rotor speed.
     """
-    found = _fitted(stretches, vehicle)
-    other = _fitted(tuple(stretch.coarser for stretch in stretches), vehicle)
+    found = _fit(stretches, vehicle)
+    other = _fit(tuple(stretch.coarser for stretch in stretches), vehicle)
     apart = _numbers(found) - _numbers(other)
     return replace(found, covariance=found.covariance + np.diag(apart**2))
 
@@ -225,17 +226,17 @@ def _numbers(response: Response) -> Array:
     )
 
 
-def _fitted(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Response:
+def _fit(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Response:
     problem = _problem_of(stretches, vehicle)
-    weighings = {name: _first(problem, name) for name in OUTPUTS}
+    weighings = {name: _unweighted(problem, name) for name in OUTPUTS}
     place = problem.begin
     for _ in range(ROUNDS):
-        weighings = _weighed(problem, place, weighings)
+        weighings = _reweight(problem, place, weighings)
     for number in range(ROUNDS):
-        before, place = place, _searched(problem, place, weighings, first=number == 0)
+        before, place = place, _search_lags(problem, place, weighings, first=number == 0)
         for _ in range(2):
-            weighings = _weighed(problem, place, weighings)
-        if np.all(np.abs(place - before) < ARRIVED):
+            weighings = _reweight(problem, place, weighings)
+        if np.all(np.abs(place - before) < CONVERGED):
             break
     return _response(problem, place, weighings)
 
@@ -249,8 +250,8 @@ def _problem_of(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> _Proble
         rate = stretch.body_rate[:-1]
         force = 0.5 * (stretch.force[1:] + stretch.force[:-1])
         turning = (np.diff(stretch.body_rate, axis=0) / step)[inside]
-        across = low_passed(force[:, :2], step, DRAGGED)
-        shared.append(np.column_stack([across, low_passed(force[:, 2:], step, SHARED)]))
+        across = low_passed(force[:, :2], step, DRAG_BAND)
+        shared.append(np.column_stack([across, low_passed(force[:, 2:], step, THRUST_BAND)]))
         one = np.ones(int(inside.sum()))
         for axis, name in enumerate(OUTPUTS[:3]):
             coupling = rate[:, (axis + 1) % 3] * rate[:, (axis + 2) % 3]
@@ -265,7 +266,7 @@ def _problem_of(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> _Proble
     return _Problem(stretches, vehicle, motor, measured, still, tuple(shared))
 
 
-def _moving(problem: _Problem, place: Array) -> Tables:
+def _lag_columns(problem: _Problem, place: Array) -> Tables:
     """Return for each output the columns that lags move, the gain's first."""
     vehicle, step = problem.vehicle, problem.step
     arms, places = levers(vehicle), _places(vehicle)
@@ -276,7 +277,7 @@ def _moving(problem: _Problem, place: Array) -> Tables:
         inside = stretch.inside[:-1]
         square = 0.5 * (speed[1:] ** 2 + speed[:-1] ** 2)
         lift, torque = square.sum(axis=1), square @ arms
-        each = shared[:, 2] / low_passed(lift[:, None], step, SHARED)[:, 0]
+        each = shared[:, 2] / low_passed(lift[:, None], step, THRUST_BAND)[:, 0]
         mean = (speed[1:] + speed[:-1]) @ places / (speed[1:] + speed[:-1]).sum(axis=1)[:, None]
         spread = mean[:, 0] * shared[:, 1] - mean[:, 1] * shared[:, 0]
         reaction = np.diff(speed @ np.sign(arms[:, 2])) / step
@@ -294,7 +295,7 @@ def _places(vehicle: VehicleFile) -> Array:
     return np.asarray(places - [value.get(f"center_of_mass_{axis}") or 0.0 for axis in "xyz"])
 
 
-def _first(problem: _Problem, name: str) -> _Weighing:
+def _unweighted(problem: _Problem, name: str) -> _Weighing:
     """Return plain least squares."""
     still, measured = problem.still[name], problem.measured[name]
     return _Weighing.of(np.ones(1), _prior(problem, name, None), still, measured)
@@ -315,7 +316,7 @@ def _prior(problem: _Problem, name: str, gain: float | None) -> Array:
     return prior
 
 
-def _filtered(tables: Sequence[Array], kernel: Array) -> Array:
+def _filter(tables: Sequence[Array], kernel: Array) -> Array:
     """Return the rows (n, k) of all stretches, filtered; the first that a filter spans are lost."""
     shape = (-1, *(1,) * (tables[0].ndim - 1))
     parts = [
@@ -326,7 +327,7 @@ def _filtered(tables: Sequence[Array], kernel: Array) -> Array:
     return np.concatenate(parts)
 
 
-def _solved(weighing: _Weighing, table: Array, measured: Array) -> Array:
+def _solve(weighing: _Weighing, table: Array, measured: Array) -> Array:
     """Return the best coefficients (k,) of a filtered table (n, k), moved columns first."""
     moved = table.shape[1] - len(weighing.prior)
     prior = np.concatenate([np.zeros(moved), weighing.prior])
@@ -338,11 +339,11 @@ def _columns(problem: _Problem, name: str, moving: Tables) -> list[Array]:
     return [np.hstack(pair) for pair in pairs]
 
 
-def _weighed(
+def _reweight(
     problem: _Problem, place: Array, weighings: Mapping[str, _Weighing]
 ) -> dict[str, _Weighing]:
     """Return the weighings that errors at a place call for."""
-    moving, order = _moving(problem, place), max(1, round(MEMORY / problem.step))
+    moving, order = _lag_columns(problem, place), max(1, round(NOISE_MEMORY / problem.step))
     renewed = {}
     for name in OUTPUTS:
         old, columns, measured = (
@@ -350,7 +351,7 @@ def _weighed(
             _columns(problem, name, moving),
             problem.measured[name],
         )
-        found = _solved(old, _filtered(columns, old.kernel), _filtered(measured, old.kernel))
+        found = _solve(old, _filter(columns, old.kernel), _filter(measured, old.kernel))
         alike = np.zeros(order + 1)
         for table, values in zip(columns, measured, strict=True):
             errors = values - table @ found
@@ -370,14 +371,14 @@ def _weighed(
     return renewed
 
 
-def _searched(
+def _search_lags(
     problem: _Problem, place: Array, weighings: Mapping[str, _Weighing], *, first: bool
 ) -> Array:
     """Return the likeliest lags' coordinates (3,)."""
     begin = problem.begin
 
     def misfit(at: Array) -> float:
-        moving, total = _moving(problem, at), float(np.sum(((at - begin) / PRIOR) ** 2))
+        moving, total = _lag_columns(problem, at), float(np.sum(((at - begin) / PRIOR) ** 2))
         for name in OUTPUTS:
             left = weighings[name].left(moving[name])
             total += len(left) * float(np.log(np.mean(left * left) + TINY))
@@ -407,25 +408,25 @@ def _searched(
 
 def _response(problem: _Problem, place: Array, weighings: Mapping[str, _Weighing]) -> Response:
     """Return what is found at a place, and how surely."""
-    moving = _moving(problem, place)
+    moving = _lag_columns(problem, place)
     slopes = _slopes(problem, place)
     found, tables, errors, curves = {}, {}, {}, {}
     for name in OUTPUTS:
         weighing, columns = weighings[name], _columns(problem, name, moving)
         measured = problem.measured[name]
-        table = _filtered(columns, weighing.kernel)
-        found[name] = _solved(weighing, table, _filtered(measured, weighing.kernel))
-        errors[name] = _filtered(measured, weighing.kernel) - table @ found[name]
+        table = _filter(columns, weighing.kernel)
+        found[name] = _solve(weighing, table, _filter(measured, weighing.kernel))
+        errors[name] = _filter(measured, weighing.kernel) - table @ found[name]
         count = moving[name][0].shape[1]
         by_lags = [
-            _filtered([part @ found[name][:count] for part in slope[name]], weighing.kernel)
+            _filter([part @ found[name][:count] for part in slope[name]], weighing.kernel)
             for slope in slopes
         ]
         tables[name] = np.column_stack([*by_lags, table])
         modelled = [table @ found[name] for table in columns]
         curves[name] = _curves(measured, modelled, problem.step)
     firsts, covariance = _covariance(problem, weighings, tables, errors)
-    covariance += _of_air(problem, moving, found)
+    covariance += _air_covariance(problem, moving, found)
     return Response(
         lags=Lags.at(place),
         gains={name: float(solution[0]) for name, solution in found.items()},
@@ -451,7 +452,7 @@ def _slopes(problem: _Problem, place: Array) -> list[Tables]:
         for sign in (1.0, -1.0):
             at = place.copy()
             at[number] = np.clip(at[number] + sign * nudge, *BOUNDS[number])
-            ends.append((at[number], _moving(problem, at)))
+            ends.append((at[number], _lag_columns(problem, at)))
         (above, high), (below, low) = ends
         slopes.append(
             {
@@ -513,15 +514,16 @@ def _covariance(
     return firsts, np.asarray(covariance[np.ix_(wanted, wanted)])
 
 
-def _of_air(problem: _Problem, moving: Tables, found: Mapping[str, Array]) -> Array:
+def _air_covariance(problem: _Problem, moving: Tables, found: Mapping[str, Array]) -> Array:
     """Return the covariance (10, 10) of what the accelerometer does not tell of air.
 
     What air takes of the thrust is not known in the mean: as much, say, as it changes along the
     flight, or as the constant is that it leaves of the specific force. Whether it takes it of a
     rotor's speed or of its square, and the accelerometer's own error along z, make up as much of
-    roll's and pitch's gain. The moment of drag is told to a share (`TOLD`), which is more of the
-    turning the gentler that is. What the axial airspeed takes of rotors that rise or sink as the
-    vehicle turns damps that, or drives it where the air comes from below: half of that is unknown.
+    roll's and pitch's gain. The moment of drag is known to a share (`DRAG_MOMENT_ERROR`), which is
+    more of the turning the gentler that is. What the axial airspeed takes of rotors that rise or
+    sink as the vehicle turns damps that, or drives it where the air comes from below: half of that
+    is unknown.
     A phase that is off by as much is another lag.
     """
     gain, decline = found["thrust"][:2]
@@ -529,7 +531,7 @@ def _of_air(problem: _Problem, moving: Tables, found: Mapping[str, Array]) -> Ar
     for stretch, shared, table in zip(
         problem.stretches, problem.shared, moving["thrust"], strict=True
     ):
-        lift = low_passed(table, problem.step, SHARED) @ [gain, decline]
+        lift = low_passed(table, problem.step, THRUST_BAND) @ [gain, decline]
         left.append(shared[stretch.inside[:-1], 2] / lift)
     taken = float(np.concatenate(left).std())
     fastest = min(problem.vehicle.aerodynamics.max_relative_airspeed, AIRSPEED)
@@ -540,7 +542,7 @@ def _of_air(problem: _Problem, moving: Tables, found: Mapping[str, Array]) -> Ar
         )
         force = np.concatenate([still[:, DRAG] for still in problem.still[name]])
         arm = abs(float(_places(problem.vehicle)[:, 2].mean())) * abs(found[name][0])
-        told = TOLD * arm * force.std()
+        told = DRAG_MOMENT_ERROR * arm * force.std()
         turning = turned.std() + GYRO
         rate = np.concatenate([still[:, RATE] for still in problem.still[name]]).std()
         squares = np.mean(levers(problem.vehicle)[:, OUTPUTS.index(name)] ** 2)
@@ -549,9 +551,9 @@ def _of_air(problem: _Problem, moving: Tables, found: Mapping[str, Array]) -> Ar
         shares.append(float(np.sqrt(taken**2 + (BIAS / GRAVITY) ** 2 + told**2)))
     both = float(np.mean(shares))
     deviations = np.zeros(len(NAMES))
-    deviations[:3] = both, both, both * LATEST
+    deviations[:3] = both, both, both * LARGEST_PHASE_LAG
     deviations[3:5] = np.abs([found[name][0] for name in OUTPUTS[:2]]) * shares
     offset = found["thrust"][moving["thrust"][0].shape[1] + CONSTANT] / GRAVITY
-    deviations[-len(STEADY) :] = LASTING
+    deviations[-len(STEADY) :] = TRIM_VARIATION
     deviations[NAMES.index("thrust")] = gain * np.hypot(taken, offset)
     return np.diag(deviations**2)

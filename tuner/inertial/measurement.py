@@ -38,13 +38,13 @@ NUMBERS = (
     ("torque_trim_z",),
 )
 """The coefficients of each number of a `Response`: inertias divide, the others multiply."""
-TURNED = dict(zip(STEADY, OUTPUTS, strict=False))
+OUTPUT_OF = dict(zip(STEADY, OUTPUTS, strict=False))
 """The angular acceleration that each constant is of."""
-ENOUGH = 0.1
+LEAST_EXPLAINED = 0.1
 """Share of an output's variance below which nothing is taken from it."""
-DIM = 0.25
+LARGEST_ERROR = 0.25
 """Relative standard error from which a gain says nothing: what it is of stays as it was."""
-SURE = 0.1
+CERTAIN_ERROR = 0.1
 """That below which a gain of the wrong sign is the vehicle file's fault, and no chance."""
 TITLES = {
     "roll": "angular acceleration about x, rad/s²",
@@ -67,7 +67,7 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
     for finding in order_findings(flight.name, flight.series, vehicle, longest):
         raise RecordingError(flight.path, clause(sentence(finding)), clause(remedy(finding)))
     response = fit_response(stretches, vehicle)
-    wrong = [name for name in _shown(response, SURE) if response.gains[name] <= 0.0]
+    wrong = [name for name in _shown(response, CERTAIN_ERROR) if response.gains[name] <= 0.0]
     if wrong:
         raise RecordingError(
             flight.path,
@@ -90,16 +90,17 @@ def _shown(response: Response, dim: float) -> list[str]:
     return [
         name
         for name in OUTPUTS
-        if response.explained[name] > ENOUGH and error[name] < dim * abs(response.gains[name])
+        if response.explained[name] > LEAST_EXPLAINED
+        and error[name] < dim * abs(response.gains[name])
     ]
 
 
 def _used(response: Response) -> tuple[str, ...]:
     """Return the names of the numbers that the flight shows at all."""
     error = dict(zip(NAMES, np.sqrt(np.diag(response.covariance)), strict=True))
-    shown = {name for name in _shown(response, DIM) if response.gains[name] > 0.0}
-    lags = {name for name in ("up", "down") if error[name] < 2.0 * DIM} | {"late"}
-    steady = {name for name, output in TURNED.items() if output in shown}
+    shown = {name for name in _shown(response, LARGEST_ERROR) if response.gains[name] > 0.0}
+    lags = {name for name in ("up", "down") if error[name] < 2.0 * LARGEST_ERROR} | {"late"}
+    steady = {name for name, output in OUTPUT_OF.items() if output in shown}
     return tuple(name for name in NAMES if name in shown | lags | steady)
 
 
@@ -120,7 +121,7 @@ def _measurement(
     constant = vehicle.aerodynamics.motor_constant if thrust is None else thrust
     over = {"roll": vehicle.mass, "pitch": vehicle.mass, "yaw": constant}
     inertia = {
-        name: over[output] / gains[output] for name, output in TURNED.items() if name in used
+        name: over[output] / gains[output] for name, output in OUTPUT_OF.items() if name in used
     }
     values |= {name: response.steady[name] * moment for name, moment in inertia.items()}
     places = [NAMES.index(number) for number in used]

@@ -16,7 +16,7 @@ CUTOFF = 30.0
 frames' vibrations, below it what motors of tens of ms can follow."""
 FASTEST = 500.0
 """Hz of the common clock, at most."""
-TRIMMED = 0.5
+END_MARGIN = 0.5
 """s at both ends of a stretch that are left out: take-off, landing and the filters' ends."""
 BLOCK = 1.0
 """s, longer than residuals are alike: the standard errors count such blocks, not samples."""
@@ -51,7 +51,7 @@ class Stretch:
     @property
     def inside(self) -> NDArray[np.bool_]:
         """Which samples are far enough from the ends to be compared."""
-        ends = self.time[0] + TRIMMED, self.time[-1] - TRIMMED
+        ends = self.time[0] + END_MARGIN, self.time[-1] - END_MARGIN
         return np.asarray((self.time > ends[0]) & (self.time < ends[1]), dtype=np.bool_)
 
     @property
@@ -72,9 +72,9 @@ def stretches_of(
     stretches = []
     for begin, end in flying:
         count = int((end - begin) * rate)
-        if count >= 4 * TRIMMED * rate - 1:
+        if count >= 4 * END_MARGIN * rate - 1:
             time = begin + np.arange(count) / rate
-            stretches.append(Stretch(time, *(_on(time, series[name]) for name in names)))
+            stretches.append(Stretch(time, *(_interpolate(time, series[name]) for name in names)))
     return tuple(stretches)
 
 
@@ -102,7 +102,7 @@ def blocks_of(stretches: tuple[Stretch, ...], order: int) -> NDArray[np.int64]:
     return np.concatenate(numbers)
 
 
-def _on(time: Array, series: Series) -> Array:
+def _interpolate(time: Array, series: Series) -> Array:
     known = np.isfinite(series.values).all(axis=1)
     return np.column_stack(
         [np.interp(time, series.time[known], column) for column in series.values[known].T]

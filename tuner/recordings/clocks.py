@@ -28,24 +28,24 @@ from tuner.recordings.recording import Nanoseconds, Samples
 
 SECOND = 1_000_000_000
 #: A stamp that leaves its neighbours by more than this, while its arrival does not, has jumped.
-JUMP = SECOND // 10
+LEAST_JUMP = SECOND // 10
 #: Topics whose stamps differ by more than this from the others' are on a clock of their own.
-APART = SECOND // 2
+LEAST_CLOCK_OFFSET = SECOND // 2
 #: A stamp this part of a period off its tick still belongs to that tick.
 ON_TICK = 0.2
 #: No clock drifts faster, in s/s: such stamps have another rate.
 FASTEST_DRIFT = 0.01
 #: A smaller offset, in s, is left to the fit, which has a time offset and latencies to find.
-WORTH_MOVING = 0.02
+LEAST_OFFSET = 0.02
 #: Seconds within which an offset is looked for.
-REACH = 0.6
+LARGEST_OFFSET = 0.6
 #: How much less unlike the signals must be at the offset than without it.
-SHARPER = 0.8
+UNLIKENESS_RATIO = 0.8
 #: Turning below this, in rad/s, or a correlation below that is no evidence.
-ENOUGH_TURNING = 0.1
-ALIKE = 0.6
+LEAST_TURN_RATE = 0.1
+LEAST_CORRELATION = 0.6
 #: Seconds over which both are averaged against noise.
-WINDOW = 0.1
+AVERAGING_WINDOW = 0.1
 
 
 def message_times(
@@ -80,13 +80,13 @@ def message_times(
         if passed > SECOND and went_on < passed / 2:
             unset.append(topic)
             continue
-        stamp, repaired = _repair(topic, of.stamp, of.receive)
+        stamp, repaired = _repair_stamps(topic, of.stamp, of.receive)
         notes.extend(repaired)
         times[topic] = stamp
         offsets[topic] = int(np.median(stamp - of.receive))
     common = int(np.median(list(offsets.values()))) if offsets else 0
     for topic, offset in offsets.items():
-        if abs(offset - common) > APART:
+        if abs(offset - common) > LEAST_CLOCK_OFFSET:
             times[topic] = times[topic] - (offset - common)
             off = {"seconds": (offset - common) / SECOND}
             count = len(times[topic])
@@ -103,7 +103,9 @@ def message_times(
     return times, tuple(notes)
 
 
-def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanoseconds, list[Note]]:
+def _repair_stamps(
+    topic: str, stamp: Nanoseconds, receive: Nanoseconds
+) -> tuple[Nanoseconds, list[Note]]:
     """Undo jumps of a stamp that the time of recording did not make."""
     if len(stamp) < 3:
         return stamp, []
@@ -111,7 +113,7 @@ def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanos
     usual = int(np.median(step))
     extra = step - arrival
     # A recorder that stalls delays arrivals while stamps go on as usual: that is no jump.
-    jumped = np.flatnonzero((np.abs(extra) > JUMP) & (np.abs(step - usual) > JUMP))
+    jumped = np.flatnonzero((np.abs(extra) > LEAST_JUMP) & (np.abs(step - usual) > LEAST_JUMP))
     if len(jumped) == 0:
         return stamp, []
     fixed = stamp.copy()
@@ -122,7 +124,7 @@ def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanos
     while i < len(jumped):
         here = int(jumped[i])
         back = int(jumped[i + 1]) if i + 1 < len(jumped) else -1
-        if back - here in (1, 2, 3) and abs(int(extra[here] + extra[back])) < JUMP:
+        if back - here in (1, 2, 3) and abs(int(extra[here] + extra[back])) < LEAST_JUMP:
             rows = np.arange(here + 1, back + 1)
             fixed[rows] = receive[rows] + (stamp[here] - receive[here])
             wrong += len(rows)
@@ -243,14 +245,14 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
     if "attitude" not in series or "body_rate" not in series:
         return None
     clock = stretch(series)
-    if len(clock) < 3 * REACH * RATE:
+    if len(clock) < 3 * LARGEST_OFFSET * RATE:
         return None
-    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)), WINDOW)
-    gyro = smooth(on_clock(series, "body_rate", clock), WINDOW)
-    if rms(gyro) < ENOUGH_TURNING:
+    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)), AVERAGING_WINDOW)
+    gyro = smooth(on_clock(series, "body_rate", clock), AVERAGING_WINDOW)
+    if rms(gyro) < LEAST_TURN_RATE:
         return None
     # The best whole lag first, then a parabola through the three highest points.
-    most = round(REACH * RATE)
+    most = round(LARGEST_OFFSET * RATE)
     lags = np.arange(-most, most + 1)
     count = len(clock)
     score = np.array(
@@ -263,8 +265,12 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
     )
     best = int(np.argmax(score))
     unlike = 1 - score
-    if score[best] < ALIKE or best in (0, len(lags) - 1) or unlike[best] > SHARPER * unlike[most]:
-        return 0.0 if score[most] > ALIKE else None
+    if (
+        score[best] < LEAST_CORRELATION
+        or best in (0, len(lags) - 1)
+        or unlike[best] > UNLIKENESS_RATIO * unlike[most]
+    ):
+        return 0.0 if score[most] > LEAST_CORRELATION else None
     left, peak, right = score[best - 1 : best + 2]
     bend = left - 2 * peak + right
     fine = 0.5 * (left - right) / bend if bend < 0 else 0.0
@@ -290,7 +296,7 @@ def align_pose(
     offset = pose_offset(series)
     if offset is None:
         return aligned, ()
-    if abs(offset) < WORTH_MOVING:
+    if abs(offset) < LEAST_OFFSET:
         return aligned, (Note(NoteCode.POSE_ON_TIME, "info", topic, numbers={"seconds": offset}),)
     for signal, samples in series.items():
         if topics.get(signal) == topic:

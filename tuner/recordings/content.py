@@ -50,11 +50,17 @@ from tuner.vehicle.motor_orders import columns_of, motor_order_of, order_in_word
 
 PX4_REFERENCES = ("trajectory_setpoint", "vehicle_local_position_setpoint")
 """Messages that ask PX4's own position control for something."""
-DRIVES = ("command", "rotor_speed", "thrust_setpoint", "commanded_thrust", "reference_position")
+DRIVING_SIGNALS = (
+    "command",
+    "rotor_speed",
+    "thrust_setpoint",
+    "commanded_thrust",
+    "reference_position",
+)
 """Signals of which one has to be there beside a pose, for anything to drive a simulation."""
 PER_MOTOR = ("command", "rotor_speed")
 """Signals with a column a motor."""
-UNHURRIED = {"lap", "battery_voltage"}
+SLOW_SIGNALS = {"lap", "battery_voltage"}
 """Signals for which the time of recording is as good as a stamp."""
 
 
@@ -201,7 +207,7 @@ def read_signals(options: ReadOptions) -> Signals:
         *noticed,
     ]
     if is_tabular(recording.format) and not any(clock.unit for clock in chosen.time):
-        raw, quicker = _quickened(raw)
+        raw, quicker = _with_shorter_times(raw)
         notes += quicker
     if order is not None and set(PER_MOTOR) & set(raw):
         columns = columns_of(order)
@@ -211,7 +217,7 @@ def read_signals(options: ReadOptions) -> Signals:
         notes.append(Note(NoteCode.MOTOR_ORDER_GIVEN, "info", names=names))
     series, epoch, dropped = _clean(raw)
     topics = {signal: data.topic for signal, data in raw.items()}
-    damage = tuple(part.later(_late(raw, contents, epoch)) for part in contents.damage)
+    damage = tuple(part.later(_stamp_delay(raw, contents, epoch)) for part in contents.damage)
     notes += dropped
     for needed in ("position", "attitude"):
         if no_pose is None and needed not in series:
@@ -227,14 +233,14 @@ def _notes_of_places(places: Mapping[str, Place]) -> list[Note]:
     notes, speed, reference = [], places.get("rotor_speed"), places.get("reference_position")
     if speed is not None and speed.source.unit is None:  # what they were taken for
         notes.append(Note(NoteCode.SPEED_UNIT_OPEN, "info", speed.topic, names=(speed.unit,)))
-    if {"position", "attitude"} <= set(places) and not set(DRIVES) & set(places):
+    if {"position", "attitude"} <= set(places) and not set(DRIVING_SIGNALS) & set(places):
         notes.append(Note(NoteCode.POSE_ALONE))
     if reference and reference.topic.rpartition("/")[2].startswith(PX4_REFERENCES):
         notes.append(Note(NoteCode.PX4_REFERENCE, "info", reference.topic))
     return notes
 
 
-def _late(raw: Mapping[str, Raw], contents: Contents, epoch: int) -> float:
+def _stamp_delay(raw: Mapping[str, Raw], contents: Contents, epoch: int) -> float:
     """Return the s from the recorder's clock to that of the stamps since some nanoseconds."""
     first = "position" if "position" in raw else min(raw, default=None)
     if first is None:
@@ -269,20 +275,20 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     series, shifted = align_pose(signals.series, topics)
     series, turned = correct_frames(series, topics)
     cut, stale = without_stale(series)
-    missions = _missions(cut, sidecar)
+    missions = _choose_missions(cut, sidecar)
     if stale and not missions:  # read for inspection; a fit leaves such a flight out
-        missions = _missions(series, sidecar)
+        missions = _choose_missions(series, sidecar)
     else:
         series = cut
     denied = contradiction(series, missions)
     if denied is not None:  # which says what the doubts of frames are about
         turned = (*(note for note in turned if note.code not in DOUBTS), denied)
-    notes = (*signals.notes, *shifted, *turned, *stale, *_unmeasured(series, topics))
+    notes = (*signals.notes, *shifted, *turned, *stale, *_note_missing_tachometers(series, topics))
     read = vars(signals) | {"series": series, "notes": notes}
     return Content(**read, missions=missions)
 
 
-def _quickened(raw: dict[str, Raw]) -> tuple[dict[str, Raw], list[Note]]:
+def _with_shorter_times(raw: dict[str, Raw]) -> tuple[dict[str, Raw], list[Note]]:
     """Return signals with times a thousandth as long, where gravity says that they are."""
     if not is_too_slow({name: data.stamped(0) for name, data in raw.items()}):
         return raw, []
@@ -313,7 +319,9 @@ def _clean(raw: Mapping[str, Raw]) -> tuple[dict[str, Series], int, list[Note]]:
     return series, epoch, [*units, *notes.values()]
 
 
-def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list[Note]:
+def _note_missing_tachometers(
+    series: Mapping[str, Series], topics: Mapping[str, str]
+) -> list[Note]:
     """Note which rotors have no tachometer."""
     if "rotor_speed" not in series:
         return []
@@ -325,7 +333,7 @@ def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list
     return [Note(NoteCode.NO_TACHOMETER, "info", topic, count=len(rotors), names=rotors)]
 
 
-def _missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:
+def _choose_missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:
     missions = manoeuvres(series, find_missions(series))
     if sidecar.missions is not None:
         numbers = sidecar.missions
@@ -385,7 +393,7 @@ def extract(
     )
     receive_only = {p.topic for p in places.values() if p.source.stamp == "receive"}
     kinds = {t: {s for s, place in places.items() if place.topic == t} for t in wanted}
-    unhurried = {topic for topic, held in kinds.items() if held <= UNHURRIED}
+    unhurried = {topic for topic, held in kinds.items() if held <= SLOW_SIGNALS}
     times, notes = message_times(contents.samples, receive_only, unhurried)
     signals: dict[str, Raw] = {}
     inferred: list[Note] = []

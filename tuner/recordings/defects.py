@@ -40,22 +40,22 @@ RANGES: Mapping[str, tuple[float, float]] = {
 }
 """Signals that cannot leave a range; a value beyond it is a corrupt sample."""
 
-WHOLLY = 0.5
+WRONG_UNIT_SHARE = 0.5
 """Share of samples out of range above which a signal is in another unit rather than corrupt."""
 
-LONGEST = 43_200.0
+LONGEST_RECORDING = 43_200.0
 """No recording lasts longer, in s, to either side of its middle."""
-THRESHOLD = 6.0
+OUTLIER_THRESHOLD = 6.0
 """Multiples of how far samples stick out nearby that make an outlier."""
-AWAY = 1.0
+LONGEST_EXCURSION = 1.0
 """Seconds after which a pose that jumped away is not expected back."""
-LASTS = 1.0
+SHORTEST_STALE = 1.0
 """s for which a signal must not have changed."""
-MOVED = 0.05
+LEAST_MOTION = 0.05
 """m by which the vehicle must have moved meanwhile."""
-TURNED = 0.2
+LEAST_TURN_RATE = 0.2
 """rad/s of its gyro, root mean square, that show the same."""
-MADE = ("attitude", "body_rate")
+MOTION_SIGNALS = ("attitude", "body_rate")
 """Signals that change whenever a vehicle moves."""
 
 
@@ -89,7 +89,7 @@ def clean(
     low, high = RANGES.get(signal, (-np.inf, np.inf))
     beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
     dropped = int(beyond.any(axis=1).sum())
-    if dropped > WHOLLY * len(values):
+    if dropped > WRONG_UNIT_SHARE * len(values):
         median = float(np.nanmedian(values))
         note(dropped, NoteCode.UNIT_UNKNOWN, "warning", lower=low, upper=high, median=median)
     else:
@@ -110,7 +110,11 @@ def clean(
     note(late, NoteCode.OUT_OF_ORDER)
     order = np.argsort(time, kind="stable")
     time, values = time[order], values[order]
-    apart = np.abs(time - np.median(time)) > LONGEST if len(time) else np.zeros(0, dtype=np.bool_)
+    apart = (
+        np.abs(time - np.median(time)) > LONGEST_RECORDING
+        if len(time)
+        else np.zeros(0, dtype=np.bool_)
+    )
     note(int(apart.sum()), NoteCode.FAR_IN_TIME)
     time, values = time[~apart], values[~apart]
     time, values, doubles = _merge_equal_times(time, values)
@@ -258,7 +262,7 @@ def outliers(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
     apart = np.pad((time[4:] - time[:-4]) / 4, 2, mode="edge")
     bound = limits.floor_of(values) + 2 * limits.curvature * apart**2
     usual = np.sort(rough, axis=1)[:, 20]  # the fifth largest of 25
-    return np.asarray(excess > np.maximum(bound, THRESHOLD * usual), dtype=np.bool_)
+    return np.asarray(excess > np.maximum(bound, OUTLIER_THRESHOLD * usual), dtype=np.bool_)
 
 
 def _middle(a: Array, b: Array, c: Array) -> Array:
@@ -291,7 +295,7 @@ def excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray[np.b
     Returns
     -------
     tuple
-        (n,) which samples, and how many leaps did not come back within `AWAY`.
+        (n,) which samples, and how many leaps did not come back within `LONGEST_EXCURSION`.
     """
     away = np.zeros(len(values), dtype=np.bool_)
     if len(values) < 12:
@@ -313,7 +317,7 @@ def excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray[np.b
             (
                 j
                 for j in range(i + 1, min(len(at), i + 40))
-                if time[at[j]] - time[at[i]] < AWAY
+                if time[at[j]] - time[at[i]] < LONGEST_EXCURSION
                 and np.linalg.norm(leap[at[i]] + leap[at[j]]) < 0.3 * size[at[i]] + limits.floor
             ),
             None,
@@ -330,13 +334,17 @@ def excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray[np.b
 def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list[Note]]:
     """Return the signals without what repeats itself at their end while the vehicle moves."""
     kept, notes = dict(series), []
-    for name in MADE:
+    for name in MOTION_SIGNALS:
         if name not in series:
             continue
         time, values = series[name].time, series[name].values
         changes = np.flatnonzero((values[1:] != values[:-1]).any(axis=1))
         last = int(changes[-1]) + 1 if len(changes) else 0
-        if not last or time[-1] - time[last] < LASTS or not _moves(series, name, time[last]):
+        if (
+            not last
+            or time[-1] - time[last] < SHORTEST_STALE
+            or not _is_moving(series, name, time[last])
+        ):
             continue
         kept[name] = Series(time[: last + 1], values[: last + 1])
         numbers = {"seconds": float(time[-1] - time[last])}
@@ -346,15 +354,15 @@ def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list
     return kept, notes
 
 
-def _moves(series: Mapping[str, Series], stuck: str, since: float) -> bool:
+def _is_moving(series: Mapping[str, Series], stuck: str, since: float) -> bool:
     """Return whether the vehicle is seen to move, by its position or, if not stuck, its gyro."""
     places = _known(series["position"], since)
-    if len(places) and np.ptp(places, axis=0).max() >= MOVED:
+    if len(places) and np.ptp(places, axis=0).max() >= LEAST_MOTION:
         return True
     if stuck == "body_rate" or "body_rate" not in series:
         return False
     rates = _known(series["body_rate"], since)
-    return len(rates) > 0 and bool(np.sqrt(np.mean(rates**2)) >= TURNED)
+    return len(rates) > 0 and bool(np.sqrt(np.mean(rates**2)) >= LEAST_TURN_RATE)
 
 
 def _known(samples: Series, since: float) -> Array:

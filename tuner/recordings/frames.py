@@ -40,14 +40,14 @@ from tuner.recordings.unit_detection import (
 
 DOUBTS = (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED, NoteCode.VELOCITY_DOUBTED)
 """Notes of what fits no reading."""
-ENOUGH_PUSH = 0.3
-ENOUGH_TURNING = 0.1
-ENOUGH_SPEED = 0.2
+LEAST_ACCELERATION = 0.3
+LEAST_TURN_RATE = 0.1
+LEAST_SPEED = 0.2
 """Motion below these, in m/s^2, rad/s and m/s, contradicts nothing."""
-GOOD = 0.6
-BETTER = 0.3
+GOOD_AGREEMENT = 0.6
+LEAST_GAIN = 0.3
 """Agreement that is believed without a look at alternatives, and how much better one must be."""
-UNLIKELY = 0.05
+READING_PENALTY = 0.05
 """What a further misreading must bring to be preferred."""
 
 
@@ -61,17 +61,17 @@ _RATES = (
     Reading("in degrees per second", lambda w: w * _DEGREES),
     Reading("in FRD axes and degrees", lambda w: to_enu_flu(w, "body_rate") * _DEGREES),
 )
-AGAINST = -0.5
+OPPOSED = -0.5
 """Correlation below which two signals that should be alike are opposites."""
 UNRELATED = 0.2
 """Correlation, of either sign, of signals that have nothing to do with each other."""
-COMMENSURATE = 3.0
+LARGEST_RATIO = 3.0
 """Times that one of two unrelated signals may be larger: more of it would be noise."""
-LASTING = 0.5
+LEAST_AUTOCORRELATION = 0.5
 """Correlation of an acceleration with that a bin later, which noise of a position has not."""
-LASTS = 5.0
+SHORTEST_MISSION = 5.0
 """s that a mission has to last for any of it to be certain."""
-PUSH, TURNING, SPEED = 1.0, 0.3, 0.3
+CLEAR_ACCELERATION, CLEAR_TURN_RATE, CLEAR_SPEED = 1.0, 0.3, 0.3
 """m/s^2, rad/s and m/s, root mean square, that are plenty."""
 
 
@@ -128,14 +128,14 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
         turned = reading(q)
         up = upward(turned)
         scores = []
-        if rms(push[:, :2]) > ENOUGH_PUSH:
+        if rms(push[:, :2]) > LEAST_ACCELERATION:
             scores.append(correlation(smooth(up[:, :2], 0.2), push[:, :2]))
-        if gyro is not None and rms(gyro) > ENOUGH_TURNING:
+        if gyro is not None and rms(gyro) > LEAST_TURN_RATE:
             # The gyro's own axes may be wrong too, though two errors are less likely than one.
             turning = smooth(body_rate_of(turned))
             in_flu = correlation(turning, smooth(gyro))
             in_frd = correlation(turning, smooth(_RATES[0].read(gyro)))
-            scores.append(max(in_flu, in_frd - UNLIKELY))
+            scores.append(max(in_flu, in_frd - READING_PENALTY))
         if force is None:  # thrust points where the motion and gravity ask for it
             carried = (up * pull).sum(axis=1) / np.linalg.norm(pull, axis=1)
         else:
@@ -143,13 +143,15 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
         return (min(scores) if scores else 1.0), float(np.nanmean(carried))
 
     fit, upright = agreement(lambda values: values)
-    if fit > GOOD and upright > 0.5:
+    if fit > GOOD_AGREEMENT and upright > 0.5:
         return None, None
-    worth = [_worth(*agreement(r.read)) - UNLIKELY * i for i, r in enumerate(ATTITUDE_READINGS)]
+    worth = [
+        _score(*agreement(r.read)) - READING_PENALTY * i for i, r in enumerate(ATTITUDE_READINGS)
+    ]
     best = ATTITUDE_READINGS[int(np.argmax(worth))]
     best_fit, best_upright = agreement(best.read)
-    better = _worth(best_fit, best_upright) > _worth(fit, upright) + BETTER
-    if better and best_fit > GOOD and best_upright > 0.5:
+    better = _score(best_fit, best_upright) > _score(fit, upright) + LEAST_GAIN
+    if better and best_fit > GOOD_AGREEMENT and best_upright > 0.5:
         return best, None
     if fit < 0.2 or upright < 0.5:
         numbers = {"agreement": fit, "upright": upright}
@@ -157,36 +159,36 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     return None, None
 
 
-def _worth(fit: float, upright: float) -> float:
+def _score(fit: float, upright: float) -> float:
     return fit + min(upright, 1.0)
 
 
-def _turning(series: Mapping[str, Series], clock: Array) -> tuple[Array, Array]:
+def _body_rates(series: Mapping[str, Series], clock: Array) -> tuple[Array, Array]:
     """Return the attitude's change and the gyro, (n, 3) rad/s each, which should be alike."""
     turning = body_rate_of(on_clock(series, "attitude", clock))
     return smooth(turning), smooth(on_clock(series, "body_rate", clock))
 
 
-def _moving(series: Mapping[str, Series], clock: Array) -> tuple[Array, Array]:
+def _velocities(series: Mapping[str, Series], clock: Array) -> tuple[Array, Array]:
     """Return the position's change and the velocity, (n, 3) m/s each, which should be alike."""
     moving = derivative(on_clock(series, "position", clock))
     return smooth(moving, 0.1), smooth(on_clock(series, "velocity", clock), 0.1)
 
 
-def _left(motion: Array, recorded: Array) -> float:
+def _residual_share(motion: Array, recorded: Array) -> float:
     """Return the share of a motion (n, 3) that is left when a recorded one is taken off."""
     known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
     return rms((motion - recorded)[known]) / rms(motion[known])
 
 
 def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
-    turning, gyro = _turning(series, clock)
-    if min(rms(turning), rms(gyro)) < ENOUGH_TURNING:
+    turning, gyro = _body_rates(series, clock)
+    if min(rms(turning), rms(gyro)) < LEAST_TURN_RATE:
         return None, None
-    here = _left(turning, gyro)
-    best = min(_RATES, key=lambda r: _left(turning, r.read(gyro)))
-    there = _left(turning, best.read(gyro))
-    of_another_unit = there < here / 20 and correlation(turning, best.read(gyro)) > GOOD
+    here = _residual_share(turning, gyro)
+    best = min(_RATES, key=lambda r: _residual_share(turning, r.read(gyro)))
+    there = _residual_share(turning, best.read(gyro))
+    of_another_unit = there < here / 20 and correlation(turning, best.read(gyro)) > GOOD_AGREEMENT
     if (there < 0.7 and there < here / 2) or of_another_unit:
         return best, None
     doubt = Note(NoteCode.BODY_RATE_DOUBTED, numbers={"left": here})
@@ -197,16 +199,16 @@ def _judge_setpoint(series: Mapping[str, Series], clock: Array) -> Reading | Non
     """Return how else to read rate set-points, which a vehicle's body rate follows."""
     rate = smooth(on_clock(series, "body_rate", clock))
     wanted = smooth(on_clock(series, "rate_setpoint", clock))
-    if min(rms(rate), rms(wanted)) < ENOUGH_TURNING:
+    if min(rms(rate), rms(wanted)) < LEAST_TURN_RATE:
         return None
-    best = min(_RATES, key=lambda r: _left(rate, r.read(wanted)))
-    there, here = _left(rate, best.read(wanted)), _left(rate, wanted)
-    return best if there < GOOD and there < here / 3 else None
+    best = min(_RATES, key=lambda r: _residual_share(rate, r.read(wanted)))
+    there, here = _residual_share(rate, best.read(wanted)), _residual_share(rate, wanted)
+    return best if there < GOOD_AGREEMENT and there < here / 3 else None
 
 
 def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
-    moving, velocity = _moving(series, clock)
-    if min(rms(moving), rms(velocity)) < ENOUGH_SPEED:
+    moving, velocity = _velocities(series, clock)
+    if min(rms(moving), rms(velocity)) < LEAST_SPEED:
         return None, None
     fit = correlation(moving, velocity)
     if fit > 0.8:
@@ -237,7 +239,7 @@ def contradiction(series: Mapping[str, Series], missions: Sequence[Mission]) -> 
         What was flown.
     """
     longest = max(missions, key=lambda m: m.end - m.start, default=None)
-    if longest is None or longest.end - longest.start < LASTS:
+    if longest is None or longest.end - longest.start < SHORTEST_MISSION:
         return None
     flown = {name: samples.between(longest.start, longest.end) for name, samples in series.items()}
     flown = {name: samples for name, samples in flown.items() if len(samples.time) > 1}
@@ -254,31 +256,31 @@ def noted_contradiction(notes: Sequence[Note]) -> Note | None:
     return next((note for note in notes if note.code is NoteCode.CONTRADICTED), None)
 
 
-def _opposed(derived: Array, recorded: Array, plenty: float) -> float | None:
+def _opposition(derived: Array, recorded: Array, plenty: float) -> float | None:
     """Return how alike two signals are, if they are opposites and larger than what is plenty."""
     agreement = correlation(derived, recorded)
-    return agreement if agreement < AGAINST and min(rms(derived), rms(recorded)) > plenty else None
+    return agreement if agreement < OPPOSED and min(rms(derived), rms(recorded)) > plenty else None
 
 
-def _leaning(series: Mapping[str, Series]) -> float | None:
+def _tilt_contradiction(series: Mapping[str, Series]) -> float | None:
     """Return how alike tilt and acceleration are, if one does not follow from the other."""
     position, attitude = (
         Stamped(series[name].time, series[name].values) for name in ("position", "attitude")
     )
     pull, tilt = pull_and_tilt(position, attitude)
     agreement, pushed, leant = correlation(pull, tilt), rms(pull), GRAVITY * rms(tilt)
-    if pushed < PUSH or leant < PUSH:
+    if pushed < CLEAR_ACCELERATION or leant < CLEAR_ACCELERATION:
         return None
-    if agreement < AGAINST:
+    if agreement < OPPOSED:
         return agreement
-    alike_in_size = 1 / COMMENSURATE < pushed / leant < COMMENSURATE
-    moves = correlation(pull[1:], pull[:-1]) > LASTING
+    alike_in_size = 1 / LARGEST_RATIO < pushed / leant < LARGEST_RATIO
+    moves = correlation(pull[1:], pull[:-1]) > LEAST_AUTOCORRELATION
     return agreement if abs(agreement) < UNRELATED and alike_in_size and moves else None
 
 
 _PAIRS: Mapping[tuple[str, str], Callable[[Mapping[str, Series]], float | None]] = {
-    ("attitude", "body_rate"): lambda s: _opposed(*_turning(s, stretch(s)), TURNING),
-    ("position", "velocity"): lambda s: _opposed(*_moving(s, stretch(s)), SPEED),
-    ("attitude", "position"): _leaning,
+    ("attitude", "body_rate"): lambda s: _opposition(*_body_rates(s, stretch(s)), CLEAR_TURN_RATE),
+    ("position", "velocity"): lambda s: _opposition(*_velocities(s, stretch(s)), CLEAR_SPEED),
+    ("attitude", "position"): _tilt_contradiction,
 }
 """Signals that deny each other -> how alike they are, None unless that is certain."""

@@ -50,7 +50,7 @@ from tuner.vehicle import COEFFICIENTS
 
 NO_DATE = 631_152_000_000_000_000
 """Stamps before 1990 count from a start-up, not from 1970."""
-LOOKED_AT = 3600.0
+LONGEST = 3600.0
 """Seconds of a mission over which speeds are sought."""
 ROLL_PITCH_RATE = 0.2
 YAW_RATE = 0.4
@@ -58,9 +58,9 @@ SPEED = 1.5
 VERTICAL_SPEED = 3.0
 COMMAND_SPREAD = 0.03
 """Below these a motion shows little of a coefficient, and below a third of them nothing."""
-QUICK = 80.0
-_POSE = ("position", "attitude")
+LEAST_RATE = 80.0
 """Hz that a signal needs to show how fast a rotor follows."""
+_POSE = ("position", "attitude")
 _WRENCH = ("commanded_thrust", "commanded_torque")
 """What a vehicle file's arms and curve turn into motor commands where none were recorded."""
 _DRIVES = ("rotor_speed", "command", "thrust_setpoint")
@@ -233,7 +233,7 @@ def _clock(content: Content) -> Mapping[str, float]:
 
 def _mission(content: Content, index: int) -> MissionReport:
     mission = content.missions[index]
-    clock = np.arange(mission.start, min(mission.end, mission.start + LOOKED_AT), 1 / RATE)
+    clock = np.arange(mission.start, min(mission.end, mission.start + LONGEST), 1 / RATE)
     position = resample("position", content.series["position"], clock)
     attitude = resample("attitude", content.series["attitude"], clock)
     speed = np.linalg.norm(derivative(smooth(position)), axis=1)
@@ -328,7 +328,7 @@ def informed(
     vertical = _during(series["velocity"], missions)[:, 2] if "velocity" in series else np.zeros(1)
     climb = float(np.nanmax(np.abs(vertical))) if len(vertical) else 0.0
     driven = bool(has & {"command", "rotor_speed", "rate_setpoint", "reference_position"})
-    quick = {n for n in ("command", "rotor_speed") if n in series and series[n].rate >= QUICK}
+    quick = {n for n in ("command", "rotor_speed") if n in series and series[n].rate >= LEAST_RATE}
     tachometer, commands = "rotor_speed" in has, "command" in has
 
     def turning(axis: int, limit: float, name: str) -> tuple[str, str]:

@@ -10,14 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 from tuner.recordings.flight import SIGNALS, Array, Series
 
 #: Beyond this gap between two samples, in s, nothing is known; slower signals get three periods.
-GAP = 0.25
+LONGEST_GAP = 0.25
 #: Seconds after their last sample for which counters hold.
 FOREVER = np.inf
 #: Periods of a regular publisher between two samples beyond which one is missing.
-MISSED = 1.5
+MISSED_PERIODS = 1.5
 #: Hz and seconds of the stretch that is looked at.
 RATE = 100.0
-LONGEST = 60.0
+LONGEST_STRETCH = 60.0
 
 
 def resample(signal: str, series: Series, clock: Array) -> Array:
@@ -52,7 +52,7 @@ def without_gaps(series: Series) -> Series:
     Recorders drop messages that the flight controller received. Held through such a gap, a
     reference at 4 m/s would lag by 4 cm for 10 ms and kick the vehicle. The missing samples lie on
     a monotone cubic through their neighbours (Fritsch and Butland 1984), so that a step stays one.
-    Longer gaps than are bridged anywhere (`GAP`) are left.
+    Longer gaps than are bridged anywhere (`LONGEST_GAP`) are left.
     """
     known = np.isfinite(series.values).all(axis=1)
     time, values = series.time[known], series.values[known]
@@ -60,7 +60,7 @@ def without_gaps(series: Series) -> Series:
         return series
     steps = np.diff(time)
     period = float(np.median(steps))
-    gaps = np.flatnonzero((steps > MISSED * period) & (steps <= longest_gap(time)))
+    gaps = np.flatnonzero((steps > MISSED_PERIODS * period) & (steps <= longest_gap(time)))
     if len(gaps) == 0:
         return series
     counts = np.round(steps[gaps] / period).astype(int)
@@ -80,7 +80,7 @@ def without_gaps(series: Series) -> Series:
 
 def longest_gap(time: Array) -> float:
     """Return the s between samples beyond which nothing is known."""
-    return max(GAP, 3 * float(np.median(np.diff(time)))) if len(time) > 1 else GAP
+    return max(LONGEST_GAP, 3 * float(np.median(np.diff(time)))) if len(time) > 1 else LONGEST_GAP
 
 
 def runs(flags: ArrayLike) -> list[tuple[int, int]]:
@@ -128,7 +128,7 @@ def stretch(series: Mapping[str, Series]) -> Array:
     """Return a uniform clock over the middle of a recording, one minute at most."""
     time = series["position"].time
     start, end = float(time[0]), float(time[-1])
-    spare = max(0.0, end - start - LONGEST) / 2
+    spare = max(0.0, end - start - LONGEST_STRETCH) / 2
     return np.arange(start + spare, end - spare, 1 / RATE)
 
 

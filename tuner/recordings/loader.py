@@ -129,7 +129,7 @@ def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> A
     return resample(signal, series, clock)
 
 
-def _kept(options: ReadOptions) -> Path:
+def _cache_file(options: ReadOptions) -> Path:
     """Return the file of the cache for the flights of a recording, read so."""
     path, given = options.path, options.given
     messages = [digest(file) for file in given.messages if file.exists()] if given else []
@@ -150,7 +150,7 @@ def load_flights(
     if not exists(path):
         raise RecordingError(path, "no such file", "check the path")
     options = ReadOptions.of(path, topics, namespace, rate)
-    if cache and (flights := from_npz(load(_kept(options)))) is not None:
+    if cache and (flights := from_npz(load(_cache_file(options)))) is not None:
         # The same content may lie elsewhere now.
         return tuple(dataclasses.replace(flight, path=str(path)) for flight in flights)
     with readable(path):
@@ -182,7 +182,7 @@ def flights_of(content: Content, options: ReadOptions, *, keep: bool) -> tuple[F
     sha256, missions = digest(options.path), range(len(content.missions))
     flights = tuple(make_flight(content, options, i, sha256=sha256) for i in missions)
     if keep and flights:
-        store(_kept(options), to_npz(flights))
+        store(_cache_file(options), to_npz(flights))
     return flights
 
 
@@ -268,7 +268,7 @@ SLOWEST = 120.0
 #: s below which a stretch in the air shows nothing.
 SHORTEST = 2.0
 #: rad/s, or less, at which a vehicle turns through nine tenths of a gentle flight.
-GENTLE = 3.0
+GENTLE_TURN_RATE = 3.0
 
 
 @dataclass(frozen=True)
@@ -335,7 +335,11 @@ def obstacle(signals: Signals, flown: tuple[tuple[float, float], ...]) -> Record
     stated = signals.places["body_rate"].source.unit is not None or any(
         note.code is NoteCode.UNIT_READ and note.names[0] == "body_rate" for note in signals.notes
     )
-    if is_tabular(signals.recording.format) and not stated and GENTLE < often <= FASTEST_TURN:
+    if (
+        is_tabular(signals.recording.format)
+        and not stated
+        and GENTLE_TURN_RATE < often <= FASTEST_TURN
+    ):
         return RecordingError(
             path,
             f"holds no pose, and a body rate of up to {often:.1f} that may be in rad/s or deg/s",
@@ -359,7 +363,7 @@ def read_inertial(
     """
     options = ReadOptions.of(path, topics, namespace)
     with readable(path):
-        if from_npz(load(_kept(options))) is not None:
+        if from_npz(load(_cache_file(options))) is not None:
             return None
         signals = read_signals(options)
         if not is_inertial(signals):

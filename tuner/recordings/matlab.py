@@ -30,7 +30,7 @@ from tuner.recordings.recording import (
     reason_of,
 )
 from tuner.recordings.sources import guess
-from tuner.recordings.table import NEVER, read_times
+from tuner.recordings.table import NO_TIME, read_times
 
 MAGIC, MAGIC_7_3 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 #: Bytes of all arrays together, and how many arrays: scipy recurses into those inside others.
@@ -110,7 +110,7 @@ class MatlabTable(TabularRecording):
         column = pyarrow.chunked_array([pyarrow.array(stamps)])
         held = {name: self._columns[name] for name in names}
         time, notes = read_times(self.path, column, clock, held.values())
-        known, nothing = time != NEVER, np.full(len(time), np.nan)
+        known, nothing = time != NO_TIME, np.full(len(time), np.nan)
         values = {name: held.get(name, nothing)[known] for name in fields}
         return Samples(time[known], time[known], values), notes
 

@@ -20,30 +20,30 @@ AT_REST = 1e-5
 """Reference motion below this, in m or m/s, is a reference at rest."""
 PAUSE = 1.0
 """Set-points that pause for longer, in s, begin another mission."""
-MOMENT = 0.2
+SHORTEST_LANDING = 0.2
 """A flight that leaves the air for less, in s, only seems to: a bounce at landing takes longer."""
 SHORTEST = 2.0
 """A shorter stretch, in s, is no mission."""
 IDLE = 0.12
 IDLE_SPEED = 80.0
-CARRIES = 0.5
+IDLE_SHARE = 0.5
 OFF = 0.02
 OFF_SPEED = 20.0
 """A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s; but
-not above `CARRIES` of what carries the vehicle in the air, nor below what is off."""
-CLEAR = 0.12
+not above `IDLE_SHARE` of what carries the vehicle in the air, nor below what is off."""
+FLYING_HEIGHT = 0.12
 """Higher above the ground than this, in m, the vehicle flies."""
-RESTS = 0.01
+RESTING_RANGE = 0.01
 """What stays within this, in m, for a second rests."""
 BIN = 0.1
 """s of which one mean position is taken."""
 FROM_THE_START = 0.5
 """Set-points that begin this soon after the pose, in s, ran all the time."""
-LONG = 120.0
+LONGEST_MISSION = 120.0
 """s beyond which a mission is taken apart."""
-PIECE = 60.0
+LONGEST_MANOEUVRE = 60.0
 """s of a manoeuvre, at most."""
-FITTED = 180.0
+LONGEST_FITTED = 180.0
 """s of a long recording that are fitted, at most."""
 SHORTEST_MANOEUVRE = 5.0
 """s of a manoeuvre, at least."""
@@ -51,7 +51,7 @@ HOVER_PAUSE = 3.0
 """s of hover that end a manoeuvre."""
 HOVER_BEFORE = 1.0
 """s of hover before it that belong to it: what is simulated begins at rest."""
-MOVES, TURNS = 0.3, 0.3
+HOVER_SPEED, HOVER_TURN_RATE = 0.3, 0.3
 """m/s and rad/s above which a vehicle does more than hover."""
 
 
@@ -135,7 +135,7 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
     grounded = stands | (_resting(time, height) & rests & ~observed)
     if not grounded.any():
         return [(float(time[0]), float(time[-1]))]
-    low = grounded | ~(height > _ground(time, height, grounded) + CLEAR)
+    low = grounded | ~(height > _ground(time, height, grounded) + FLYING_HEIGHT)
     if not stands.any():  # the ground is a guess, and what passes it without a rest flies
         for first, last in runs(low):
             low[first:last] = (grounded | rests)[first:last].any()
@@ -156,7 +156,7 @@ def _rests(time: Array, positions: Array) -> NDArray[np.bool_]:
         reach = ndimage.maximum_filter1d(means, window)
         reach -= ndimage.minimum_filter1d(means, window)
         spread = np.maximum(spread, reach)
-    return np.asarray((spread < RESTS)[place], dtype=np.bool_)
+    return np.asarray((spread < RESTING_RANGE)[place], dtype=np.bool_)
 
 
 def _lasting(time: Array, idle: NDArray[np.bool_], rests: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -173,7 +173,7 @@ def _idle(
     series: Mapping[str, Series], time: Array, height: Array
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return at which times the motors idle, and at which times that was recorded."""
-    clear = height > float(np.quantile(height, 0.02)) + 3 * CLEAR
+    clear = height > float(np.quantile(height, 0.02)) + 3 * FLYING_HEIGHT
     for name, limit, off in (
         ("command", IDLE, OFF),
         ("rotor_speed", IDLE_SPEED, OFF_SPEED),
@@ -185,9 +185,11 @@ def _idle(
             if not known.any():
                 continue
             at = np.interp(time, samples.time[known], np.nanmean(samples.values[known], axis=1))
-            observed = (time >= samples.time[0] - MOMENT) & (time <= samples.time[-1] + MOMENT)
+            observed = (time >= samples.time[0] - SHORTEST_LANDING) & (
+                time <= samples.time[-1] + SHORTEST_LANDING
+            )
             flown = at[clear & observed]
-            carries = CARRIES * float(np.median(flown)) if len(flown) else limit
+            carries = IDLE_SHARE * float(np.median(flown)) if len(flown) else limit
             idle: NDArray[np.bool_] = np.asarray(at < max(off, min(limit, carries)))
             return observed & idle, observed
     nothing = np.zeros(len(time), dtype=np.bool_)
@@ -201,7 +203,7 @@ def _resting(time: Array, height: Array) -> NDArray[np.bool_]:
         level = float(np.median(height[near]))
         still = float(np.ptp(height[near])) < 0.01
         lowest = level < float(np.quantile(height, 0.02)) + 0.03
-        if still and lowest and float(np.quantile(height, 0.9)) - level > 3 * CLEAR:
+        if still and lowest and float(np.quantile(height, 0.9)) - level > 3 * FLYING_HEIGHT:
             resting |= np.abs(height - level) < 0.03
     return resting
 
@@ -217,7 +219,7 @@ def _ground(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
 
 
 def stretches(
-    time: Array, up: NDArray[np.bool_], *, bridged: float = MOMENT
+    time: Array, up: NDArray[np.bool_], *, bridged: float = SHORTEST_LANDING
 ) -> list[tuple[float, float]]:
     """Return the stretches in which a condition holds, breaks of up to some s bridged."""
     holds = time[up]
@@ -277,19 +279,23 @@ def manoeuvres(series: Mapping[str, Series], missions: Sequence[Mission]) -> tup
     missions
         In the order of flight.
     """
-    if all(mission.end - mission.start <= LONG for mission in missions):
+    if all(mission.end - mission.start <= LONGEST_MISSION for mission in missions):
         return tuple(missions)
     time, moving, turning = _motion(series)
-    active = np.asarray((moving > MOVES) | (turning > TURNS), dtype=np.bool_)
+    active = np.asarray((moving > HOVER_SPEED) | (turning > HOVER_TURN_RATE), dtype=np.bool_)
     parts: list[Mission] = []
     for mission in missions:
-        parts += [mission] if mission.end - mission.start <= LONG else _parts(mission, time, active)
+        parts += (
+            [mission]
+            if mission.end - mission.start <= LONGEST_MISSION
+            else _parts(mission, time, active)
+        )
     vivid = moving**2 + turning**2
 
     def shown(part: Mission) -> float:
         return float(vivid[(time >= part.start) & (time <= part.end)].sum())
 
-    left, chosen = FITTED, set[int]()
+    left, chosen = LONGEST_FITTED, set[int]()
     for number in sorted(range(len(parts)), key=lambda i: -shown(parts[i])):
         if parts[number].end - parts[number].start <= left:
             left -= parts[number].end - parts[number].start
@@ -303,14 +309,14 @@ def _parts(mission: Mission, time: Array, active: NDArray[np.bool_]) -> list[Mis
     parts = []
     for first, last in stretches(time, inside, bridged=HOVER_PAUSE):
         begin = max(mission.start, first - HOVER_BEFORE)
-        count = int(np.ceil((last - begin) / PIECE - 1e-9))
+        count = int(np.ceil((last - begin) / LONGEST_MANOEUVRE - 1e-9))
         edges = np.linspace(begin, last, max(1, count) + 1)
         parts += [
             Mission(float(a), float(b), "a manoeuvre")
             for a, b in pairwise(edges)
             if b - a >= SHORTEST_MANOEUVRE
         ]
-    whole = replace(mission, end=mission.start + PIECE)
+    whole = replace(mission, end=mission.start + LONGEST_MANOEUVRE)
     return parts or [whole]
 
 

@@ -260,7 +260,7 @@ def _rank(group: str) -> tuple[bool, int]:
     return bool(_ESTIMATE & set(group.split("_"))), len(group)
 
 
-NAMED = 12
+MOST_NAMED = 12
 """Columns that a note names, at most."""
 
 
@@ -370,7 +370,7 @@ def unread(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) 
     read |= {clock.field for clock in topics.time}
     columns = [name for topic in recording.topics for name in recording.fields(topic.name)]
     others = tuple(name for name in columns if name not in read)
-    note = Note(NoteCode.COLUMNS_UNREAD, "info", count=len(others), names=others[:NAMED])
+    note = Note(NoteCode.COLUMNS_UNREAD, "info", count=len(others), names=others[:MOST_NAMED])
     return (note,) if others else ()
 
 
@@ -409,7 +409,7 @@ def _obstacle(recording: Recording, topics: TopicMap, what: str, *, given: bool)
     columns = recording.fields("")
     if recording.obstacle is not None and not given:
         return recording.obstacle
-    listed = f"{', '.join(columns[:NAMED])}{', ...' if len(columns) > NAMED else ''}"
+    listed = f"{', '.join(columns[:MOST_NAMED])}{', ...' if len(columns) > MOST_NAMED else ''}"
     clocks = [clock.field for clock in topics.time]
     if not any(field in columns for field in clocks):
         named = f"the topic map '{topics.name}' finds no time: no column {' or '.join(clocks)}"

@@ -18,18 +18,18 @@ from tuner.core.numerics import robust_sd
 from tuner.recordings.flight import SIGNALS, Array, InitialState, Series
 from tuner.recordings.interpolation import body_rate_from
 
-AROUND = 0.03
+FILTER_HALF_WIDTH = 0.03
 """s on either side of a time from which its state is filtered."""
-FEWEST = 3
+FEWEST_SAMPLES = 3
 """Samples on either side that it is filtered from at least, where they follow each other slowly."""
-WITHIN = 0.5
+FARTHEST_SAMPLE = 0.5
 """s beyond which no sample says anything of a time."""
 HOVER = 1.0
 """Seconds before the mission in which a steady hover is looked for."""
 IN_MOTION = 0.1
 """Seconds on each side of the start for the polynomial of a vehicle in motion."""
-SLOW = 0.05
-STILL = 0.1
+HOVER_SPEED = 0.05
+HOVER_TURN_RATE = 0.1
 """A hover moves slower than this, in m/s, and turns slower than this, in rad/s."""
 
 
@@ -93,7 +93,7 @@ def states_at(series: Mapping[str, Series], times: Array) -> States:
 def half_width(series: Series) -> float:
     """Return the s on either side of a time from which a signal is filtered."""
     gap = float(np.median(np.diff(series.time))) if len(series.time) > 1 else 0.0
-    return max(AROUND, (FEWEST + 0.5) * gap)
+    return max(FILTER_HALF_WIDTH, (FEWEST_SAMPLES + 0.5) * gap)
 
 
 def filtered(series: Series, times: Array, *, derivative: int = 0) -> Array:
@@ -131,7 +131,7 @@ def _parabolas(time: Array, values: Array, times: Array, half: float, derivative
     matrix[line, 2, :], matrix[line, :, 2], matrix[line, 2, 2] = 0.0, 0.0, 1.0
     right[line, 2] = 0.0
     found = np.linalg.solve(matrix, right[..., None])[..., 0]
-    near = np.abs(time[place] - times[:, None]).min(axis=1) <= WITHIN
+    near = np.abs(time[place] - times[:, None]).min(axis=1) <= FARTHEST_SAMPLE
     return np.where(near, found[:, derivative] / half**derivative, np.nan)
 
 
@@ -188,12 +188,12 @@ def in_hover(series: Mapping[str, Series]) -> bool:
         return False
     slope = np.polyfit(position.time, position.values, 1)[0]
     swing = np.quantile(position.values, 0.95, axis=0) - np.quantile(position.values, 0.05, axis=0)
-    if np.abs(slope).max() > SLOW or swing.max() > SLOW * HOVER:
+    if np.abs(slope).max() > HOVER_SPEED or swing.max() > HOVER_SPEED * HOVER:
         return False
     if "body_rate" not in series:
         return True
     rates = series["body_rate"].between(-HOVER, 0.0).values
-    return len(rates) > 0 and bool(np.abs(np.median(rates, axis=0)).max() < STILL)
+    return len(rates) > 0 and bool(np.abs(np.median(rates, axis=0)).max() < HOVER_TURN_RATE)
 
 
 def _near_start(series: Series, hover: bool) -> Series:

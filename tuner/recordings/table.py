@@ -90,7 +90,7 @@ class Table(TabularRecording):
         time, noted = read_times(self.path, table.column(clock.field), clock, fields.values())
         notes = list(noted)
         damage = [Damage(Cause.ROWS_MALFORMED, lost=self._skipped)] if self._skipped else []
-        kept = time != NEVER
+        kept = time != NO_TIME
         if not kept.all():
             lost = int((~kept).sum())
             notes.append(Note(NoteCode.ROWS_WITHOUT_TIME, topic=ROWS, count=lost))
@@ -166,13 +166,13 @@ def _why(err: Exception) -> str:
 
 
 #: Stands for a row without a time.
-NEVER = np.iinfo(np.int64).min
+NO_TIME = np.iinfo(np.int64).min
 #: Hz at which flights are sampled: a thousand apart, as the units of time are.
 SLOWEST, FASTEST = 3.0, 3000.0
 #: Rows that one stamp may be on, before it counts as one of too few digits.
-SHARED = 10
+ROWS_A_STAMP = 10
 #: Fields by whose samples the step is told.
-LOOKED_AT = 24
+MOST_FIELDS = 24
 UNIT_NAMES = {
     "s": "in seconds",
     "ms": "in milliseconds",
@@ -188,7 +188,7 @@ _DAY = 24 * 3600 * NANOSECONDS["s"]
 def read_times(
     path: Path, column: pyarrow.ChunkedArray, clock: Clock, fields: Iterable[Array]
 ) -> tuple[Nanoseconds, tuple[Note, ...]]:
-    """Return the times (n,) of a table's rows in ns, `NEVER` where there is none.
+    """Return the times (n,) of a table's rows in ns, `NO_TIME` where there is none.
 
     Parameters
     ----------
@@ -213,9 +213,9 @@ def read_times(
     """
     if types.is_timestamp(column.type):
         whole = compute.cast(compute.cast(column, "timestamp[ns]"), int64())
-        return np.asarray(array_of(compute.fill_null(whole, NEVER)), dtype=np.int64), ()
+        return np.asarray(array_of(compute.fill_null(whole, NO_TIME)), dtype=np.int64), ()
     numbers = numbers_of(column)
-    sampled = [np.isfinite(field) for field in list(fields)[:LOOKED_AT]] or [np.isfinite(numbers)]
+    sampled = [np.isfinite(field) for field in list(fields)[:MOST_FIELDS]] or [np.isfinite(numbers)]
     if is_text(column) and not np.isfinite(numbers).any():
         times, unit = _dates(path, column, clock.field), None
     else:
@@ -282,7 +282,7 @@ def _unit(path: Path, field: str, numbers: Array, sampled: list[NDArray[np.bool_
 def _whole(column: pyarrow.ChunkedArray, numbers: Array, unit: int) -> Nanoseconds:
     """Return a column of numbers in whole ns, with every digit that a text holds."""
     known = np.isfinite(numbers) & (np.abs(numbers) < 9e18 / unit)
-    result = np.full(len(numbers), NEVER, dtype=np.int64)
+    result = np.full(len(numbers), NO_TIME, dtype=np.int64)
     if types.is_integer(column.type) and not column.null_count:
         result[known] = np.asarray(array_of(column), dtype=np.int64)[known] * unit
         return result
@@ -310,7 +310,7 @@ def _dates(path: Path, column: pyarrow.ChunkedArray, field: str) -> Nanoseconds:
             stamps = compute.cast(cells, pyarrow.timestamp("ns", zone))
         except ArrowInvalid:  # some have a zone and some have none
             continue
-        whole = compute.fill_null(compute.cast(stamps, pyarrow.int64()), NEVER)
+        whole = compute.fill_null(compute.cast(stamps, pyarrow.int64()), NO_TIME)
         times = np.asarray(np.from_dlpack(whole), dtype=np.int64)
         return _over_midnight(times) if only_of_day else times
     first = next((cell for cell in text.to_pylist() if cell), "")
@@ -322,7 +322,7 @@ def _dates(path: Path, column: pyarrow.ChunkedArray, field: str) -> Nanoseconds:
 
 
 def _over_midnight(times: Nanoseconds) -> Nanoseconds:
-    known = times != NEVER
+    known = times != NO_TIME
     on = times[known]
     days = np.concatenate([[0], np.cumsum(np.diff(on) < -_DAY // 2)])
     result = times.copy()
@@ -338,9 +338,9 @@ def _require_digits(
 ) -> None:
     """Refuse stamps that were written with so few digits that many rows share them."""
     there = times[max(sampled, key=np.count_nonzero)]
-    there = there[there != NEVER]
+    there = there[there != NO_TIME]
     different = len(np.unique(there))
-    if len(there) >= 2 * SHARED and different * SHARED <= len(there):
+    if len(there) >= 2 * ROWS_A_STAMP and different * ROWS_A_STAMP <= len(there):
         first = str(column[0].as_py()).strip()[:30]
         raise RecordingError(
             path,

@@ -252,7 +252,7 @@ def _parse(path: Path, names: list[str], *, header_only: bool = False) -> tuple[
 SYSTEM_IDENTIFICATION, HIGH_RATE = 8, 16
 """Bits of ``SDLOG_PROFILE``."""
 DEFAULT_PROFILE = 1
-ENOUGH = 0.8
+ENOUGH_OF_RATE = 0.8
 """Share of a wanted rate that is enough."""
 
 
@@ -399,7 +399,7 @@ def advice_of(rates: Mapping[str, float]) -> tuple[Advice, ...]:
     for wanted in WANTED:
         fastest = max(wanted.messages, key=lambda name: rates.get(name, 0.0))
         logged = rates.get(fastest, 0.0)
-        if logged < ENOUGH * wanted.rate:
+        if logged < ENOUGH_OF_RATE * wanted.rate:
             found.append(Advice(wanted.messages[0], logged, wanted.rate, wanted.shows))
     return tuple(found)
 

@@ -120,31 +120,31 @@ ATTITUDE_READINGS = (
 
 LENGTHS = {"position": False, "velocity": True}
 """Signals of lengths that may come in another unit than metres; whether they are speeds."""
-NAMED = {"cm": "in centimetres", "mm": "in millimetres"}
+LENGTH_UNITS = {"cm": "in centimetres", "mm": "in millimetres"}
 """Units that are recognised, and how a sentence calls them."""
 
 BIN = 0.1
 """s of which one median is taken, of noise, bursts of stamps and single corrupt samples."""
 REACH = 3
 """Bins on either side of a time over which the acceleration there is a mean."""
-LOOKED_AT = 300.0
+LONGEST = 300.0
 """s to either side of the middle stamp that are looked at; those far off are wrong."""
-SLOW = 0.03
+SLOW_STEP = 0.03
 """s from sample to sample, above which times may be a thousand times too long."""
-UPRIGHT = 0.3
+LEAST_COSINE = 0.3
 """Cosine of the tilt below which thrust carries little of the weight."""
 
-SEEN = 0.002
+LEAST_TILT_RMS = 0.002
 """rad of tilt, root mean square, of which less is noise."""
-AGREEMENT = 0.8
+LEAST_AGREEMENT = 0.8
 """Share of the tilt that has to point as the vehicle accelerates."""
-UNLIKELY = 3.0
+SIGNIFICANCE = 3.0
 """Standard deviations by which chance would have to err for that."""
-BELIEVED = (0.45, 1.6)
+SCALE_RANGE = (0.45, 1.6)
 """How far the lengths of a unit may seem to be from it."""
-FOREIGN = 2.0
+LEAST_SCALE = 2.0
 """Units to a metre that no flight in metres seems to have."""
-SAME = 3.0
+SPEED_RATIO = 3.0
 """Times that a recorded speed may be off the change of a position in its unit."""
 NAMES = {
     "si": "in SI units",
@@ -159,12 +159,13 @@ NAMES = {
     "signed": "from -1 to 1",
 }
 """Units that are inferred, and how a sentence calls them."""
-FORCE = (0.75, 1.4)
+GRAVITY_RANGE = (0.75, 1.4)
 """How far a steady specific force, as recorded, is from gravity, of a vehicle that flies or
 stands."""
 FASTEST_TURN = 40.0
-FEWEST = 20
 """rad/s that no vehicle turns at for a tenth of its flight: gyros end at 35."""
+FEWEST_SAMPLES = 20
+"""Samples without which a range says nothing of their unit."""
 
 
 @dataclass(frozen=True)
@@ -226,7 +227,7 @@ def is_too_slow(recorded: Mapping[str, Stamped]) -> bool:
     if not {"position", "attitude"} <= set(recorded):
         return False
     step = np.diff(np.sort(recorded["position"].time))
-    if not len(step) or np.median(step) < SLOW:
+    if not len(step) or np.median(step) < SLOW_STEP:
         return False
     quick = {
         name: Stamped(1e-3 * samples.time, samples.values) for name, samples in recorded.items()
@@ -238,10 +239,10 @@ def is_too_slow(recorded: Mapping[str, Stamped]) -> bool:
 
 
 def fits_gravity(
-    position: Stamped, attitude: Stamped, units: Iterable[str] = ("si", *NAMED)
+    position: Stamped, attitude: Stamped, units: Iterable[str] = ("si", *LENGTH_UNITS)
 ) -> bool:
     """Return whether positions in one of some units accelerate as an attitude says."""
-    scale, (low, high) = scale_of(position, attitude), BELIEVED
+    scale, (low, high) = scale_of(position, attitude), SCALE_RANGE
     return scale.sure and any(low < scale.per_metre * UNITS[unit][0] < high for unit in units)
 
 
@@ -250,10 +251,10 @@ def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
 
     Metres (``si``) where they are, and wherever that cannot be told.
     """
-    if not scale.sure or scale.per_metre < FOREIGN:
+    if not scale.sure or scale.per_metre < LEAST_SCALE:
         return "si", None
-    low, high = BELIEVED
-    for unit, name in NAMED.items():
+    low, high = SCALE_RANGE
+    for unit, name in LENGTH_UNITS.items():
         factor, _ = UNITS[unit]
         if low < scale.per_metre * factor < high:
             return unit, Note(NoteCode.UNIT_READ, topic=topic, names=(signal, name))
@@ -303,7 +304,7 @@ def pull_and_tilt(
     weights = np.convolve(np.ones(REACH), np.ones(REACH)) / REACH**2
     columns = _binned(Stamped(attitude.time, up), centres).T
     leant = np.column_stack([np.convolve(c, weights, "valid")[1:-1] for c in columns])
-    known = np.isfinite(push).all(axis=1) & (leant[:, 2] > UPRIGHT)
+    known = np.isfinite(push).all(axis=1) & (leant[:, 2] > LEAST_COSINE)
     tilt = leant[known, :2] / leant[known, 2:]
     return push[known, :2] - push[known, 2:] * tilt, tilt
 
@@ -316,7 +317,7 @@ def _scale(pull: Array, tilt: Array) -> Scale:
     pull, tilt = pull - np.median(pull, axis=0), tilt - np.median(tilt, axis=0)
     size = np.linalg.norm(tilt, axis=1)
     pull, tilt, size = pull[size > 0], tilt[size > 0], size[size > 0]
-    if not len(size) or np.sqrt(np.mean(size**2)) < SEEN:
+    if not len(size) or np.sqrt(np.mean(size**2)) < LEAST_TILT_RMS:
         return Scale()
     slope = (pull * tilt).sum(axis=1) / size**2
     order = np.argsort(slope)
@@ -324,7 +325,7 @@ def _scale(pull: Array, tilt: Array) -> Scale:
     agreement = float(size[slope > 0].sum() / size.sum())
     # neighbours share what they are means of: one in REACH of them is a throw of its own
     chance = 0.5 * np.sqrt(REACH * (size**2).sum()) / size.sum()
-    sure = bool(agreement > max(AGREEMENT, 0.5 + UNLIKELY * chance))
+    sure = bool(agreement > max(LEAST_AGREEMENT, 0.5 + SIGNIFICANCE * chance))
     return Scale(float(slope[order][middle]) / GRAVITY, agreement, sure)
 
 
@@ -346,7 +347,7 @@ def _share_a_unit(position: Stamped, speed: Stamped) -> bool:
         return False
     lengths = (np.median(np.linalg.norm(values[known], axis=1)) for values in (moved, speeds))
     slower, faster = sorted(lengths)
-    return bool(faster < SAME * slower)
+    return bool(faster < SPEED_RATIO * slower)
 
 
 def _centres(*signals: Stamped) -> Array:
@@ -360,7 +361,7 @@ def _near(*signals: Stamped) -> list[Stamped]:
     """Return signals' samples about the middle stamp of the last; those far off are wrong."""
     last = signals[-1].time
     middle = np.median(last) if len(last) else 0.0
-    near = [np.abs(samples.time - middle) < LOOKED_AT for samples in signals]
+    near = [np.abs(samples.time - middle) < LONGEST for samples in signals]
     return [Stamped(s.time[n], s.values[n]) for s, n in zip(signals, near, strict=True)]
 
 
@@ -405,7 +406,7 @@ def unit_by_range(signal: str, values: Array, assumed: str) -> str:
     """
     rule = _RULES.get(signal)
     known = values[np.isfinite(values).all(axis=1)] if signal != "command" else values
-    if rule is None or len(known) < FEWEST or not np.isfinite(known).any():
+    if rule is None or len(known) < FEWEST_SAMPLES or not np.isfinite(known).any():
         return assumed
     return rule(known) or assumed
 
@@ -427,7 +428,7 @@ def _command(values: Array) -> str | None:
 
 def _force(values: Array) -> str | None:
     """Return the unit in which the mean is gravity, which turns with the body but little."""
-    low, high = FORCE
+    low, high = GRAVITY_RANGE
     size = float(np.linalg.norm(np.median(values, axis=0)))
     for unit, factor in (("si", 1.0), ("g", GRAVITY), ("mg", 1e-3 * GRAVITY)):
         if low < size * factor / GRAVITY < high:
@@ -478,7 +479,7 @@ def unit_of_angles(path: object, attitude: Stamped, position: Stamped | None, *,
             unit: Stamped(attitude.time, quaternion_of(to_si(attitude.values, unit)))
             for unit in ("si", "deg")
         }
-        for lengths in (("si",), ("si", *NAMED)):  # metres first: a radian is 57 degrees
+        for lengths in (("si",), ("si", *LENGTH_UNITS)):  # metres first: a radian is 57 degrees
             fitting = [
                 u for u, turned in attitudes.items() if fits_gravity(position, turned, lengths)
             ]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.flight import Series
-from tuner.recordings.interpolation import GAP, without_gaps
+from tuner.recordings.interpolation import LONGEST_GAP, without_gaps
 from tuner.recordings.loader import gaps_in, load_flight
 from tuner.recordings.topics import load_topic_map
 
@@ -145,7 +145,7 @@ def test_a_step_stays_between_its_ends() -> None:
     assert np.all((got.values >= 0.0) & (got.values <= 1.0))
 
 
-@pytest.mark.parametrize("gap", [2.0 * GAP, 1.0])
+@pytest.mark.parametrize("gap", [2.0 * LONGEST_GAP, 1.0])
 def test_long_gaps_and_lone_samples_stay(gap: float) -> None:
     kept = (TIME < 2.0) | (2.0 + gap <= TIME)
     assert len(without_gaps(Series(TIME[kept], circling(TIME)[kept])).time) == kept.sum()

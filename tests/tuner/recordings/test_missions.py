@@ -13,8 +13,8 @@ from tuner.findings.findings import Code
 from tuner.recordings.flight import Series
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import (
-    FITTED,
-    PIECE,
+    LONGEST_FITTED,
+    LONGEST_MANOEUVRE,
     Mission,
     YawSpin,
     airborne,
@@ -194,14 +194,14 @@ def test_hover_parts_manoeuvres_and_the_liveliest_are_fitted() -> None:
 
 def test_what_never_hovers_is_cut_into_pieces() -> None:
     found = manoeuvres(flown(np.ones_like(CLOCK)), (Mission(10.0, 990.0, "flight"),))
-    assert max(m.end - m.start for m in found) <= PIECE + 1e-6
+    assert max(m.end - m.start for m in found) <= LONGEST_MANOEUVRE + 1e-6
     assert sum(m.end - m.start for m in found) == pytest.approx(980.0, abs=2.0)
-    assert sum(m.end - m.start for m in found if m.fitted) <= FITTED
+    assert sum(m.end - m.start for m in found if m.fitted) <= LONGEST_FITTED
 
 
 def test_what_only_hovers_is_cut_to_a_piece() -> None:
     (found,) = manoeuvres(flown(np.zeros_like(CLOCK)), (Mission(10.0, 990.0, "flight"),))
-    assert (found.start, found.end, found.fitted) == (10.0, 10.0 + PIECE, True)
+    assert (found.start, found.end, found.fitted) == (10.0, 10.0 + LONGEST_MANOEUVRE, True)
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import pytest
 
 from tuner.recordings.flight import Series
 from tuner.recordings.states import (
-    AROUND,
+    FILTER_HALF_WIDTH,
     filtered,
     half_width,
     in_hover,
@@ -39,7 +39,7 @@ def test_slow_samples_are_filtered_over_more_time_and_gaps_are_bridged():
     slow = Series(TIME[::5], wave(TIME[::5], 0.5)[:, None])
     assert half_width(Series(TIME, TIME[:, None])) == pytest.approx(0.035, abs=0.006)
     assert half_width(slow) == pytest.approx(0.175)
-    assert half_width(slow) > AROUND
+    assert half_width(slow) > FILTER_HALF_WIDTH
     gap = (TIME < 1.0) | (TIME > 1.2)
     series = Series(TIME[gap], (3.0 * TIME[gap])[:, None])
     assert filtered(series, np.array([1.1]))[0, 0] == pytest.approx(3.3)
