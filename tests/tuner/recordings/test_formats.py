@@ -15,6 +15,7 @@ from tuner.recordings.formats import open_recording
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause
 from tuner.recordings.recording import Request
+from tuner.recordings.ros.mcap import records
 
 SLOW = pytest.mark.slow
 
@@ -79,6 +80,26 @@ def test_bare_file_and_folder_without_metadata(
     got = load_flight(folder)
     assert_same(got, circle)
     assert [damage.cause for damage in got.damage] == [Cause.METADATA_MISSING]
+
+
+def test_mcap_without_chunks_and_summary(tmp_path: Path, circle: Flight) -> None:
+    folder = making.to_ros2(making.CIRCLE, tmp_path / "circle", StoragePlugin.MCAP)
+    (whole,) = folder.glob("*.mcap")
+    content = whole.read_bytes()
+    parts = [content[:8]]
+    for op, begin, end in records(content[8:-8], 0):
+        if op in (0x01, 0x03, 0x04):  # header, schema, channel
+            parts.append(content[8:-8][begin - 9 : end])
+        elif op == 0x06:  # a chunk, of which the records begin behind its head
+            chunk = content[8:-8][begin:end]
+            name = int.from_bytes(chunk[28:32], "little")
+            parts.append(chunk[32 + name + 8 :])
+    path = tmp_path / "loose.mcap"
+    path.write_bytes(b"".join(parts))
+    got = load_flight(path)
+    assert_same(got, circle)
+    (damage,) = got.damage
+    assert (damage.cause, damage.salvaged, damage.bytes_lost) == (Cause.END_MISSING, 28_007, 0)
 
 
 @pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])

@@ -88,7 +88,7 @@ class Mcap(ChunkedFile):
             raise DamagedError("its summary is absurdly long")
         counts: dict[int, int] = {}
         summary = data[start:end]
-        for op, begin, behind in _records(summary, 0):
+        for op, begin, behind in records(summary, 0):
             content = summary[begin:behind]
             if op == CHUNK_INDEX:
                 self._chunks.append(_chunk_index(content, len(data)))
@@ -105,7 +105,7 @@ class Mcap(ChunkedFile):
         self._chunks, self.connections = [], {}
         loose: dict[int, list[tuple[int, int]]] = {}
         reached, unread = len(MAGIC), 0
-        for op, begin, end in _records(data, reached):
+        for op, begin, end in records(data, reached):
             if op in (0, FOOTER, DATA_END) or (end > len(data) and op != CHUNK):
                 break
             if loose and (op != MESSAGE or sum(map(len, loose.values())) >= AT_ONCE):
@@ -127,7 +127,7 @@ class Mcap(ChunkedFile):
     def _scan(self, content: bytes) -> tuple[Mapping[int, list[tuple[int, int]]], int]:
         messages: dict[int, list[tuple[int, int]]] = {}
         read = 0
-        for op, begin, end in _records(content, 0):
+        for op, begin, end in records(content, 0):
             if end > len(content):
                 break
             read = end
@@ -175,7 +175,7 @@ class Mcap(ChunkedFile):
         return Block(content, offset[inside] + BEFORE_PAYLOAD, end[inside], time[inside])
 
 
-def _records(data: Content, at: int) -> Iterator[tuple[int, int, int]]:
+def records(data: Content, at: int) -> Iterator[tuple[int, int, int]]:
     """Yield op, start and end of the content of each record; the last may be cut."""
     while at + 9 <= len(data):
         op, length = struct.unpack("<BQ", data[at : at + 9])
