@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-from pydantic import TypeAdapter
-
 from tuner.config import Options, Settings, settle
 from tuner.core.phrases import listed
-from tuner.recordings.cache import cached, digest, load, store
+from tuner.recordings.cache import cached, digest, recalled
 from tuner.recordings.inspection import Inspection
 from tuner.recordings.topics import read_sidecar
 from tuner.recordings.ulog import Advice, advice_of, parameters_of, settings_in_words
@@ -94,17 +91,16 @@ def _decided(path: Path, settings: Settings) -> Verdict:
     inputs = settings.vehicle, settings.controller, job, read_sidecar(path)
     maps = [digest(file) for file in (job.topics,) if file is not None and file.exists()]
     key = (digest(path), path.name, _version(), *map(repr, (*inputs, *maps)))
-    kept = cached("verdict", *key)
-    if (content := load(kept)) is not None:
-        return replace(TypeAdapter(Verdict).validate_json(content), path=str(path))
-    from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
 
-    configure()
-    from tuner.job.recording_decision import decided  # noqa: PLC0415
+    def found() -> Verdict:
+        from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
 
-    verdict = decided(path, settings)
-    store(kept, json.dumps(asdict(verdict)).encode())
-    return verdict
+        configure()
+        from tuner.job.recording_decision import decided  # noqa: PLC0415
+
+        return decided(path, settings)
+
+    return replace(recalled(Verdict, cached("verdict", *key), found), path=str(path))
 
 
 @cache

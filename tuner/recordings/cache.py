@@ -1,6 +1,6 @@
 """The cache of what was read: keyed by content, settings and the readers' own source.
 
-Standard library only, so that a recording seen before is answered before numpy is imported.
+It imports no numpy, so that a recording seen before is answered before that is loaded.
 """
 
 from __future__ import annotations
@@ -11,13 +11,18 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
 from pathlib import Path
+from typing import TypeVar
+
+from pydantic import TypeAdapter, ValidationError
 
 from tuner.core.disk import cache_folder, readable, whole_file
 from tuner.core.errors import OutputError
 
 logger = logging.getLogger(__name__)
+T = TypeVar("T")
 
 #: Files above this, in bytes, are not read again only to learn that they are unchanged.
 LARGE = 256 << 20
@@ -92,6 +97,26 @@ def load(path: Path) -> bytes | None:
     except OSError:
         return None
     return content
+
+
+def recalled(kind: type[T], path: Path, find: Callable[[], T]) -> T:
+    """Return a dataclass that a file of the cache holds, or find it and keep it there.
+
+    Parameters
+    ----------
+    kind
+        The dataclass.
+    path
+        The file; one that is damaged holds nothing.
+    find
+        What takes long.
+    """
+    if (content := load(path)) is not None:
+        with contextlib.suppress(ValidationError):
+            return TypeAdapter(kind).validate_json(content)
+    found = find()
+    store(path, json.dumps(asdict(found)).encode())  # type: ignore[call-overload]
+    return found
 
 
 def store(path: Path, content: bytes) -> None:

@@ -5,7 +5,6 @@ A recording that was inspected before is answered from the cache, before numpy i
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -21,7 +19,7 @@ from rich.text import Text
 
 from tuner.core.disk import exists
 from tuner.core.errors import InputError, RecordingError
-from tuner.recordings.cache import cached, digest, load, store
+from tuner.recordings.cache import cached, digest, recalled
 from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
 
 if TYPE_CHECKING:
@@ -242,19 +240,17 @@ def _inspect(
 ) -> Inspection:
     if not exists(path):
         raise RecordingError(path, "no such file", "check the path")
-    beside = path / "flight.yaml" if path.is_dir() else path.with_suffix(".yaml")
-    plain = topics is None and not beside.is_file()
-    kept = cached("inspection", digest(path), namespace) if cache and plain else None
-    if kept is not None and (content := load(kept)) is not None:
-        with contextlib.suppress(ValidationError):  # of a damaged cache
-            before = TypeAdapter(Inspection).validate_json(content)
-            return dataclasses.replace(before, path=str(path))
-    from tuner.recordings.inspector import examine  # noqa: PLC0415 (loads numpy and the readers)
 
-    result = examine(path, topics, namespace, keep=cache)
-    if kept is not None:
-        store(kept, json.dumps(dataclasses.asdict(result)).encode())
-    return result
+    def found() -> Inspection:
+        from tuner.recordings.inspector import examine  # noqa: PLC0415 (numpy and the readers)
+
+        return examine(path, topics, namespace, keep=cache)
+
+    beside = path / "flight.yaml" if path.is_dir() else path.with_suffix(".yaml")
+    if not cache or topics is not None or beside.is_file():
+        return found()
+    before = recalled(Inspection, cached("inspection", digest(path), namespace), found)
+    return dataclasses.replace(before, path=str(path))
 
 
 def as_json(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 from rich.console import Console
 
 from tests.tuner.recordings import making
+from tuner.job.recording_verdict import verdict_of
+from tuner.recordings.cache import own_folder
 from tuner.recordings.inspection import Inspection, as_json, inspect_recordings, render
 from tuner.recordings.inspector import inlets
 from tuner.vehicle import COEFFICIENTS
@@ -131,6 +134,18 @@ def test_second_time_needs_no_numpy() -> None:
     assert "'jax'" not in words[0]
     assert "pandas" not in words[0]
     assert words[1] == "7 []\n"
+
+
+@pytest.mark.parametrize("kind", ["inspection", "verdict"])
+def test_damaged_cache_is_found_anew(kind: str, tmp_path: Path) -> None:
+    bag = shutil.copy(making.CIRCLE, tmp_path)
+    (inspection,), _ = inspect_recordings([bag])
+    verdict = verdict_of(inspection)
+    for kept in (own_folder() / kind).iterdir():
+        kept.write_bytes(kept.read_bytes()[:-20])
+    (again,), _ = inspect_recordings([bag])
+    assert again == inspection
+    assert verdict_of(again) == verdict
 
 
 def test_commanded_thrust_and_torque_stand_for_the_motor_commands() -> None:
