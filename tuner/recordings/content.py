@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -402,7 +402,8 @@ def extract(
         samples = contents.samples.get(place.topic)
         if samples is None or not len(samples.receive):
             continue
-        time, values = times[place.topic], _columns(samples, signal, place)
+        time = times[place.topic]
+        values = np.column_stack([samples.fields[name] for name in place.fields])
         raw = Raw(place.topic, time, values)
         unit = _unit(recording, signal, place, raw, signals.get("position"))
         if unit != place.unit:
@@ -416,14 +417,6 @@ def extract(
             signals[signal] = Raw(place.topic, time, values)
     ordered = {signal: signals[signal] for signal in places if signal in signals}
     return ordered, contents, (*notes, *inferred)
-
-
-def _columns(samples: Samples, signal: str, place: Place) -> Array:
-    """Return (n, k) numbers as recorded, in the order of the signal's columns."""
-    fields: Sequence[str] = place.fields
-    if place.source.quaternion == "xyzw" and signal in ATTITUDES:
-        fields = (fields[3], *fields[:3])
-    return np.column_stack([samples.fields[name] for name in fields])
 
 
 def _unit(

@@ -19,6 +19,7 @@ from tuner.recordings.formats import is_tabular
 from tuner.recordings.notes import Note, NoteCode, reason_in_words
 from tuner.recordings.recording import Clock, Recording
 from tuner.recordings.topics import Source, TopicMap
+from tuner.recordings.unit_detection import ATTITUDES
 
 #: Unit as written -> unit of a topic map.
 UNITS_WRITTEN: Mapping[str, str] = {
@@ -266,7 +267,10 @@ MOST_NAMED = 12
 
 @dataclass(frozen=True)
 class Place:
-    """Where a signal will be read: its source, with topic, fields, unit and axes filled in."""
+    """Where a signal will be read: its source, with topic, fields, unit and axes filled in.
+
+    The fields are in the order of the signal's columns.
+    """
 
     source: Source
     topic: str
@@ -355,6 +359,8 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
         near = difflib.get_close_matches(missing[0], recording.fields(topic), n=1)
         names = (missing[0], signal, *near)
         return None if absent else Note(NoteCode.FIELD_MISSING, topic=topic, names=names)
+    if source.quaternion == "xyzw" and signal in ATTITUDES:
+        fields = (fields[3], *fields[:3])
     unit = source.unit or (usual.unit if usual and not source.fields else "si")
     return Place(source, topic, fields, unit, source.frame or (usual.frame if usual else "enu_flu"))
 
