@@ -199,6 +199,7 @@ def propagated(
     follow: Callable[[Array], Array],
     unrest: Array,
     *,
+    keeps: Array,
     tick: Array,
 ) -> tuple[Array, Array]:
     """Return F (P - W Wᵀ) Fᵀ + Q: a tick later, when samples have told what they do.
@@ -211,6 +212,8 @@ def propagated(
         Whose gains are W.
     follow, unrest
         F, as a function of a column, and the diagonal (n,) of Q.
+    keeps
+        (D,) the share that each of the last numbers keeps of itself, all that F does to them.
     tick
         Its number.
     """
@@ -234,10 +237,15 @@ def propagated(
     def second(i: Array, into: Array) -> Array:
         return _with_row(into, i, follow(_column(scratch, i)))
 
+    def kept(number: Array, into: Array) -> Array:
+        i = number + size - len(keeps)
+        return _with_row(into, i, at(keeps, number) * row(scratch, i, size))
+
     def added(i: Array, matrix: Array) -> Array:
         return _with_entry(matrix, i, i, _entry(matrix, i, i) + at(unrest, i))
 
-    covariance = lax.fori_loop(0, size, second, covariance)
+    covariance = lax.fori_loop(0, size - len(keeps), second, covariance)
+    covariance = lax.fori_loop(0, len(keeps), kept, covariance)
     covariance = lax.fori_loop(0, size, added, covariance)
     return _symmetric(covariance, jnp.where(tick % MADE_SYMMETRIC == 0, size, 0)), scratch
 

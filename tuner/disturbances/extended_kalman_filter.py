@@ -36,8 +36,6 @@ from tuner.disturbances.covariance import (
     at,
     innovations_of,
     propagated,
-    row,
-    rows_of,
 )
 from tuner.disturbances.disturbances import COUNT
 from tuner.disturbances.observer import (
@@ -171,8 +169,10 @@ def filtered(schedule: Schedule, feed: Feed, expected: Expected, *, gains: bool 
 
 def innovations(
     schedule: Schedule, feed: Feed, gains: Gains, expected: Expected, directions: ArrayLike | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return whitened innovations (T, m, F) with given gains, and derivatives (N, T, m, F).
+) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
+    """Return whitened innovations (T, m, F) with given gains, and derivatives; None for none.
+
+    Those are left as they were laid, (F, passes, T, m, columns of a pass): see `lanes.Run`.
 
     Parameters
     ----------
@@ -188,11 +188,7 @@ def innovations(
     moved = None if directions is None else _tangents(expected, np.asarray(directions, float))
     wanted = (True, False) if moved is None else ((True, False), (False, True))
     run = _run(_given(feed, expected, gains), static, moved, wanted)
-    white = np.moveaxis(run.values[0], 0, -1)
-    if directions is None:
-        return white, np.zeros((0, *white.shape))
-    by_pass = np.moveaxis(run.columns[1], (1, -1, 0), (0, 1, -1))
-    return white, by_pass.reshape(-1, *by_pass.shape[2:])
+    return np.moveaxis(run.values[0], 0, -1), run.columns and run.columns[1]
 
 
 class _Given(NamedTuple):
@@ -372,9 +368,15 @@ def _filter(given: _Given, static: _Static, ticks: int) -> Any:
 
         _, follow, after = jax.linearize(advance, jnp.zeros(size), has_aux=True)
         covariance, scratch = propagated(
-            (covariance, scratch), told, samples, follow, unrest, tick=number
+            (covariance, scratch),
+            told,
+            samples,
+            follow,
+            unrest,
+            keeps=processes.keeps,
+            tick=number,
         )
-        gains = rows_of(lambda i: row(told.gain, i, size).astype(jnp.float32), wide)
+        gains = told.gain.astype(jnp.float32)
         matrices = covariance, told.gain, scratch
         carried = after, pushed * processes.keeps, matrices, before, beyond
         return carried, (white, root, loss, gains, factors.astype(jnp.float32))

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from lanes import joined
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.schedule import Schedule
 from tuner.core.numerics import robust_sd
@@ -35,6 +36,7 @@ from tuner.disturbances.recorded import (
     gathered,
     sampled,
     setpoints_on_ticks,
+    taken_from,
 )
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_from_jacobian, with_secants
@@ -322,8 +324,7 @@ class Predictor:
         own = Point(point.coefficients, self.feed.offsets)
 
         def flown(predictor: Predictor, objective: Objective, there: Point) -> dict[str, Any]:
-            # by one offset, too: one program serves both
-            return dict(predictor.jacobian(objective, there, [len(objective.space)]).residuals)
+            return dict(predictor.jacobian(objective, there, []).residuals)
 
         jacobian = with_secants(
             self.jacobian(objective, own, [*moved, *offsets]),
@@ -387,18 +388,24 @@ class Predictor:
         count = len(point.coefficients)
         size = count + len(point.offsets)
         feed, expected = self._fed(point), self._expected(objective, point)
-        columns: dict[str, Any] = {}
+        columns = {
+            name: np.zeros((self.rows[name].shape[1], len(self.rows[name]), width, size))
+            for name, width in feed.widths.items()
+        }
         residuals: dict[str, Any] = {}
         for first in range(0, max(len(moved), 1), AT_ONCE):
             some = list(moved[first : first + AT_ONCE])
             directions = np.eye(size)[some] if some else None
-            errors, derivatives = innovations(
-                self.schedule, feed, self.found.gains, expected, directions
-            )
+            errors, laid = innovations(self.schedule, feed, self.found.gains, expected, directions)
             residuals = gathered(errors, feed.widths, self.rows)
-            for name, part in gathered(derivatives[: len(some)], feed.widths, self.rows).items():
-                columns.setdefault(name, np.zeros((size, *part.shape[1:])))[some] = part
-        return Jacobian(residuals, columns, jnp.full(self.feed.segments.count, jnp.inf))
+            if laid is not None:
+                for name, segment, part in taken_from(laid, feed.widths, self.rows):
+                    columns[name][segment][..., some] = joined(part[None], len(some))[0]
+        return Jacobian(
+            residuals,
+            {name: np.moveaxis(part, (-1, 0), (0, -1)) for name, part in columns.items()},
+            jnp.full(self.feed.segments.count, jnp.inf),
+        )
 
 
 def likelihood_of(found: Filtered, ticks: int, segments: slice = slice(None)) -> Likelihood:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -170,3 +170,24 @@ def gathered(
         channels[name] = np.where((tick >= 0)[:, None], taken, 0.0)
         first += width
     return channels
+
+
+def taken_from(
+    laid: NDArray[np.float32], widths: Mapping[str, int], rows: Mapping[str, NDArray[np.intp]]
+) -> Iterator[tuple[str, int, NDArray[np.float32]]]:
+    """Return channel, segment and the samples' (passes, n, k, columns) of derivatives on ticks.
+
+    Parameters
+    ----------
+    laid
+        (F, passes, T, m, columns), the channels' rows one channel after the other.
+    widths, rows
+        As of `gathered`.
+    """
+    first = 0
+    for name, width in widths.items():
+        for segment, tick in enumerate(rows[name].T):
+            part = laid[segment][:, np.maximum(tick, 0), first : first + width]
+            part[:, tick < 0] = 0.0
+            yield name, segment, part
+        first += width

@@ -172,10 +172,10 @@ def _equations(
     gradient, hessian = np.zeros((segments, total)), np.zeros((segments, total, total))
     loss, huber = np.zeros(segments), float(criterion.huber)
     for name, more in by_strengths.items():
-        columns = np.concatenate([jacobian.columns.pop(name), more])
         errors = np.moveaxis(np.asarray(jacobian.residuals[name]), -1, 0)
+        columns = [np.moveaxis(c, (0, -1), (-1, 0)) for c in (jacobian.columns.pop(name), more)]
         scale = np.asarray(criterion.scale[name])
-        along, bend = gauss_newton(np.moveaxis(columns, (0, -1), (-1, 0)), errors, scale, huber)
+        along, bend = gauss_newton(np.concatenate(columns, axis=-1), errors, scale, huber)
         gradient += along
         hessian += bend
         loss += 0.5 * robust(errors, huber).sum(axis=(1, 2))

@@ -38,6 +38,8 @@ Array = NDArray[np.float64]
 
 MEMORY = 2**30
 """bytes that derivatives take at most by default while they are computed."""
+LOGGED = 4
+"""Share of them, one in so many, that is logged at a time where residuals are kept."""
 
 
 class Objective(eqx.Module):
@@ -159,7 +161,8 @@ class Objective(eqx.Module):
         """
         moving = self._moving(criterion, derivatives=derivatives, still=still)
         parts = [
-            part._sums(point, of_part, moving) for part, of_part in self._in_turn(criterion, moving)
+            part._sums(point, of_part, moving)
+            for _, part, of_part in self._in_turn(criterion, moving, self.memory)
         ]
         sums: SegmentSums = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *parts)
         if self.multiplicity is None:
@@ -174,14 +177,11 @@ class Objective(eqx.Module):
 
     def jacobian(self, point: Point, criterion: Criterion) -> Jacobian:
         """Return every residual's derivatives."""
-        moving = self._moving(criterion)
-        flown = self.fly(point, criterion, moving)
-        errors, columns = self._laid_out(flown, self.reading(point, criterion, moving))
-        return Jacobian(errors, columns, flown.crash_time)
+        return Jacobian(*self._laid_out(point, criterion, self._moving(criterion)))
 
     def residuals(self, point: Point, criterion: Criterion) -> dict[str, Array]:
         """Return channel -> (n, k, F) residuals, without derivatives."""
-        return self._laid_out(self.fly(point, criterion), self.reading(point, criterion))[0]
+        return self._laid_out(point, criterion, {})[0]
 
     def _moving(
         self, criterion: Criterion, *, derivatives: bool = True, still: bool = False
@@ -212,20 +212,21 @@ class Objective(eqx.Module):
         return directions
 
     def _in_turn(
-        self, criterion: Criterion, moving: Mapping[str, int]
-    ) -> Iterator[tuple[Objective, Criterion]]:
-        """Return the segments in parts whose derivatives fit the memory."""
+        self, criterion: Criterion, moving: Mapping[str, int], memory: int
+    ) -> Iterator[tuple[slice, Objective, Criterion]]:
+        """Return the segments in parts whose logged derivatives fit some bytes of memory."""
         measured = self.segments.measured.values()
         logged = min(int(criterion.horizon), self.samples) * sum(
             np.shape(m.values)[1] for m in measured
         )
         one = 8 * (sum(moving.values()) + 1) * logged
-        size = max(int(self.memory // max(one, 1)), 1)
-        if size >= self.segments.count:
-            yield self, criterion
-            return
+        size = max(int(memory // max(one, 1)), 1)
         for first in range(0, self.segments.count, size):
-            yield some_segments(self, criterion, slice(first, first + size))
+            some = slice(first, first + size)
+            if size >= self.segments.count:
+                yield some, self, criterion
+            else:
+                yield some, *some_segments(self, criterion, some)
 
     def _sums(self, point: Point, criterion: Criterion, moving: Mapping[str, int]) -> SegmentSums:
         """Return what all segments contribute at once."""
@@ -276,19 +277,31 @@ class Objective(eqx.Module):
         )
 
     def _laid_out(
-        self, flown: Flown, reading: Reading
-    ) -> tuple[dict[str, Array], dict[str, Array]]:
-        """Return channel -> (n, k, F) residuals, and channel -> (Q, n, k, F) columns."""
-        errors, columns = {}, {}
+        self, point: Point, criterion: Criterion, moving: Mapping[str, int]
+    ) -> tuple[dict[str, Array], dict[str, Array], Array]:
+        """Return channel -> (n, k, F) residuals and (Q, n, k, F) columns; (F,) times of crashes.
+
+        Segments are flown in turn, so that what is logged takes less than what is laid out.
+        """
+        total = self.reading(point, criterion, moving).total
+        errors, columns, crash_time = {}, {}, np.zeros(self.segments.count)
         for name in self.channels:
             n, k, segments = np.shape(self.segments.measured[name].weight)
-            error, column = np.zeros((segments, n, k)), np.zeros((segments, n, k, reading.total))
-            for block in residuals(flown, self.segments, name, reading):
-                place = np.arange(segments)[block.segments, None], block.stamps
-                error[place], column[place] = block.errors, block.columns
-            errors[name] = np.moveaxis(error, 0, -1)
-            columns[name] = np.moveaxis(column, (-1, 0), (0, -1))
-        return errors, columns
+            errors[name] = np.zeros((segments, n, k))
+            columns[name] = np.zeros((segments, n, k, total))
+        for some, part, of_part in self._in_turn(criterion, moving, self.memory // LOGGED):
+            flown, reading = part.fly(point, of_part, moving), part.reading(point, of_part, moving)
+            crash_time[some] = flown.crash_time
+            for name in self.channels:
+                for block in residuals(flown, part.segments, name, reading):
+                    place = np.arange(part.segments.count)[block.segments, None], block.stamps
+                    errors[name][some][place] = block.errors
+                    columns[name][some][place] = block.columns
+        return (
+            {name: np.moveaxis(error, 0, -1) for name, error in errors.items()},
+            {name: np.moveaxis(column, (-1, 0), (0, -1)) for name, column in columns.items()},
+            crash_time,
+        )
 
 
 def some_segments(

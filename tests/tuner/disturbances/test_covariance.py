@@ -27,6 +27,8 @@ def spread(rng: np.random.Generator, size: int) -> np.ndarray:
 def test_samples_tell_and_time_spreads_what_products_of_matrices_say(sampled: list[int]) -> None:
     rng = np.random.default_rng(len(sampled))
     covariance, follow = spread(rng, SIZE), rng.standard_normal((SIZE, SIZE))
+    keeps = rng.random(3)
+    follow[-3:] = np.diag(np.append(np.zeros(SIZE - 3), keeps))[-3:]
     derivatives = rng.standard_normal((WIDE, SHOWN)) * (rng.random((WIDE, SHOWN)) < 0.4)
     derivatives[:, 0] = 1.0
     columns = [jnp.asarray(row)[jnp.flatnonzero(row)] for row in derivatives]
@@ -69,6 +71,7 @@ def test_samples_tell_and_time_spreads_what_products_of_matrices_say(sampled: li
         samples,
         lambda column: jnp.asarray(follow) @ column,
         jnp.asarray(unrest),
+        keeps=jnp.asarray(keeps),
         tick=jnp.asarray(1),
     )
     expected = follow @ (covariance - gain.T @ gain) @ follow.T + np.diag(unrest)
@@ -77,9 +80,10 @@ def test_samples_tell_and_time_spreads_what_products_of_matrices_say(sampled: li
 
 def test_the_covariance_of_an_unstable_vehicle_settles_as_riccatis_equation_says() -> None:
     """Halves that rounding errors let differ grow with it, until a variance is negative."""
-    rng, size, ticks = np.random.default_rng(0), 6, 4000
+    rng, size, ticks, kept = np.random.default_rng(0), 7, 4000, 0.8
     shapes = rng.standard_normal((size, size))
-    follow = shapes @ np.diag([1.02, 1.01, 1.0, 0.99, 0.9, 0.5]) @ np.linalg.inv(shapes)
+    shapes[-1] = np.append(np.zeros(size - 1), 1.0)
+    follow = shapes @ np.diag([1.02, 1.01, 1.0, 0.99, 0.9, 0.5, kept]) @ np.linalg.inv(shapes)
     seen = rng.standard_normal((2, size))
     samples = Samples(
         jnp.zeros(2),
@@ -99,6 +103,7 @@ def test_the_covariance_of_an_unstable_vehicle_settles_as_riccatis_equation_says
             samples,
             lambda c: follow @ c,
             jnp.asarray(unrest),
+            keeps=jnp.asarray([kept]),
             tick=number,
         )
         return (covariance, told.gain, scratch), None

@@ -94,3 +94,5 @@ def test_segments_give_the_same_sums_one_at_a_time_as_many_at_once():
     got = small.sums(point, criterion_of(small))
     np.testing.assert_allclose(got.hessian, want.hessian, rtol=1e-12)
     np.testing.assert_allclose(got.loss, want.loss, rtol=1e-12)
+    alone, beside = (of.jacobian(point, criterion_of(of)) for of in (small, many))
+    jax.tree.map(np.testing.assert_array_equal, alone, beside)
