@@ -57,8 +57,8 @@ from tuner.vehicle import (
 
 STAGES = slice(-3, None)
 """Of the search: whole flights, then the polish in the weights that what is missing leaves."""
-LEFT = 1e-4
-"""Share of the loss that may be left to gain: half as much of how far off the flights are."""
+LEFT = 0.01
+"""Share of the loss that a step has to gain: half as much of how far off the flights are."""
 LAWS = "other laws"
 """What a simulator lacks that no coefficient says."""
 FOLDER = "effective"
