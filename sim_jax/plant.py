@@ -19,7 +19,7 @@ from sim_jax.control.geometric import (
     thrust_setpoint,
     wanted_acceleration,
 )
-from sim_jax.environment import Environment
+from sim_jax.environment import Air, Environment
 from sim_jax.frames import Gyro, estimated
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import Inlet, ReferenceInlet
@@ -38,7 +38,6 @@ from sim_jax.sensing import (
     unpacked,
 )
 from sim_jax.state import Limits, Setpoints, State
-from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.vehicle import PerRotor, Vehicle
 

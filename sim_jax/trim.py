@@ -17,12 +17,12 @@ from jaxtyping import Bool
 from sim_jax.constants import GRAVITY
 from sim_jax.control.gains import Controller
 from sim_jax.control.mixer import ROTORS, torque_of
+from sim_jax.environment import Air
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import command_of
 from sim_jax.numeric import Array, Scalar, where
 from sim_jax.rigid_body import Motion
 from sim_jax.state import Start, hover_speed
-from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.vehicle import PerRotor, Vehicle
 

@@ -7,9 +7,9 @@ centre of mass through the air. ω is the body rate. All in body axes.
 
 from __future__ import annotations
 
+from sim_jax.environment import Air
 from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Motion, Wrench
-from sim_jax.terms.air import Air
 from sim_jax.vehicle import PerRotor, Vehicle
 
 

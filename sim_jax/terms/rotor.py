@@ -12,11 +12,11 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jax.scipy.stats import norm
 
+from sim_jax.environment import Air
 from sim_jax.geometry import Vec3
 from sim_jax.numeric import Scalar
 from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.state import hover_speed
-from sim_jax.terms.air import Air
 from sim_jax.vehicle import Aerodynamics, PerRotor, Vehicle
 
 

@@ -7,10 +7,10 @@ from typing import TypeAlias
 
 import jax.numpy as jnp
 
+from sim_jax.environment import Air
 from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.terms import beyond, rotor
-from sim_jax.terms.air import Air
 from sim_jax.vehicle import PerRotor, Vehicle
 
 Term: TypeAlias = Callable[[Vehicle, Motion, PerRotor, Air], Wrench | None]

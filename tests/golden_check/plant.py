@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.control.gains import Filters, MixerSettings
+from sim_jax.environment import Air
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet
 from sim_jax.rigid_body import Motion, acceleration, angular_acceleration
 from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
-from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.vehicle import Vehicle
 from tests.golden_check.coefficients import GOLDEN_GRAVITY, golden_vehicle

@@ -14,11 +14,11 @@ from sim_jax.control import geometric, mixer, rate
 from sim_jax.control.gains import Filters, MixerSettings, PositionGains
 from sim_jax.control.geometric import ReferencePoint
 from sim_jax.control.mixer import HALF_SQRT2
+from sim_jax.environment import Air
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.sensing import GyroFilter, GyroMemory, filtered, look_back
-from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.trajectory import Circle, publish
 from sim_jax.vehicle import PerRotor, Rotor, Vehicle

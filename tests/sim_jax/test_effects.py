@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from jax import Array
 
-from sim_jax.environment import NOTHING_AROUND, Environment
+from sim_jax.environment import NOTHING_AROUND, Air, Environment
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet, RotorSpeedInlet
 from sim_jax.rigid_body import Motion
@@ -21,7 +21,6 @@ from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
 from sim_jax.terms import total
-from sim_jax.terms.air import Air
 from sim_jax.terms.beyond import fuselage_drag
 from sim_jax.vehicle import Vehicle
 from tests.sim_jax.support import (

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim_jax.environment import NOTHING_AROUND, Environment
+from sim_jax.environment import NOTHING_AROUND, Air, Environment
 from sim_jax.rigid_body import Motion
 from sim_jax.terms import total
-from sim_jax.terms.air import Air
 from sim_jax.terms.beyond import fuselage_drag
 from tests.sim_jax.support import quaternion, vec, vehicle
 

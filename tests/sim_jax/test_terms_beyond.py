@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from sim_jax.environment import Environment
+from sim_jax.environment import Air, Environment
 from sim_jax.motor import Lag, LagSlope, SwitchedLag
 from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import Tachometer
 from sim_jax.state import hover_speed
-from sim_jax.terms.air import Air
 from sim_jax.terms.rotor import lifting
 from sim_jax.terms.total import total_wrench, wrench_of_each_term
 from tests.sim_jax.support import controller, moving_start, quaternion, vec, vehicle, wobble

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lanes import Argument, Program
+from sim_jax.environment import Air
 from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.terms import total
-from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from tuner.equation_error.measured import Measured
 from tuner.objective.flown import CODE

@@ -16,12 +16,11 @@ import numpy as np
 
 from lanes import Argument, Program
 from sim_jax.constants import GRAVITY
-from sim_jax.environment import Environment
+from sim_jax.environment import Air, Environment
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Array as JaxArray
 from sim_jax.rigid_body import Motion
 from sim_jax.terms import total
-from sim_jax.terms.air import Air
 from sim_jax.terms.total import wrench_of_each_term
 from sim_jax.vehicle import Vehicle
 from tuner.objective.flown import CODE

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from sim_jax.environment import Environment
+from sim_jax.environment import Air, Environment
 from sim_jax.frames import gyro_of, markers_of
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import Inlet
@@ -18,7 +18,6 @@ from sim_jax.plant import Sample
 from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
-from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.trim import in_trim
 from sim_jax.vehicle import PerRotor, Vehicle

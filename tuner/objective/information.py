@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tuner.core.numerics import huber_weights
+from tuner.core.numerics import Inverse, huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
 from tuner.objective.space import Space
@@ -85,6 +86,11 @@ class FisherInformation:
     in_doubt: Array | None = None
     pull: Array | None = None
     nuisance_pull: Array | None = None
+
+    @cached_property
+    def inverse(self) -> Inverse:
+        """The inverse of all information, priors included."""
+        return Inverse.of(self.total, self.given)
 
     def in_stretches(
         self, numbers: NDArray[np.intp]

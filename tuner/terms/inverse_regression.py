@@ -37,12 +37,12 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
 
 from sim_jax.constants import GRAVITY
+from sim_jax.environment import Air
 from sim_jax.frames import gyro_of, markers_of
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Array
 from sim_jax.rigid_body import Motion
 from sim_jax.state import AIRBORNE
-from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.core.numerics import huber_weights, robust_sd, scaled_solve

@@ -251,7 +251,7 @@ class IndependentErrors:
     @staticmethod
     def of(information: FisherInformation) -> IndependentErrors:
         """Return the errors of a fit."""
-        inverse = Inverse.of(information.total, information.given)
+        inverse = information.inverse
         white = np.einsum("cf,cfbpq->pq", information.spread, information.blocks)
         from_flights = np.diag(inverse.sandwiched(white, np.zeros_like(white)))
         return IndependentErrors(
@@ -378,6 +378,6 @@ def _cut(information: FisherInformation, seconds: float) -> Stretches:
     blocks = information.blocks.shape[2]
     times = information.begins[:, None] + (np.arange(blocks) + 0.5) * BLOCK
     known, score, *_ = information.in_stretches(np.floor(times / seconds).astype(np.intp))
-    to_minimum = -Inverse.of(information.total, information.given).matrix @ information.slope
+    to_minimum = -information.inverse.matrix @ information.slope
     flown = np.any(known != 0.0, axis=(1, 2))
     return Stretches(known[flown], (score + known @ to_minimum)[flown])

@@ -377,7 +377,7 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
     lags
         (K,) how far a parameter moves for each s by which a lag is longer; zero for what is none.
     """
-    inverse = Inverse.of(information.total, information.given)
+    inverse = information.inverse
     moved = {
         name: np.abs(inverse.matrix @ change.sum(axis=0))
         for name, change in information.changes.items()

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim_jax.environment import Air
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
-from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from tuner.config import JobFile
 from tuner.core.shipped import find_config
