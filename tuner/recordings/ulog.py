@@ -1,8 +1,9 @@
 """PX4's messages: read from ULog files in its own frames, NED and FRD, which a topic map turns.
 
-pyulog reads the messages. What comes before is a check and a count without it: pyulog multiplies
-out a log's formats, and 77 bytes whose formats nest kept it busy for over 25 s, where this refuses
-them in 0.14 s; it also reports nothing of the bytes behind the last whole message of a cut log.
+pyulog reads the header and the messages. Between the two formats are checked and messages counted:
+pyulog multiplies out a log's formats, and 77 bytes whose formats nest kept it busy for over 25 s,
+where this refuses them in 0.14 s; it also reports nothing of the bytes behind the last whole
+message of a cut log.
 Messages are alike in logs and in ROS 2: where they hold the signals, and what a log would have to
 hold more of. Source of profiles and default rates: PX4's ``logged_topics.cpp``.
 """
