@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 import zipfile
@@ -14,6 +13,7 @@ import anyio
 import anyio.to_thread
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.sse import EventSourceResponse, ServerSentEvent
 from starlette.requests import ClientDisconnect
 
 from tuner.core.content_store import ContentStore
@@ -45,51 +45,11 @@ from tuner.service.words import over_http
 
 LOOK = 0.5
 """s between two looks into the table"""
-SILENCE = 15.0
-"""s after which a comment keeps the connection open"""
-
-
-async def follow(service: Service, job: str, after: int) -> AsyncIterator[str]:
-    """Yield the events of a job after one of them, and the job whenever it changes, to its end.
-
-    ``message``, ``iteration``, ``estimates``, ``folds`` and ``state`` are what happened, with their
-    numbers as ids; ``job`` is the job as it stands.
-    """
-    shown, quiet = "", 0.0
-    while not service.stopping.is_set():
-        try:
-            row, new = await anyio.to_thread.run_sync(_look, service, job, after)
-        except ServiceError as error:
-            yield _event("problem", {"detail": str(error)})
-            return
-        for event in new:
-            content = dict(event.content)
-            if event.kind == "message":
-                content["text"] = over_http(str(content["text"]))
-            yield _event(event.kind, content, event.number)
-            after = event.number
-        standing = JobAnswer.model_validate(row).model_dump_json()
-        if standing != shown:
-            yield f"event: job\ndata: {standing}\n\n"
-            shown, quiet = standing, 0.0
-        if row.state in FINISHED and not new:
-            return
-        if quiet >= SILENCE:
-            yield ": still here\n\n"
-            quiet = 0.0
-        if not new:
-            await anyio.sleep(LOOK)
-            quiet += LOOK
 
 
 def _look(service: Service, job: str, after: int) -> tuple[JobRow, Sequence[EventRow]]:
     row = jobs.job(service.database, job)
     return row, jobs.events(service.database, row, after=after)
-
-
-def _event(kind: str, content: Mapping[str, Any], number: int | None = None) -> str:
-    head = "" if number is None else f"id: {number}\n"
-    return f"{head}event: {kind}\ndata: {json.dumps(content)}\n\n"
 
 
 BLOCK = 1 << 20
@@ -184,12 +144,6 @@ _FORM = {
             }
         },
     }
-}
-
-_EVENT = {
-    "type": "object",
-    "properties": {name: {"type": "string"} for name in ("id", "event", "data")},
-    "required": ["event", "data"],
 }
 
 api = APIRouter(prefix=API, responses=dict(PROBLEMS), tags=["tuning"])
@@ -305,28 +259,45 @@ def get_job(service: Served, job: str) -> FullJobAnswer:
     return full_job(row, jobs.events(service.database, row, kind="message"))
 
 
-@api.get(
-    "/jobs/{job}/events",
-    response_class=StreamingResponse,
-    responses={
-        200: {"content": {"text/event-stream": {"schema": _EVENT}}},
-        **NOT_FOUND,
-    },
-)
+def _job(service: Served, job: str) -> JobRow:
+    return jobs.job(service.database, job)
+
+
+@api.get("/jobs/{job}/events", response_class=EventSourceResponse, responses=NOT_FOUND)
 async def get_events(
     service: Served,
-    job: str,
+    row: Annotated[JobRow, Depends(_job)],
     after: Annotated[int, Query(ge=0, le=2**31 - 1)] = 0,
     last_event_id: Annotated[str | None, Header(max_length=20)] = None,
-) -> StreamingResponse:
-    """Send a job's events as they happen.
+) -> AsyncIterator[ServerSentEvent]:
+    """Send a job's events after one of them as they happen, and the job whenever it changes.
 
-    Their kinds are ``message``, ``iteration``, ``estimates``, ``folds``, ``state`` and ``job``.
+    ``message``, ``iteration``, ``estimates``, ``folds`` and ``state`` are what happened, with their
+    numbers as ids; ``job`` is the job as it stands. They end with the job.
     """
-    row = await anyio.to_thread.run_sync(jobs.job, service.database, job)
     if last_event_id is not None and last_event_id.isdecimal():
         after = min(int(last_event_id), 2**31 - 1)
-    return StreamingResponse(follow(service, row.id, after), media_type="text/event-stream")
+    shown = None
+    while not service.stopping.is_set():
+        try:
+            row, new = await anyio.to_thread.run_sync(_look, service, row.id, after)
+        except ServiceError as error:
+            yield ServerSentEvent(event="problem", data={"detail": str(error)})
+            return
+        for event in new:
+            content = dict(event.content)
+            if event.kind == "message":
+                content["text"] = over_http(str(content["text"]))
+            yield ServerSentEvent(event=event.kind, data=content, id=str(event.number))
+            after = event.number
+        standing = JobAnswer.model_validate(row)
+        if standing != shown:
+            yield ServerSentEvent(event="job", data=standing)
+            shown = standing
+        if row.state in FINISHED and not new:
+            return
+        if not new:
+            await anyio.sleep(LOOK)
 
 
 @api.post("/jobs/{job}/cancel", responses={**NOT_FOUND, **CONFLICT})
