@@ -43,23 +43,22 @@ def inspect(
     suggest
         Print a topic map to begin with: the best guess for every column, its unit, and why.
     """
-    if suggest:
-        from pathlib import Path
-
-        from tuner.core.disk import find_flights
-        from tuner.recordings.inspector import suggested_map
-
-        for path in find_flights(flights):
-            sys.stdout.write(suggested_map(Path(path)))
-        return
     from dataclasses import asdict
 
     from tuner.core.disk import find_flights
+
+    paths = find_flights(flights)
+    if suggest:
+        from tuner.recordings.inspector import suggested_map
+
+        for path in paths:
+            sys.stdout.write(suggested_map(path))
+        return
     from tuner.job.recording_verdict import in_words, verdict_of
     from tuner.recordings.inspection import as_json, inspect_recordings
 
     inspections, errors = inspect_recordings(
-        find_flights(flights), topics=reading.topics, namespace=reading.namespace or ""
+        paths, topics=reading.topics, namespace=reading.namespace or ""
     )
     verdicts = {
         seen.path: verdict_of(seen, **vars(reading), vehicle=vehicle) for seen in inspections

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from tuner.job.ground import BenchResult
     from tuner.job.sensitivity import SensitivityResult
-    from tuner.result import RunResult
+    from tuner.result import ExportRecord, RunResult
     from tuner.search.iteration import PointEstimate
     from tuner.uncertainty.records import Refit
 
@@ -57,7 +57,7 @@ def print_run(
 
 
 def _summary(
-    folder: Path, result: RunResult, exports: Sequence[object], seconds: float | None
+    folder: Path, result: RunResult, exports: Sequence[ExportRecord], seconds: float | None
 ) -> list[Text | Table]:
     """Return the lines and tables of a finished job."""
     from tuner.report.outcome import flights_table, next_step, outcome
@@ -152,12 +152,9 @@ def _rest(result: RunResult) -> list[str]:
     return lines
 
 
-def _written(folder: Path, exports: Sequence[object], seconds: float | None) -> list[str]:
-    from tuner.result import ExportRecord
-
-    known = [one for one in exports if isinstance(one, ExportRecord)]
-    files = [one.file for one in known if one.file]
-    refused = [f"{one.format} was refused" for one in known if one.refused]
+def _written(folder: Path, exports: Sequence[ExportRecord], seconds: float | None) -> list[str]:
+    files = [one.file for one in exports if one.file]
+    refused = [f"{one.format} was refused" for one in exports if one.refused]
     took = "" if seconds is None else f" in {seconds:.0f} s"
     parts = [part for part in (", ".join(files), "; ".join(refused)) if part]
     lines = [shorten(f"Exported: {'; '.join(parts)}.", WIDTH)] if parts else []

@@ -75,17 +75,28 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _decimal)
 
 
 def read_yaml(path: str | Path) -> Document:
-    """Read one YAML document.
+    """Read a file of one YAML document.
 
     Raises
     ------
     ConfigError
-        The file is missing, too large, not YAML, has a key twice, or expands without bound.
+        The file is missing or too large, or as of `document_of`.
     """
     path = Path(path)
     if exists(path) and path.is_dir():
         raise ConfigError(path, "is a folder", "give the path of a YAML file")
     raw = read_bytes(path, most=MAX_BYTES, remedy="give the path of a YAML file")
+    return document_of(raw, path)
+
+
+def document_of(raw: bytes, path: Path) -> Document:
+    """Return one YAML document, of a file or what messages call one.
+
+    Raises
+    ------
+    ConfigError
+        It is not YAML, has a key twice, or expands without bound.
+    """
     try:
         loader = _Loader(raw.decode("utf-8-sig"))
         node = loader.get_single_node()

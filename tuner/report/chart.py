@@ -74,7 +74,7 @@ class Heat:
     digits
         With how many decimals each value is written into its cell; None writes nothing.
     diverging
-        Whether zero lies in the middle: then the colours go from −``limit`` to +``limit``.
+        Whether zero lies in the middle: then the colours go from −1 to 1.
     bar
         Title of the colour bar.
     ticks
@@ -88,7 +88,6 @@ class Heat:
     text: Sequence[Sequence[str]] = ()
     digits: int | None = None
     diverging: bool = False
-    limit: float = 1.0
     ticks: dict[float, str] = field(default_factory=dict)
 
 

@@ -258,12 +258,8 @@ def _bars(bars: Bars, place: Axes, base: dict[str, Any]) -> None:
 
 def _heat(heat: Heat, place: Axes) -> None:
     values = np.array([[np.nan if v is None else v for v in row] for row in heat.values])
-    limits: dict[str, Any] = {}
-    if heat.diverging:
-        limits = {"vmin": -heat.limit, "vmax": heat.limit}
-    image = place.imshow(
-        values, aspect="auto", cmap="RdBu_r" if heat.diverging else "cividis", **limits
-    )
+    look = {"cmap": "RdBu_r", "vmin": -1.0, "vmax": 1.0} if heat.diverging else {"cmap": "cividis"}
+    image = place.imshow(values, aspect="auto", **look)
     place.grid(visible=False)
     place.set_yticks(range(len(heat.rows)), heat.rows)
     if heat.columns and isinstance(heat.columns[0], str):

@@ -166,6 +166,14 @@ Served = Annotated[Service, Depends(service_of)]
 Counted = Annotated[Metrics, Depends(metrics_of)]
 
 
+def job_of(service: Served, job: str) -> JobRow:
+    """Return the job that a request is about, with its flights and files."""
+    return jobs.job(service.database, job)
+
+
+OfJob = Annotated[JobRow, Depends(job_of)]
+
+
 async def upload(request: Request) -> tuple[RecordingRow, bool]:
     """Take in the recording of a request, and return its row and whether it is new.
 
@@ -253,20 +261,15 @@ def get_jobs(
 
 
 @api.get("/jobs/{job}", responses=NOT_FOUND)
-def get_job(service: Served, job: str) -> FullJobAnswer:
+def get_job(service: Served, row: OfJob) -> FullJobAnswer:
     """Return a job, with what it said."""
-    row = jobs.job(service.database, job)
     return full_job(row, jobs.events(service.database, row, kind="message"))
-
-
-def _job(service: Served, job: str) -> JobRow:
-    return jobs.job(service.database, job)
 
 
 @api.get("/jobs/{job}/events", response_class=EventSourceResponse, responses=NOT_FOUND)
 async def get_events(
     service: Served,
-    row: Annotated[JobRow, Depends(_job)],
+    row: OfJob,
     after: Annotated[int, Query(ge=0, le=2**31 - 1)] = 0,
     last_event_id: Annotated[str | None, Header(max_length=20)] = None,
 ) -> AsyncIterator[ServerSentEvent]:
@@ -303,18 +306,18 @@ async def get_events(
 @api.post("/jobs/{job}/cancel", responses={**NOT_FOUND, **CONFLICT})
 def cancel_job(service: Served, job: str) -> FullJobAnswer:
     """Let a job end without a result; what its search has found so far is kept for a retry."""
-    return _after(service, jobs.cancel(service.database, job).id)
+    return _after(service, jobs.cancel(service.database, job))
 
 
 @api.post("/jobs/{job}/retry", responses={**NOT_FOUND, **CONFLICT})
 def retry_job(service: Served, job: str) -> FullJobAnswer:
     """Put a job that failed or was cancelled back into the queue; its search goes on."""
-    return _after(service, jobs.retry(service.database, job).id)
+    return _after(service, jobs.retry(service.database, job))
 
 
-def _after(service: Service, job: str) -> FullJobAnswer:
+def _after(service: Service, row: JobRow) -> FullJobAnswer:
     service.dispatcher.call()
-    return get_job(service, job)
+    return get_job(service, row)
 
 
 @api.get(
@@ -338,9 +341,8 @@ def get_file(service: Served, job: str, name: str) -> StreamingResponse:
         **NOT_FOUND,
     },
 )
-def get_files(service: Served, job: str) -> StreamingResponse:
+def get_files(service: Served, row: OfJob) -> StreamingResponse:
     """Return all files of a job's result as one archive."""
-    row = jobs.job(service.database, job)
     if not row.files:
         raise NotKnownError(f"job {row.id}", "has no files", "wait until the job is done")
     for file in row.files:

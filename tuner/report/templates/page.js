@@ -82,7 +82,7 @@
   const ofHeat = (heat, narrow) => {
     const cells = heat.rows.flatMap((row, n) => heat.columns.map((column, m) => ({ row, column, value: heat.values[n][m], text: heat.text[n]?.[m].replaceAll("<br>", "\n") })));
     const color = heat.diverging
-      ? { type: "diverging", scheme: "RdBu", reverse: true, domain: [-heat.limit, heat.limit] }
+      ? { type: "diverging", scheme: "RdBu", reverse: true, domain: [-1, 1] }
       : { type: "linear", scheme: "cividis", domain: d3.extent(cells, (cell) => cell.value) };
     const shade = Plot.scale({ color });
     const ticks = Object.keys(heat.ticks).map(Number).filter((at) => at >= color.domain[0] && at <= color.domain[1]);

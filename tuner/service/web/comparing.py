@@ -15,8 +15,6 @@ from tuner.core.content_store import ContentStore
 from tuner.core.files import MAX_BYTES
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.result import CoefficientResult, ExportRecord, ExportRecords, RunResult
-from tuner.service import jobs
-from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError
 from tuner.service.shapes import CoefficientHistory, Point
 from tuner.service.tables import JobRow
@@ -56,15 +54,14 @@ class FlightPair:
     rmse: tuple[tuple[float | None, float | None], ...]
 
 
-def result_of(database: Database, store: ContentStore, job: str) -> RunResult:
+def result_of(store: ContentStore, row: JobRow) -> RunResult:
     """Return the result of a job that is done.
 
     Raises
     ------
     NotKnownError, NotNowError
-        There is no such job, or it has no result that can be read.
+        It has no result that can be read.
     """
-    row = jobs.job(database, job)
     content = _content(row, store, RunResult.FILE)
     if content is None:
         raise NotNowError(f"job {row.id}", f"is {row.state}", "compare jobs that are done")

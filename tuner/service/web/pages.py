@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -23,14 +22,14 @@ from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Re
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
 from tuner.core.validation import config_error
-from tuner.core.yaml_document import read_yaml
+from tuner.core.yaml_document import document_of
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
 from tuner.report.outcome import flights_table, outcome, warnings_of
 from tuner.report.section import figures
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
-from tuner.service.http import Served, service_of, upload
+from tuner.service.http import OfJob, Served, service_of, upload
 from tuner.service.jobs import history, vehicles
 from tuner.service.queue import MOST_EVENTS
 from tuner.service.recordings import flight_name
@@ -222,7 +221,7 @@ def _submit(service: Service, form: FormData) -> Response:
     try:
         settings = typed_settings(text.get("settings", ""))
         if (held := _held(settings)) and " ".join(held) != text.get("holdout", ""):
-            chosen = [(r, "holdout" if _flight(r) in held else use) for r, use in chosen]
+            chosen = [(r, "holdout" if flight_name(r.name) in held else use) for r, use in chosen]
             text["holdout"] = " ".join(held)
             what = f"hold out {', '.join(held)}"
             raise InputError("settings", what, "see what checks the fit below, and start again")
@@ -255,10 +254,6 @@ def _held(settings: Mapping[str, Any]) -> list[str]:
     return [str(name) for name in held] if isinstance(held, list) else []
 
 
-def _flight(row: RecordingRow) -> str:
-    return recordings.flight_name(row.name)
-
-
 def _request(
     text: Mapping[str, str],
     settings: dict[str, Any],
@@ -273,7 +268,7 @@ def _request(
         "settings": settings,
         "name": text.get("name", "").strip(),
     }
-    held = [_flight(row) for row, use in used if use == "holdout"]
+    held = [flight_name(row.name) for row, use in used if use == "holdout"]
     if held or _held(settings):  # which the page has shown
         values["holdout"] = held
     if vehicle := text.get("vehicle", "").strip():
@@ -314,15 +309,14 @@ def list_jobs(
 
 
 @web.get("/jobs/{job}")
-def show_job(service: Served, job: str) -> Response:
+def show_job(service: Served, row: OfJob) -> Response:
     """Show a job: live until it ends, then with its report."""
-    row = jobs.job(service.database, job)
     done, _ = jobs.page(service.database, vehicle=row.vehicle, state=State.DONE)
     others = [other for other in done if other.id != row.id]
     box: dict[str, object] = {"outcome": None}
     with suppress(InputError):  # the report, if it is there, says what it can
         if row.state == State.DONE:
-            result = comparing.result_of(service.database, service.store, row.id)
+            result = comparing.result_of(service.store, row)
             found = outcome(result)
             box = {
                 "outcome": found,
@@ -337,9 +331,9 @@ def show_job(service: Served, job: str) -> Response:
 
 
 @web.get("/jobs/{job}/live")
-def show_live(service: Served, job: str) -> Response:
+def show_live(service: Served, row: OfJob) -> Response:
     """Return the part of a job's page that moves."""
-    return render("live.html.jinja", **_live(service, jobs.job(service.database, job)))
+    return render("live.html.jinja", **_live(service, row))
 
 
 def _live(service: Service, row: JobRow) -> dict[str, object]:
@@ -393,7 +387,7 @@ def show_vehicle(service: Served, name: str) -> Response:
 def compare(service: Served, a: str = "", b: str = "") -> Response:
     """Show two jobs side by side."""
     rows = [jobs.job(service.database, job) for job in (a, b)]
-    first, second = (comparing.result_of(service.database, service.store, row.id) for row in rows)
+    first, second = (comparing.result_of(service.store, row) for row in rows)
     return render(
         "compare.html.jinja",
         a=rows[0],
@@ -467,13 +461,7 @@ def typed_settings(text: str) -> dict[str, Any]:
     """
     if not text.strip():
         return {}
-    with tempfile.TemporaryDirectory(prefix="tune-settings-") as folder:
-        file = Path(folder) / "tune.yaml"
-        file.write_text(text, encoding="utf-8", errors="replace")
-        try:
-            data = read_yaml(file).data
-        except ConfigError as error:
-            raise ConfigError("settings", error.what, error.remedy) from None
+    data = document_of(text.encode(errors="replace"), Path("settings")).data
     if not isinstance(data, dict):
         raise ConfigError("settings", "are no keys with values", "write them as in tune.yaml")
     return data
