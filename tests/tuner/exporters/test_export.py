@@ -1,10 +1,12 @@
 import shutil
 from datetime import date
+from pathlib import Path
 
 import pytest
 
 from tests.tuner.exporters.conftest import MODELS, as_the_run_says, rmse
 from tuner.config.job import ExportSettings
+from tuner.core import shipped
 from tuner.core.errors import ExportError, InputError
 from tuner.exporters import export as exporting
 from tuner.exporters.effective import Effective
@@ -179,6 +181,14 @@ def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
     for kind, refusal in exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY):
         assert export_sentence(kind, refusal).startswith(f"The {kind} export was refused: ")
         assert "held position" in str(refusal)
+
+
+def test_no_two_formats_of_a_job_are_one_file(make_run):
+    run = make_run()
+    asked = ExportSettings(formats=tuple(shipped.EXPORT_TARGETS))
+    written = dict(exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
+    paths = [path for path in written.values() if isinstance(path, Path)]
+    assert len(set(paths)) == len(paths) >= 6
 
 
 def test_a_file_that_would_not_read_back_is_not_written(tmp_path, make_run):

@@ -11,6 +11,7 @@ from tuner.exporters.targets.sdf import TARGET as SDF
 TARGET: Target = replace(
     SDF,
     name="gz-sim",
+    suffix="_gz.sdf",
     simulator=GZ_SIM,
     others=(),
 )
