@@ -15,7 +15,15 @@ import numpy as np
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import ExportError
-from tuner.exporters.sdf.model import Array, Inertial, Model, inertials, read_model, together
+from tuner.exporters.sdf.model import (
+    MOST_ROTORS,
+    Array,
+    Inertial,
+    Model,
+    composite,
+    inertials,
+    read_model,
+)
 from tuner.exporters.sdf.spans import Element, assembled, rendered
 from tuner.exporters.target import read_file
 from tuner.exporters.targets.px4 import outside_range, read_parameters
@@ -24,7 +32,6 @@ from tuner.vehicle import values_of
 
 RPM = 2 * math.pi / 60
 """rad/s of one rpm."""
-MOST_ROTORS = 12
 THRUST_TO_WEIGHT = (1.2, 12.0)
 """Of vehicles that fly; SITL models sit between 1.5 and 5."""
 HOVER = (0.1, 0.8)
@@ -89,7 +96,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     if not rotors:
         raise ExportError(path, "has no motor with a link and a number", "give each motor its own")
     given = {} if params is None else read_parameters(params)
-    whole = together([body for _, body in inertials(model)])
+    whole = composite(model)
     bodies = [*_of_bodies(model)]
     hover = [*_of_hover(whole, rotors, _speeds(model, rotors, given))]
     faults = [*bodies, *_of_rotors(rotors, model), *_of_layout(whole, rotors), *hover]

@@ -11,7 +11,15 @@ from lxml import etree
 
 from tests.tuner.exporters.conftest import MODELS
 from tuner.core.errors import ExportError
-from tuner.exporters.sdf.model import Inertial, Pose, base_for, pose_of, read_model, together
+from tuner.exporters.sdf.model import (
+    Inertial,
+    Pose,
+    base_for,
+    composite,
+    pose_of,
+    read_model,
+    together,
+)
 from tuner.exporters.sdf.patch import sdf_draft
 from tuner.exporters.sdf.spans import (
     Edit,
@@ -23,7 +31,7 @@ from tuner.exporters.sdf.spans import (
     rendered,
     set_value,
 )
-from tuner.exporters.sdf.tags import carried_values, composite, values_in
+from tuner.exporters.sdf.tags import carried_values, values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.exporters.target import not_carried, target_of, write
 from tuner.exporters.targets.sdf import TARGET

@@ -11,10 +11,9 @@ import pytest
 
 from tests.tuner.exporters.conftest import MODELS
 from tuner.core.errors import ExportError
-from tuner.exporters.sdf.model import read_model
+from tuner.exporters.sdf.model import composite, read_model
 from tuner.exporters.sdf.patch import sdf_draft
 from tuner.exporters.sdf.spans import assembled, rendered
-from tuner.exporters.sdf.tags import composite
 from tuner.exporters.simulators import GZ_SIM
 from tuner.exporters.target import read_file, write
 from tuner.vehicle import values_of

@@ -132,6 +132,8 @@ def _about(point: Array, body: Inertial) -> Array:
 _CLASSIC_MOTOR = "gazebo_motor_model"
 _GZ_MOTOR = "multicopter-motor-model"
 _CLASSIC_CHANNELS = "control_channels"
+MOST_ROTORS = 12
+"""Of a vehicle: motors with a larger number drive something else."""
 
 
 @dataclass(frozen=True)
@@ -347,3 +349,8 @@ def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
             [[given.get(f"i{min(a, b)}{max(a, b)}", 0.0) for b in "xyz"] for a in "xyz"]
         )
         yield link, Inertial(mass, model.pose_of_inertial(link), matrix)
+
+
+def composite(model: Model) -> Inertial:
+    """Return all links of a model as one body."""
+    return together([body for _, body in inertials(model)])

@@ -11,7 +11,16 @@ from pydantic import ValidationError
 
 from tuner.core.errors import ExportError
 from tuner.exporters.sdf import spans, tags
-from tuner.exporters.sdf.model import Inertial, Model, base_for, inertials, read_model, together
+from tuner.exporters.sdf.model import (
+    MOST_ROTORS,
+    Inertial,
+    Model,
+    base_for,
+    composite,
+    inertials,
+    read_model,
+    together,
+)
 from tuner.exporters.sdf.spans import MERGED, Edit, Element, assembled, blanked, rendered
 from tuner.exporters.sdf.tags import rotor_origin, values_in
 from tuner.exporters.simulators import (
@@ -32,8 +41,6 @@ PROVENANCE = "Coefficients by tune"
 
 #: m within which a rotor counts as sitting where the vehicle file has it.
 PLACE_TOLERANCE = 0.005
-#: Of a vehicle: motors with a larger number drive something else.
-MOST_ROTORS = 12
 
 
 def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
@@ -312,7 +319,7 @@ def _other_rotors(model: Model, vehicle: VehicleFile, base: Inertial) -> tuple[s
 
 def placed(model: Model, vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle with its rotors where a model has them, and turning as they do there."""
-    centre = together([body for _, body in inertials(model)]).pose.position
+    centre = composite(model).pose.position
     offset = np.array(tags.center_of_mass(vehicle) or (0.0, 0.0, 0.0))
     rotors = list(vehicle.rotors)
     for index, (link, turns) in model.rotor_links().items():

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from tuner.core.errors import ExportError
-from tuner.exporters.sdf.model import Array, Inertial, Model, inertials, read_model, together
+from tuner.exporters.sdf.model import Array, Model, composite, read_model
 from tuner.exporters.sdf.spans import Element, sources, without_comments
 from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of, with_values
 
@@ -205,11 +205,6 @@ def _agreed(
             if value is not None:
                 read[name] = value
     return read
-
-
-def composite(model: Model) -> Inertial:
-    """Return all links of a model as one body."""
-    return together([body for _, body in inertials(model)])
 
 
 def rotor_origin(model: Model, vehicle: VehicleFile) -> Array | None:
