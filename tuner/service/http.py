@@ -266,7 +266,13 @@ def get_job(service: Served, row: OfJob) -> FullJobAnswer:
     return full_job(row, jobs.events(service.database, row, kind="message"))
 
 
-@api.get("/jobs/{job}/events", response_class=EventSourceResponse, responses=NOT_FOUND)
+class _EventStream(EventSourceResponse):
+    """Events in a description whose refusals are JSON, as everywhere."""
+
+    media_type = None  # type: ignore[assignment]  # JSON then
+
+
+@api.get("/jobs/{job}/events", response_class=_EventStream, responses=NOT_FOUND)
 async def get_events(
     service: Served,
     row: OfJob,
