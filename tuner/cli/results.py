@@ -65,7 +65,7 @@ def _summary(
     found = outcome(result)
     lines: list[Text | Table] = [
         Text(
-            shorten(f"{found.standing.capitalize()}. {found.what}", WIDTH),
+            shorten(f"{found.usability.capitalize()}. {found.what}", WIDTH),
             f"bold {STYLES[found.look]}",
         ),
         *(Text(line) for line in _origins(result)),

@@ -57,7 +57,7 @@ DOUBTS = frozenset(
 """Warnings that put the numbers themselves in doubt."""
 
 
-class Standing(StrEnum):
+class Usability(StrEnum):
     """Whether a fit can be used."""
 
     USABLE = "usable"
@@ -65,12 +65,12 @@ class Standing(StrEnum):
     UNUSABLE = "not usable"
 
 
-LOOKS = {Standing.USABLE: "well", Standing.WITH_CARE: "weak", Standing.UNUSABLE: "not"}
+LOOKS = {Usability.USABLE: "well", Usability.WITH_CARE: "weak", Usability.UNUSABLE: "not"}
 
 
 @dataclass(frozen=True)
-class Met:
-    """How closely a flight is met.
+class FlightOutcome:
+    """How closely a flight is flight.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class Outcome:
 
     Attributes
     ----------
-    standing
+    usability
         Whether it can be used.
     what
         What was fitted to what, as a sentence.
@@ -104,40 +104,38 @@ class Outcome:
         For what, and why so, in sentences.
     flights
         How closely each is met, held-out ones first.
+    checks
+        Those that speak for or against it: held-out ones, else all.
     """
 
-    standing: Standing
+    usability: Usability
     what: str
     uses: tuple[str, ...]
     reasons: tuple[str, ...]
-    flights: tuple[Met, ...]
+    flights: tuple[FlightOutcome, ...]
+    checks: tuple[FlightOutcome, ...]
 
     @property
     def look(self) -> str:
         """Class of the page's style."""
-        return LOOKS[self.standing]
-
-    @property
-    def checks(self) -> tuple[Met, ...]:
-        """Flights that speak for or against it: held-out ones, else all."""
-        return tuple(met for met in self.flights if met.held_out) or self.flights
+        return LOOKS[self.usability]
 
 
 def outcome(result: RunResult, bench: BenchRecord | None = None) -> Outcome:
     """Return whether a fit can be used, for what, and why."""
-    met = tuple(
-        sorted(
-            (_met(flight, result) for flight in result.flights), key=lambda one: not one.held_out
-        )
+    flights = sorted(
+        (_flight_outcome(flight, result) for flight in result.flights),
+        key=lambda flight: not flight.held_out,
     )
-    checks = tuple(one for one in met if one.held_out) or met
-    standing = _standing(result, checks, met)
+    checks = [flight for flight in flights if flight.held_out] or flights
+    usability = _usability(result, checks, flights)
     return Outcome(
-        standing,
+        usability,
         _what(result) if bench is None else bench_in_words(bench),
-        _uses(result, standing),
+        _uses(result, usability),
         _reasons(result, checks),
-        met,
+        tuple(flights),
+        tuple(checks),
     )
 
 
@@ -159,9 +157,9 @@ def next_step(result: RunResult, found: Outcome, folder: Path) -> tuple[str, str
     """Return what to do next with a fit: in words, and the command."""
     name = shlex.quote(str(folder))
     doubts = [warning for warning in warnings_of(result.findings) if warning.small]
-    if found.standing is Standing.UNUSABLE:
+    if found.usability is Usability.UNUSABLE:
         return doubts[0].small if doubts else "Look at its flights.", f"tune report {name} --open"
-    if found.flights and not any(met.held_out for met in found.flights):
+    if found.flights and not any(flight.held_out for flight in found.flights):
         flight = shlex.quote(found.flights[-1].name)
         return "Hold a flight out, which then checks the fit.", f"tune ... --holdout {flight}"
     if not found.flights:
@@ -180,17 +178,17 @@ def of_examination(knowledge: Knowledge) -> str:
     )
 
 
-def flights_table(flights: Sequence[Met]) -> Table:
+def flights_table(flights: Sequence[FlightOutcome]) -> Table:
     """Return how closely flights are met, beside the noise."""
     looks = {"matched": "well", "better": "well", "unchanged": "weak"}
     rows: list[tuple[Cell | str, ...]] = [
         (
-            met.name + (", held out" if met.held_out else ""),
-            *_cells(met.position, lambda value: f"{1e3 * value:.3g} mm"),
-            *_cells(met.attitude, lambda value: f"{value:.3g}°"),
-            Cell(met.word, look=looks.get(met.word, "not")),
+            flight.name + (", held out" if flight.held_out else ""),
+            *_cells(flight.position, lambda value: f"{1e3 * value:.3g} mm"),
+            *_cells(flight.attitude, lambda value: f"{value:.3g}°"),
+            Cell(flight.word, look=looks.get(flight.word, "not")),
         )
-        for met in flights
+        for flight in flights
     ]
     columns = ("flight", "position RMSE", "noise", "attitude RMSE", "noise ", "verdict")
     return Table(columns, rows, words=("flight", "verdict"))
@@ -218,10 +216,10 @@ def _cells(errors: Errors, write: Callable[[float], str]) -> list[str]:
     return [both, "" if noise is None else write(noise)]
 
 
-def _met(flight: FlightResult, result: RunResult) -> Met:
+def _flight_outcome(flight: FlightResult, result: RunResult) -> FlightOutcome:
     position, attitude = (_errors(flight, result, signal) for signal in ("position", "attitude"))
     codes = {found.code for found in result.findings if found.subject == flight.name}
-    return Met(
+    return FlightOutcome(
         flight.name, flight.split == "holdout", position, attitude, _word(position, attitude, codes)
     )
 
@@ -251,21 +249,23 @@ def _errors(flight: FlightResult, result: RunResult, signal: str) -> Errors:
     return before, after, unit * of_axis if isinstance(of_axis, float) else None
 
 
-def _standing(result: RunResult, checks: Sequence[Met], met: Sequence[Met]) -> Standing:
+def _usability(
+    result: RunResult, checks: Sequence[FlightOutcome], flights: Sequence[FlightOutcome]
+) -> Usability:
     words = {one.word for one in checks}
-    if words & {"worse", "crashes"} or any(one.word == "crashes" for one in met):
-        return Standing.UNUSABLE
+    if words & {"worse", "crashes"} or any(one.word == "crashes" for one in flights):
+        return Usability.UNUSABLE
     if any(found.level == "failure" for found in result.findings):
-        return Standing.UNUSABLE
+        return Usability.UNUSABLE
     fitted = [row for row in result.coefficients.values() if row.fitted]
     unsure = (
         "unchanged" in words,
-        bool(met) and not any(one.held_out for one in met),
+        bool(flights) and not any(one.held_out for one in flights),
         not result.search.converged,
-        bool(fitted) and (any if not met else all)(row.identifiable is False for row in fitted),
+        bool(fitted) and (all if flights else any)(row.identifiable is False for row in fitted),
         any(f.level == "warning" and f.code in DOUBTS for f in result.findings),
     )
-    return Standing.WITH_CARE if any(unsure) else Standing.USABLE
+    return Usability.WITH_CARE if any(unsure) else Usability.USABLE
 
 
 def _what(result: RunResult) -> str:
@@ -282,9 +282,9 @@ def _what(result: RunResult) -> str:
     return text + "."
 
 
-def _uses(result: RunResult, standing: Standing) -> tuple[str, ...]:
+def _uses(result: RunResult, usability: Usability) -> tuple[str, ...]:
     """Return for what a fit can be used, and for what it cannot, in sentences."""
-    if standing is Standing.UNUSABLE:
+    if usability is Usability.UNUSABLE:
         return ("Do not use these numbers: see the warnings for what to do first.",)
     sentences = []
     fitted = [flight.name for flight in result.flights if flight.split == "fit"]
@@ -311,18 +311,18 @@ def _uses(result: RunResult, standing: Standing) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _reasons(result: RunResult, checks: Sequence[Met]) -> tuple[str, ...]:
+def _reasons(result: RunResult, checks: Sequence[FlightOutcome]) -> tuple[str, ...]:
     sentences = []
-    for met in checks[:3]:
-        before, after, noise = met.position
-        what = "held out" if met.held_out else "fitted"
+    for flight in checks[:3]:
+        before, after, noise = flight.position
+        what = "held out" if flight.held_out else "fitted"
         if after is None:
-            sentences.append(f"{met.name}, {what}, crashes in the simulation.")
+            sentences.append(f"{flight.name}, {what}, crashes in the simulation.")
             continue
         moved = f"{'a crash' if before is None else metres(before)} to {metres(after)}"
         floor = "" if noise is None else f"; the noise of its recording alone is {metres(noise)}"
-        sentences.append(f"{met.name}, {what}: position error from {moved}{floor}.")
-    if result.flights and not any(met.held_out for met in checks):
+        sentences.append(f"{flight.name}, {what}: position error from {moved}{floor}.")
+    if result.flights and not any(flight.held_out for flight in checks):
         sentences.append("No flight was held out, so that nothing checks the fit: hold one out.")
     if not result.search.converged:
         sentences.append("The search stopped at its limit of iterations: resume it.")

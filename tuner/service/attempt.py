@@ -81,7 +81,7 @@ def attempt(
     limits, cores
         For the process.
     report
-        Called with events and the job's standing, at least every `BEAT`; returns whether the
+        Called with events and the job's progress, at least every `BEAT`; returns whether the
         attempt still holds its job.
     is_unwanted
         Returns whether the server is ending.
@@ -166,7 +166,7 @@ def _follow(
                 events.append((kind, message))
             elif kind in ("done", "refused", "fault"):
                 last, ended = {"kind": kind, **message}, True
-        if is_unwanted() or not report(events, _standing(events)):
+        if is_unwanted() or not report(events, _progress(events)):
             raise UnwantedError
         if ended:
             return last
@@ -182,20 +182,20 @@ def _message(line: bytes | None) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _standing(events: Events) -> dict[str, Any]:
+def _progress(events: Events) -> dict[str, Any]:
     """Return where the search stands after these events."""
     iterations = [content for kind, content in events if kind == "iteration"]
     if not iterations:
         return {}
     last = iterations[-1]
-    standing = {
+    progress = {
         "stage": last["stage"],
         "iteration": last["number"],
         "seconds_left": last["seconds_left"],
     }
     if last["position_rmse"] is not None:
-        standing["rmse"] = last["position_rmse"]
-    return standing
+        progress["rmse"] = last["position_rmse"]
+    return progress
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

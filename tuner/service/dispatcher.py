@@ -69,10 +69,10 @@ def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
         for file, digest in kept.items():
             store.fetch(digest, inside(folder / RESULT, file))
 
-        def relay(events: Events, standing: Mapping[str, Any]) -> bool:
+        def relay(events: Events, progress: Mapping[str, Any]) -> bool:
             for file in (folder / RESULT).glob(CHECKPOINTS):
                 kept[file.name] = put(file, store)
-            report({"events": list(events), "standing": dict(standing), "checkpoint": dict(kept)})
+            report({"events": list(events), "progress": dict(progress), "checkpoint": dict(kept)})
             return True
 
         return attempt(folder, claim, store, limits=task.limits, report=relay)
@@ -95,8 +95,8 @@ def run_remotely(
     try:
         while True:
             has_ended = wait([future], timeout=BEAT).done
-            events, standing = _all(heard)
-            if is_unwanted() or not report(events, standing):
+            events, progress = _all(heard)
+            if is_unwanted() or not report(events, progress):
                 raise UnwantedError
             if has_ended:
                 return future.result()
@@ -109,14 +109,14 @@ def run_remotely(
 def _all(heard: SimpleQueue[dict[str, Any]]) -> tuple[Events, dict[str, Any]]:
     """Return what was heard since the last time."""
     events: list[tuple[str, Mapping[str, Any]]] = []
-    standing: dict[str, Any] = {}
+    progress: dict[str, Any] = {}
     while True:
         try:
             message = heard.get_nowait()
         except Empty:
-            return events, standing
+            return events, progress
         events += [(kind, content) for kind, content in message["events"]]
-        standing |= {**message["standing"], "checkpoint": message["checkpoint"]}
+        progress |= {**message["progress"], "checkpoint": message["checkpoint"]}
 
 
 logger = logging.getLogger(__name__)
@@ -310,22 +310,22 @@ class Reporter:
         self._pause = min(1.0, lease / 4)
         self._last = 0.0
         self._events: list[tuple[str, Mapping[str, Any]]] = []
-        self._standing: dict[str, Any] = {}
+        self._progress: dict[str, Any] = {}
         self._repeated = Counter(claim.preamble)
 
-    def __call__(self, events: Events, standing: Mapping[str, Any]) -> bool:
-        """Enter events and standing, and return whether the attempt still holds its job."""
+    def __call__(self, events: Events, progress: Mapping[str, Any]) -> bool:
+        """Enter events and progress, and return whether the attempt still holds its job."""
         self._events.extend(event for event in events if self._is_new(*event))
-        self._standing.update(standing)
+        self._progress.update(progress)
         now = time.monotonic()
         if not self._events and now - self._last < self._pause:
             return True
         try:
-            held = self._jobs.report(self._claim, self._events, self._standing)
+            held = self._jobs.report(self._claim, self._events, self._progress)
         except UnavailableError as error:
             logger.warning("job %s: %s", self._claim.id, error)
             return True
-        self._last, self._events, self._standing = now, [], {}
+        self._last, self._events, self._progress = now, [], {}
         return held
 
     def _is_new(self, kind: str, content: Mapping[str, Any]) -> bool:

@@ -299,10 +299,10 @@ async def get_events(
                 content["text"] = over_http(str(content["text"]))
             yield ServerSentEvent(event=event.kind, data=content, id=str(event.number))
             after = event.number
-        standing = JobAnswer.model_validate(row)
-        if standing != shown:
-            yield ServerSentEvent(event="job", data=standing)
-            shown = standing
+        answer = JobAnswer.model_validate(row)
+        if answer != shown:
+            yield ServerSentEvent(event="job", data=answer)
+            shown = answer
         if row.state in FINISHED and not new:
             return
         if not new:

@@ -124,12 +124,12 @@ class Queue:
         self,
         claim: Claim,
         events: Sequence[tuple[str, Mapping[str, Any]]],
-        standing: Mapping[str, Any],
+        progress: Mapping[str, Any],
     ) -> bool:
         """Note what an attempt does, and renew its lease; False if it holds the job no more."""
         with self._database.writing() as session:
             lease = time.time() + self._lease
-            if not _change(session, claim, {**standing, "lease": lease}):
+            if not _change(session, claim, {**progress, "lease": lease}):
                 return False
             for kind, content in events:
                 add_event(session, claim.number, kind, content)

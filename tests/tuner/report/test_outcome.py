@@ -7,7 +7,7 @@ import pytest
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.evaluate.records import AxesRmse
 from tuner.findings.findings import Code, Finding
-from tuner.report.outcome import Standing, counted, next_step, outcome, warnings_of
+from tuner.report.outcome import Usability, counted, next_step, outcome, warnings_of
 from tuner.uncertainty.verdict import Verdict
 
 CRASHED = AxesRmse(x=None, y=None, z=None, roll=None, pitch=None, yaw=None)
@@ -41,7 +41,7 @@ def noticing(result, *findings):
 
 def test_a_held_out_flight_met_to_its_noise_makes_a_fit_usable(result):
     found = outcome(result)
-    assert found.standing is Standing.USABLE
+    assert found.usability is Usability.USABLE
     assert found.flights[0].name == "checks"
     (met,) = found.checks
     assert met.word == "matched"
@@ -60,34 +60,34 @@ def test_that_flights_are_simulated_is_said_where_the_job_file_says_so(result):
 @pytest.mark.parametrize(
     ("after", "word", "standing"),
     [
-        (rmse(0.02), "better", Standing.USABLE),
-        (rmse(0.09), "unchanged", Standing.WITH_CARE),
-        (CRASHED, "crashes", Standing.UNUSABLE),
+        (rmse(0.02), "better", Usability.USABLE),
+        (rmse(0.09), "unchanged", Usability.WITH_CARE),
+        (CRASHED, "crashes", Usability.UNUSABLE),
     ],
 )
 def test_what_becomes_of_the_held_out_flight_decides(result, after, word, standing):
     found = outcome(with_held(result, rmse_best=after))
-    assert (found.checks[0].word, found.standing) == (word, standing)
+    assert (found.checks[0].word, found.usability) == (word, standing)
 
 
 def test_a_held_out_flight_that_is_met_worse_forbids_it(result):
     numbers, names = {"before": 0.1, "after": 0.2}, ("position", "m")
     worse = Finding(Code.FLIGHT_WORSE, "warning", "checks", numbers, names)
     found = outcome(noticing(result, worse))
-    assert (found.checks[0].word, found.standing) == ("worse", Standing.UNUSABLE)
+    assert (found.checks[0].word, found.usability) == ("worse", Usability.UNUSABLE)
     assert found.uses == ("Do not use these numbers: see the warnings for what to do first.",)
 
 
 def test_what_nothing_checks_or_something_doubts_is_used_with_care(result, tmp_path):
     unchecked = with_held(result, split="fit")
-    assert outcome(unchecked).standing is Standing.WITH_CARE
+    assert outcome(unchecked).usability is Usability.WITH_CARE
     assert "No flight was held out" in outcome(unchecked).reasons[-1]
     assert next_step(unchecked, outcome(unchecked), tmp_path)[1] == "tune ... --holdout checks"
     lacks = {"unmatched": 2.0, "flights": 2.0, "noise_multiple": 30.0}
     doubted = noticing(result, Finding(Code.MODEL_UNMATCHED, "warning", "model", lacks))
-    assert outcome(doubted).standing is Standing.WITH_CARE
+    assert outcome(doubted).usability is Usability.WITH_CARE
     gap = noticing(result, Finding(Code.POSE_GAP, "warning", "checks", {"seconds": 0.2}))
-    assert outcome(gap).standing is Standing.USABLE
+    assert outcome(gap).usability is Usability.USABLE
 
 
 def test_what_doubts_the_numbers_comes_before_what_does_not():

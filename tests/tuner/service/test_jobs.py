@@ -326,7 +326,7 @@ def test_a_job_s_page_begins_with_the_report_s_outcome_and_its_files(client, rec
     result = RunResult.model_validate(client.get(job["links"]["files"]["result.json"]).json())
     box = html.unescape(page.partition('id="outcome"')[2].partition("</section>")[0])
     found = outcome(result)
-    assert f'<p class="standing">{found.standing.capitalize()}</p>' in box
+    assert f'<p class="standing">{found.usability.capitalize()}</p>' in box
     assert all(sentence in box for sentence in (found.what, *found.uses, *found.reasons))
     assert page.index('id="outcome"') < page.index("<iframe")
     assert page.index("/files.zip") < page.index("<iframe")
