@@ -261,7 +261,7 @@ def audit(
 
     found = audited(model, params, None if run is None else read_run(run))
     if json:
-        text = {"model": str(found.path), "faults": found.faults, "compared": found.compared}
+        text = {"model": str(found.path), "faults": found.faults, "compared": found.differences}
         print(json_module.dumps(text, indent=2, ensure_ascii=False))
     else:
         from tuner.cli.tables import console
@@ -269,7 +269,7 @@ def audit(
         screen = console()
         for fault in found.faults:
             screen.print(f"{found.path.name}: {fault}", markup=False, soft_wrap=True)
-        for line in found.compared:
+        for line in found.differences:
             screen.print(line, markup=False, soft_wrap=True)
         if not found.faults and not quiet:
             screen.print(f"{found.path.name}: no fault found, {found.mass:.4g} kg", markup=False)

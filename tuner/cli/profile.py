@@ -81,10 +81,10 @@ def trace_of(spans: Sequence[Span]) -> dict[str, Any]:
 
 
 def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
-    from tuner.cli.tables import console, drawn
+    from tuner.cli.tables import console, rich_table
 
     screen = console()
-    screen.print(drawn(_table(rows)))
+    screen.print(rich_table(_table(rows)))
     beside = {name: f"{spent:.1f}" for name, spent in beside_of(recorder.spans).items()}
     parts = [f"{name} {seconds} s" for name, seconds in beside.items() if float(seconds)]
     if parts:

@@ -136,7 +136,7 @@ def jobs(
     json
         Print JSON instead of a table.
     """
-    from tuner.cli.tables import console, drawn
+    from tuner.cli.tables import console, rich_table
     from tuner.report.section import Table
 
     with client_of(server, token) as client:
@@ -158,7 +158,7 @@ def jobs(
     columns = ("job", "state", "vehicle", "name", "submitted", "RMSE mm", "")
     words = tuple(name for name in columns if name != "RMSE mm")
     screen = console()
-    screen.print(drawn(Table(columns, rows, words=words)))
+    screen.print(rich_table(Table(columns, rows, words=words)))
     if page["next"]:
         screen.print(f"more with --after {page['next']}")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from tuner.cli.tables import STYLES, console, drawn
+from tuner.cli.tables import STYLES, console, rich_table
 from tuner.core.phrases import listed_within, shorten
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.report.section import Cell, Section, Table
@@ -51,7 +51,7 @@ def print_run(
     screen = console(WIDTH)
     for line in _summary(folder, result, contents.exports, seconds):
         if isinstance(line, Table):
-            screen.print(drawn(line))
+            screen.print(rich_table(line))
         else:
             screen.print(line, soft_wrap=True)
 
@@ -179,7 +179,7 @@ def _print_section(screen: Console, section: Section) -> None:
     for point in section.points:
         screen.print(Text(f"- {point.text}", STYLES.get(point.look, "")))
     for table in section.tables:
-        screen.print(drawn(table))
+        screen.print(rich_table(table))
     if section.note:
         screen.print(Text(section.note, "dim"))
 
@@ -220,7 +220,7 @@ def estimates_table(estimates: Sequence[PointEstimate]) -> object:
     """Return where a search ended, of which nothing is known yet but the values."""
     rows = [(row.name, f"{row.initial:.5g}", f"{row.estimate:.5g}", row.unit) for row in estimates]
     columns = ("coefficient", "initial", "estimate", "unit")
-    return drawn(Table(columns, rows, words=("coefficient", "unit")))
+    return rich_table(Table(columns, rows, words=("coefficient", "unit")))
 
 
 def folds_table(folds: Sequence[Refit]) -> object:
@@ -241,4 +241,4 @@ def folds_table(folds: Sequence[Refit]) -> object:
     ]
     columns = ("left out", *(f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()))
     title = "RMSE of each flight with the fit to the others"
-    return drawn(Table(columns, rows, words=("left out",), fold=title))
+    return rich_table(Table(columns, rows, words=("left out",), fold=title))

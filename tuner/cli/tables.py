@@ -43,7 +43,7 @@ STYLES = {
 """Class of the page's style -> of the terminal's."""
 
 
-def drawn(table: Table) -> DrawnTable:
+def rich_table(table: Table) -> DrawnTable:
     """Return a table as the terminal draws it: words on the left, numbers on the right."""
     made = DrawnTable(box=None, title=table.fold or None, title_justify="left", pad_edge=False)
     for name in table.columns:
@@ -73,7 +73,7 @@ def print_flights(summaries: Sequence[Summary], path: Path) -> None:
         for summary in summaries
     ]
     screen = console()
-    screen.print(drawn(Table((*summaries[0].coefficients, *measures), rows)))
+    screen.print(rich_table(Table((*summaries[0].coefficients, *measures), rows)))
     screen.print(f"written to {path}", markup=False)
 
 
@@ -103,7 +103,7 @@ def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
     ]
     columns = ("coefficient", "value", "±", "unit", "source")
     screen = console()
-    screen.print(drawn(Table(columns, rows, words=("coefficient", "unit", "source"))))
+    screen.print(rich_table(Table(columns, rows, words=("coefficient", "unit", "source"))))
     screen.print(f"written to {path} and {path.stem}.job.yaml", markup=False)
 
 
@@ -115,7 +115,7 @@ def print_comparison(
     screen.print(f"controller: {settings.origin['controller']}", markup=False)
     columns = ("flight", "vehicle", *(f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()))
     rows = [_cells(row, comparison) for row in comparison.rows if laps or row.lap is None]
-    screen.print(drawn(Table(columns, rows, words=("flight", "vehicle"))))
+    screen.print(rich_table(Table(columns, rows, words=("flight", "vehicle"))))
     screen.print(f"best over all flights: {comparison.best or 'none, all of them crashed'}")
     for path in written:
         screen.print(f"written to {path}", markup=False)

@@ -24,7 +24,7 @@ from tuner.exporters.sdf.model import (
     inertials,
     read_model,
 )
-from tuner.exporters.sdf.spans import Element, assembled, rendered
+from tuner.exporters.sdf.spans import Element, read_tree, rendered
 from tuner.exporters.target import read_file
 from tuner.exporters.targets.px4 import outside_range, read_parameters
 from tuner.result import Run
@@ -65,16 +65,16 @@ class Rotor:
 
 
 @dataclass(frozen=True)
-class Audited:
+class Audit:
     """A model as it was read, and what is wrong with it, a line each."""
 
     path: Path
     mass: float
     faults: tuple[str, ...]
-    compared: tuple[str, ...] = ()
+    differences: tuple[str, ...]
 
 
-def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Audited:
+def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Audit:
     """Audit a model: SDF of Gazebo classic or gz-sim, split over files or not.
 
     Parameters
@@ -91,7 +91,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     ExportError
         A file cannot be read, or is no multirotor's.
     """
-    model = read_model(assembled(path, read_file, rendered), MOST_ROTORS)
+    model = read_model(read_tree(path, read_file, rendered), MOST_ROTORS)
     rotors = _rotors(model)
     if not rotors:
         raise ExportError(path, "has no motor with a link and a number", "give each motor its own")
@@ -105,8 +105,8 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     if params is not None:
         faults += outside_range(given)
         faults += _of_parameters(given, whole, rotors, _speeds(model, rotors, given))
-    compared = () if run is None else tuple(_against(run, whole, rotors))
-    return Audited(path, whole.mass, tuple(dict.fromkeys(faults)), compared)
+    differences = () if run is None else tuple(_against(run, whole, rotors))
+    return Audit(path, whole.mass, tuple(dict.fromkeys(faults)), differences)
 
 
 def _rotors(model: Model) -> list[Rotor]:

@@ -98,7 +98,7 @@ def export(
     own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
     if out is None or out.suffix:  # before anything is computed
         check_file(out or into or inside(run.folder, own), folder_is_made=True)
-    target = target.chosen(asked.simulator, into)
+    target = target.for_simulator(asked.simulator, into)
     physical, (run, effective) = run, in_simulator(run, target)
     vehicle, decided = exported_vehicle(run, today)
     check_every_coefficient(physical.vehicle, target)
@@ -156,7 +156,7 @@ def export_vehicle(file: Path, asked: ExportOptions, *, today: date) -> Exported
         As of `export`.
     """
     vehicle = read_vehicle(file)
-    target = target_of(asked.format).chosen(asked.simulator, asked.into)
+    target = target_of(asked.format).for_simulator(asked.simulator, asked.into)
     simulator = target.simulator
     check_every_coefficient(vehicle, target)
     line, sources = provenance_of_file(vehicle, file, today, asked.accept)
@@ -195,7 +195,7 @@ def export_draws(
     assert asked.draws is not None
     folder = asked.out or run.folder / FOLDER / "draws"
     draws = draws_of(run, asked.draws)
-    target = target_of(asked.format).chosen(asked.simulator)
+    target = target_of(asked.format).for_simulator(asked.simulator)
     name = file_name(run.vehicle.name, target.suffix)
     first = replace(asked, out=inside(folder, name))
     done = export(run, first, today=today, refly=refly)
@@ -278,7 +278,7 @@ def exports_of_job(
     """
     run = read_run(folder)
     for kind in wanted.formats:
-        into = wanted.into if target_of(kind).detected else None
+        into = wanted.into if target_of(kind).simulator_of else None
         try:
             asked, copies = ExportOptions(kind, into=into), folder / FOLDER
             done = export(run, asked, today=today, refly=refly, copies=copies)

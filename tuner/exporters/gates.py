@@ -23,12 +23,12 @@ WORSE = 0.01
 SAME_RELATIVE, SAME_ABSOLUTE = 0.01, 1e-4
 #: By how much its own simulator may miss a flight by more than this project's simulation of it:
 #: a factor, and in m and degrees.
-ELSEWHERE, ELSEWHERE_M, ELSEWHERE_DEG = 2.0, 0.02, 2.0
+OTHER_FACTOR, OTHER_SLACK_M, OTHER_SLACK_DEG = 2.0, 0.02, 2.0
 #: What the throttle of the hover, 0..1, may differ.
 SAME_THROTTLE = 0.005
 
 #: What is asked of a run.
-OF_FLIGHTS = (
+RUN_CONDITIONS = (
     "every trajectory of the run is flown without a crash",
     "the exported numbers fly as the run says",
     "no held-out flight is worse than before",
@@ -39,15 +39,15 @@ OF_FLIGHTS = (
 def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
     """Check a run and the vehicle as exported against every condition."""
     if not run.result.flights:
-        not_looked = (Gate(name, (), ran=False) for name in OF_FLIGHTS[:-1])
-        return (*not_looked, Gate(OF_FLIGHTS[-1], tuple(_on_bounds(run))))
+        not_looked = (Gate(name, (), ran=False) for name in RUN_CONDITIONS[:-1])
+        return (*not_looked, Gate(RUN_CONDITIONS[-1], tuple(_on_bounds(run))))
     try:
         flown = refly(run, vehicle)
         differing = _differing(run, flown)
     except InputError as error:
         flown, differing = {}, [f"the flights cannot be flown again ({error})"]
     objections = (_crashes(flown), differing, _worse(run), _on_bounds(run))
-    return tuple(Gate(name, tuple(o)) for name, o in zip(OF_FLIGHTS, objections, strict=True))
+    return tuple(Gate(name, tuple(o)) for name, o in zip(RUN_CONDITIONS, objections, strict=True))
 
 
 def check_in_simulator(
@@ -62,11 +62,11 @@ def check_in_simulator(
     for flight in run.result.flights:
         own, other = flight.rmse_best, there[flight.name]
         for signal, slack, unit in (
-            ("position", ELSEWHERE_M, "m"),
-            ("attitude", ELSEWHERE_DEG, "deg"),
+            ("position", OTHER_SLACK_M, "m"),
+            ("attitude", OTHER_SLACK_DEG, "deg"),
         ):
             expected, found = _missed(own, signal), _missed(other, signal)
-            if math.isfinite(found) and found > expected * ELSEWHERE + slack:
+            if math.isfinite(found) and found > expected * OTHER_FACTOR + slack:
                 objections.append(
                     f"{flight.name} is missed by {found:.3g} {unit}, expected {expected:.3g}"
                 )
@@ -79,7 +79,7 @@ def check_in_simulator(
 
 def not_flown() -> tuple[Gate, ...]:
     """Return the conditions of a run, for a vehicle without one."""
-    return tuple(Gate(name, (), ran=False) for name in OF_FLIGHTS)
+    return tuple(Gate(name, (), ran=False) for name in RUN_CONDITIONS)
 
 
 def check_hover(wanted: VehicleFile, there: VehicleFile) -> Gate:

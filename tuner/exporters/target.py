@@ -148,7 +148,7 @@ class Target:
         Who flies what it holds.
     others
         Further simulators that read the format.
-    detected
+    simulator_of
         A model to patch -> the name of the simulator that it is for; None for a format that goes
         into no model that exists.
     """
@@ -158,9 +158,9 @@ class Target:
     draft: Callable[[VehicleFile, str, Simulator, Path | None], Draft]
     simulator: Simulator = THIS_PROJECT
     others: tuple[Simulator, ...] = ()
-    detected: Callable[[Path], str] | None = None
+    simulator_of: Callable[[Path], str] | None = None
 
-    def chosen(self, simulator: str = "", into: Path | None = None) -> Target:
+    def for_simulator(self, simulator: str = "", into: Path | None = None) -> Target:
         """Return the target for the simulator that is asked for, or that a model is for.
 
         Raises
@@ -171,11 +171,11 @@ class Target:
         known = {s.name: s for s in (self.simulator, *self.others) if s.name}
         is_for = ""
         if into is not None:
-            if self.detected is None:
+            if self.simulator_of is None:
                 raise ExportError(
                     "--into", f"does not go with --format {self.name}", "leave it out"
                 )
-            is_for = self.detected(into)
+            is_for = self.simulator_of(into)
         for what, name in (("--simulator", simulator), (str(into), is_for)):
             if name and name not in known:
                 raise ExportError(

@@ -13,7 +13,7 @@ from tuner.search.job_flights import as_logged, read_usable, without_pose
 from tuner.vehicle import COEFFICIENTS
 
 
-def decided(path: Path, settings: Settings) -> Verdict:
+def decide(path: Path, settings: Settings) -> Verdict:
     """Return whether and how `tune` would fit a recording, and why.
 
     Parameters

@@ -96,9 +96,9 @@ def _decided(path: Path, settings: Settings) -> Verdict:
         from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
 
         configure()
-        from tuner.job.recording_decision import decided  # noqa: PLC0415
+        from tuner.job.recording_decision import decide  # noqa: PLC0415
 
-        return decided(path, settings)
+        return decide(path, settings)
 
     return replace(recalled(Verdict, cached("verdict", *key), found), path=str(path))
 

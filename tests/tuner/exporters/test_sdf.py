@@ -404,18 +404,18 @@ def test_gz_sim_is_flown_by_its_own_laws(vehicle):
     assert flown.aerodynamics.max_relative_airspeed > 1e5
     assert flown.aerodynamics.rolling_moment_coefficient == 0
     assert sdf_draft(CLASSIC, vehicle, "by a test").vehicle.aerodynamics == vehicle.aerodynamics
-    notes = " / ".join(not_carried(vehicle, TARGET.chosen(into=GZ)))
+    notes = " / ".join(not_carried(vehicle, TARGET.for_simulator(into=GZ)))
     assert "thrust in gz-sim does not depend on the airspeed" in notes
 
 
 def test_format_and_model_agree_about_the_simulator():
-    assert TARGET.chosen(into=GZ).simulator is GZ_SIM
-    assert TARGET.chosen("gz-sim").simulator is GZ_SIM
-    assert TARGET.chosen().simulator is GAZEBO_CLASSIC
+    assert TARGET.for_simulator(into=GZ).simulator is GZ_SIM
+    assert TARGET.for_simulator("gz-sim").simulator is GZ_SIM
+    assert TARGET.for_simulator().simulator is GAZEBO_CLASSIC
     with pytest.raises(ExportError, match="is a model for gz-sim"):
-        TARGET.chosen("gazebo-classic", GZ)
+        TARGET.for_simulator("gazebo-classic", GZ)
     with pytest.raises(ExportError, match="--format gz-sim is not for gazebo-classic"):
-        target_of("gz-sim").chosen(into=CLASSIC)
+        target_of("gz-sim").for_simulator(into=CLASSIC)
 
 
 def solid_box(mass, pose, sides):

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tuner.service.shapes import CoefficientHistory, Point
-from tuner.service.web.comparing import history_bars
+from tuner.service.web.comparison import history_bars
 
 
 def point(best: float, half: float) -> Point:

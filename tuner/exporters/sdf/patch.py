@@ -21,7 +21,7 @@ from tuner.exporters.sdf.model import (
     read_model,
     together,
 )
-from tuner.exporters.sdf.spans import MERGED, Edit, Element, assembled, blanked, rendered
+from tuner.exporters.sdf.spans import MERGED, Edit, Element, blanked, read_tree, rendered
 from tuner.exporters.sdf.tags import rotor_origin, values_in
 from tuner.exporters.simulators import (
     FASTEST_GZ,
@@ -62,8 +62,8 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
         The model cannot be understood, or would not come out with the wanted numbers.
     """
     rotors = len(vehicle.rotors)
-    model = read_model(assembled(path, read_file, lambda text, _: blanked(text)), rotors)
-    whole = read_model(assembled(path, read_file, rendered), rotors)
+    model = read_model(read_tree(path, read_file, lambda text, _: blanked(text)), rotors)
+    whole = read_model(read_tree(path, read_file, rendered), rotors)
     simulator = GZ_SIM if whole.is_gz else GAZEBO_CLASSIC
     flown = simulator.flown(vehicle)
     unit = gz_unit(flown) if whole.is_gz else 1.0
@@ -84,17 +84,17 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
 
     def faults(file: Path, instead: Mapping[Path, Path]) -> list[str]:
         standing = {**instead, path: file}
-        root = assembled(path, lambda p: read_file(standing.get(p, p)), rendered)
+        root = read_tree(path, lambda p: read_file(standing.get(p, p)), rendered)
         return differences(wanted, values_in(root, vehicle))
 
-    final = assembled(path, lambda p: patched.get(p) or read_file(p), rendered)
+    final = read_tree(path, lambda p: patched.get(p) or read_file(p), rendered)
     wanted = tags.carried_values(vehicle, channels=bool(whole.channels()))
     written_values = values_in(final, vehicle)
     wrong = differences(wanted, written_values)
     if wrong:
         raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
     geometry = _other_rotors(whole, vehicle, base)
-    there = placed(read_model(final, rotors), tags.as_flown(vehicle, written_values))
+    there = with_rotors_of(read_model(final, rotors), tags.as_flown(vehicle, written_values))
     return Draft(
         patched.pop(path, model.root.source.raw),
         with_speeds_in(there, 1.0 / unit),
@@ -113,7 +113,7 @@ def simulator_of(path: Path) -> str:
     ExportError
         It is no model of a multirotor.
     """
-    model = read_model(assembled(path, read_file, rendered), MOST_ROTORS)
+    model = read_model(read_tree(path, read_file, rendered), MOST_ROTORS)
     return (GZ_SIM if model.is_gz else GAZEBO_CLASSIC).name
 
 
@@ -317,7 +317,7 @@ def _other_rotors(model: Model, vehicle: VehicleFile, base: Inertial) -> tuple[s
     return tuple(clauses)
 
 
-def placed(model: Model, vehicle: VehicleFile) -> VehicleFile:
+def with_rotors_of(model: Model, vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle with its rotors where a model has them, and turning as they do there."""
     centre = composite(model).pose.position
     offset = np.array(tags.center_of_mass(vehicle) or (0.0, 0.0, 0.0))

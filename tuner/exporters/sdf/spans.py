@@ -248,7 +248,7 @@ DEEPEST = 8
 _NAME = re.compile(r"(?:model://)?([A-Za-z0-9_][A-Za-z0-9._-]{0,99})/?")
 
 
-def assembled(
+def read_tree(
     path: Path,
     read: Callable[[Path], str],
     prepare: Callable[[str, Path], str],
@@ -281,7 +281,7 @@ def assembled(
     for include in model_in(root).children:
         file = _included(include)
         if file is not None:
-            model = model_in(assembled(file, read, prepare, (*above, path)))
+            model = model_in(read_tree(file, read, prepare, (*above, path)))
             include.attributes = {"at": _pose(include) or _pose(model) or "0 0 0 0 0 0"}
             include.tag, include.children = MERGED, [model]
     return root

@@ -82,5 +82,5 @@ TARGET = Target(
     sdf_or_snippet,
     simulator=GAZEBO_CLASSIC,
     others=(GZ_SIM,),
-    detected=simulator_of,
+    simulator_of=simulator_of,
 )

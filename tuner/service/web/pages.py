@@ -39,8 +39,8 @@ from tuner.service.service import Service
 from tuner.service.settings import size_in_words
 from tuner.service.shapes import API, iso
 from tuner.service.tables import FINISHED, JobRow, RecordingRow, State
-from tuner.service.web import comparing
-from tuner.service.web.comparing import history_bars, rmse_curve
+from tuner.service.web import comparison
+from tuner.service.web.comparison import history_bars, rmse_curve
 from tuner.service.words import on_the_web
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
@@ -316,7 +316,7 @@ def show_job(service: Served, row: OfJob) -> Response:
     box: dict[str, object] = {"outcome": None}
     with suppress(InputError):  # the report, if it is there, says what it can
         if row.state == State.DONE:
-            result = comparing.result_of(service.store, row)
+            result = comparison.result_of(service.store, row)
             found = outcome(result)
             box = {
                 "outcome": found,
@@ -325,7 +325,7 @@ def show_job(service: Served, row: OfJob) -> Response:
                     replace(warning, text=on_the_web(warning.text), small=on_the_web(warning.small))
                     for warning in warnings_of(result.findings)
                 ],
-                "exports": comparing.exports_of(service.store, row),
+                "exports": comparison.exports_of(service.store, row),
             }
     return render("job.html.jinja", others=others, **box, **_live(service, row))
 
@@ -387,14 +387,14 @@ def show_vehicle(service: Served, name: str) -> Response:
 def compare(service: Served, a: str = "", b: str = "") -> Response:
     """Show two jobs side by side."""
     rows = [jobs.job(service.database, job) for job in (a, b)]
-    first, second = (comparing.result_of(service.store, row) for row in rows)
+    first, second = (comparison.result_of(service.store, row) for row in rows)
     return render(
         "compare.html.jinja",
         a=rows[0],
         b=rows[1],
-        masses=[comparing.mass_of(result) for result in (first, second)],
-        pairs=comparing.pairs(first, second),
-        flights=comparing.flight_pairs(first, second),
+        masses=[comparison.mass_of(result) for result in (first, second)],
+        pairs=comparison.pairs(first, second),
+        flights=comparison.flight_pairs(first, second),
         units=RMSE_UNITS,
     )
 
