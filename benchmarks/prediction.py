@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from tuner.config import Options, settle
 from tuner.core.errors import InputError
-from tuner.evaluate.predict import Predictions, predict, summary
+from tuner.evaluate.predict import Predictions, predict
 from tuner.findings.sentences import PREDICTED
 from tuner.job.run import run
 from tuner.objective.inlets import INLETS
@@ -70,6 +70,16 @@ def _rows(name: str, contest: Contest) -> Iterator[list[str]]:
         for steps in STEPS:
             means = summary(predictions, steps / 100.0)
             yield [name, predictor, str(steps), *(_cell(means[key]) for key in PREDICTED)]
+
+
+def summary(predictions: Sequence[Predictions], seconds: float) -> dict[str, float]:
+    """Return each quantity's mean error so many s ahead, over all predictions of some flights."""
+    counts = [len(p.begins) for p in predictions]
+    means = [p.mean(seconds) for p in predictions]
+    return {
+        name: float(np.average([mean[name] for mean in means], weights=counts))
+        for name in PREDICTED
+    }
 
 
 def _cell(mean: float) -> str:

@@ -241,7 +241,7 @@ def flights_worse(
                 findings.append(Finding(Code.FLIGHT_CRASHES, "warning", flight, numbers))
             continue
         for what, unit in MET_BY.items():
-            before, after = initial[flight].length(what), best[flight].length(what)
+            before, after = initial[flight].rmse.length(what), best[flight].rmse.length(what)
             if after > (1.0 + WORSE) * before:
                 numbers = {"before": before, "after": after}
                 findings.append(
@@ -278,7 +278,7 @@ def flights_not_flown(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[Fin
         and not r.flight.spins_freely
         and errors[r.flight.name].crash_time is None
     }
-    lengths = {name: errors[name].length("position") for name in flown}
+    lengths = {name: errors[name].rmse.length("position") for name in flown}
     findings = []
     for name, flight in flown.items():
         others = [length for other, length in lengths.items() if other != name]

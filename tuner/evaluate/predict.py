@@ -206,16 +206,6 @@ def hold(flight: Flight, begins: Array, ahead: Array) -> Predictions:
     return Predictions(begins, ahead, errors_of(reached, recorded, shape))
 
 
-def summary(predictions: Sequence[Predictions], seconds: float) -> dict[str, float]:
-    """Return each quantity's mean error so many s ahead, over all predictions of some flights."""
-    counts = [len(p.begins) for p in predictions]
-    means = [p.mean(seconds) for p in predictions]
-    return {
-        name: float(np.average([mean[name] for mean in means], weights=counts))
-        for name in PREDICTED
-    }
-
-
 BAND = (0.7, 8.0)
 """Hz between which accelerations are compared."""
 GRID = np.arange(-24, 25) * 0.0025

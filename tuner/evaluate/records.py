@@ -37,6 +37,11 @@ class AxesRmse(Part):
         parts = [getattr(self, axis) for axis in AXES[signal]]
         return None if None in parts else math.hypot(*parts)
 
+    def length(self, signal: str) -> float:
+        """Return the same; infinite for a crash."""
+        together = self.together(signal)
+        return math.inf if together is None else together
+
 
 class PredictedErrors(Part):
     """How far open-loop predictions lie from the recording, ``seconds`` after they begin.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.evaluate.forces import Forces
-from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse
+from tuner.evaluate.records import RMSE_UNITS, AxesRmse
 from tuner.recordings.flight import Array, Flight
 
 Pose = Literal["position", "attitude"]
@@ -81,13 +81,6 @@ class FlightErrors:
     def rmse(self) -> AxesRmse:
         """The thesis's six; None throughout for a crash."""
         return rmse_of([self])
-
-    def length(self, signal: Pose) -> float:
-        """Return the RMSE over a signal's axes together, m or degrees; infinite for a crash."""
-        rmse = self.rmse
-        values = [getattr(rmse, axis) for axis in AXES[signal]]
-        known = [value for value in values if value is not None]
-        return float(np.linalg.norm(known)) if known else np.inf
 
 
 def rmse_of(flights: Sequence[FlightErrors]) -> AxesRmse:

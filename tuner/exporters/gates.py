@@ -39,8 +39,7 @@ RUN_CONDITIONS = (
 def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
     """Check a run and the vehicle as exported against every condition."""
     if not run.result.flights:
-        not_looked = (Gate(name, (), ran=False) for name in RUN_CONDITIONS[:-1])
-        return (*not_looked, Gate(RUN_CONDITIONS[-1], tuple(_on_bounds(run))))
+        return (*not_flown()[:-1], Gate(RUN_CONDITIONS[-1], tuple(_on_bounds(run))))
     try:
         flown = refly(run, vehicle)
         differing = _differing(run, flown)
@@ -65,13 +64,13 @@ def check_in_simulator(
             ("position", OTHER_SLACK_M, "m"),
             ("attitude", OTHER_SLACK_DEG, "deg"),
         ):
-            expected, found = _missed(own, signal), _missed(other, signal)
+            expected, found = own.length(signal), other.length(signal)
             if math.isfinite(found) and found > expected * OTHER_FACTOR + slack:
                 objections.append(
                     f"{flight.name} is missed by {found:.3g} {unit}, expected {expected:.3g}"
                 )
     missed = "; ".join(
-        f"{name} {1000 * _missed(rmse, 'position'):.3g} mm, {_missed(rmse, 'attitude'):.2g}°"
+        f"{name} {1000 * rmse.length('position'):.3g} mm, {rmse.length('attitude'):.2g}°"
         for name, rmse in there.items()
     )
     return Gate(f"{title} itself flies it so", tuple(objections)), f"flown in {title}: {missed}"
@@ -131,16 +130,10 @@ def _worse(run: Run) -> list[str]:
         if flight.split != "holdout":
             continue
         for what, unit in (("position", "m"), ("attitude", "degrees")):
-            before, after = _missed(flight.rmse_initial, what), _missed(flight.rmse_best, what)
+            before, after = flight.rmse_initial.length(what), flight.rmse_best.length(what)
             if after > before * (1 + WORSE):
                 objections.append(f"{flight.name} {what} {after:.4g} {unit}, before {before:.4g}")
     return objections
-
-
-def _missed(rmse: AxesRmse, signal: str) -> float:
-    """Return the RMSE of a signal over its axes together; infinite for a crash."""
-    together = rmse.together(signal)
-    return math.inf if together is None else together
 
 
 def _on_bounds(run: Run) -> list[str]:

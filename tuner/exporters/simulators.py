@@ -533,10 +533,3 @@ ISAAC_LAB = Simulator(
     free=_LINEAR,
     ties=(_LINEAR,),
 )
-SIMULATORS = {
-    simulator.name: simulator
-    for simulator in (
-        GAZEBO_CLASSIC, GZ_SIM, SIH, MUJOCO, ROTORPY, DRONE_MODELS, ISAAC_LAB,
-    )
-}  # fmt: skip
-"""Name -> simulator."""

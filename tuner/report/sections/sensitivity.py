@@ -132,7 +132,7 @@ def information(contents: Contents) -> Section | None:
     points = [
         Cell(direction_in_words(d), look="failure" if d.null else "") for d in knowledge.directions
     ]
-    charts = [_by_channel(knowledge), _by_flight(knowledge)]
+    charts = _shares(knowledge)
     if len(knowledge.names) > 1:
         charts.append(_correlation(knowledge))
     return Section(
@@ -158,33 +158,33 @@ def _biases(knowledge: Knowledge) -> list[Table]:
     return [Table(columns, rows, words=columns)] if rows else []
 
 
-def _by_channel(knowledge: Knowledge) -> Chart:
-    parts = {
-        channel.replace("_", " "): [
-            sum(known.shares[channel].values()) for known in knowledge.coefficients.values()
-        ]
+def _shares(knowledge: Knowledge) -> list[Chart]:
+    """Return whose information each coefficient has: by channel, and by flight."""
+    known = knowledge.coefficients.values()
+    by_channel = {
+        channel.replace("_", " "): [sum(of.shares[channel].values()) for of in known]
         for channel in knowledge.channels
     }
-    return _stacked(
-        knowledge,
-        parts,
-        "shares_by_channel",
-        "Information about each coefficient by channel",
-        "Share of the Fisher information, the other coefficients fitted beside it.",
-    )
-
-
-def _by_flight(knowledge: Knowledge) -> Chart:
-    parts = {
-        flight: [
-            sum(of_flight[flight] for of_flight in known.shares.values())
-            for known in knowledge.coefficients.values()
-        ]
+    by_flight = {
+        flight: [sum(of_flight[flight] for of_flight in of.shares.values()) for of in known]
         for flight in knowledge.flights
     }
-    return _stacked(
-        knowledge, parts, "shares_by_flight", "Information about each coefficient by flight", ""
-    )
+    return [
+        _stacked(
+            knowledge,
+            by_channel,
+            "shares_by_channel",
+            "Information about each coefficient by channel",
+            "Share of the Fisher information, the other coefficients fitted beside it.",
+        ),
+        _stacked(
+            knowledge,
+            by_flight,
+            "shares_by_flight",
+            "Information about each coefficient by flight",
+            "",
+        ),
+    ]
 
 
 def _stacked(
