@@ -154,18 +154,19 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
     """Fly every flight with the initial and with the fitted vehicle."""
     comparison, initial = comparison_of(job, fitted), job.given.vehicle
     predictions = _predictions(job, fitted, vehicle)
+    flights = {flight.name: flight for flight in job.flights}
+    held = {name: _unchanged(flights[name], of) for name, of in predictions.items()}
     return Validation(
         initial=comparison.fly(initial),
         best=comparison.fly(vehicle),
         fitted_starts=comparison.fly_from_fitted_starts(vehicle),
         predicted_initial=_errors(_predictions(job, fitted, initial)),
         predicted_best=_errors(predictions),
-        predicted_holding=_errors(_held_predictions(job, predictions)),
+        predicted_holding=_errors(held),
         turning_explained={
-            recording.flight.name: _turning_explained(recording.flight, predicted)
-            for recording in job.recordings
-            if (predicted := predictions.get(recording.flight.name))
-            and "body_rate" in predicted.errors
+            name: 1.0 - _turning_missed(of) / _turning_missed(held[name])
+            for name, of in predictions.items()
+            if "body_rate" in of.errors
         },
     )
 
@@ -188,15 +189,10 @@ def _predictions(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, Pr
     return predicted
 
 
-def _held_predictions(job: Job, predictions: Mapping[str, Predictions]) -> dict[str, Predictions]:
-    """Return flight -> what is off if its state stays, of what its predictions predict."""
-    held = {}
-    for flight in job.flights:
-        if (of := predictions.get(flight.name)) is not None:
-            naive = hold(flight, of.begins, of.ahead)
-            same = {name: naive.errors[name] for name in of.errors}
-            held[flight.name] = replace(naive, errors=same)
-    return held
+def _unchanged(flight: Flight, predictions: Predictions) -> Predictions:
+    """Return what is off if a flight's state stays, of what predictions of it predict."""
+    naive = hold(flight, predictions.begins, predictions.ahead)
+    return replace(naive, errors={name: naive.errors[name] for name in predictions.errors})
 
 
 def _errors(
@@ -208,10 +204,9 @@ def _errors(
     }
 
 
-def _turning_explained(flight: Flight, predictions: Predictions) -> float:
-    naive = hold(flight, predictions.begins, predictions.ahead)
-    squares = [float(np.nanmean(of.errors["body_rate"][-1] ** 2)) for of in (predictions, naive)]
-    return 1.0 - squares[0] / squares[1]
+def _turning_missed(predictions: Predictions) -> float:
+    """Return the mean square by which the body rate is missed at the end of predictions."""
+    return float(np.nanmean(predictions.errors["body_rate"][-1] ** 2))
 
 
 WORSE = 0.01
