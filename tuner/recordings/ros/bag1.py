@@ -153,9 +153,10 @@ def _record(data: Content, at: int, op: int | None = None) -> tuple[Header, int,
 def _whole(data: Content, at: int, op: int) -> tuple[Header, bytes, int]:
     """Return the header and the data of a record, and where the next begins."""
     header, begin, end = _record(data, at, op)
-    if end - begin > LONGEST_DATA or end > len(data):
+    content = data[begin : min(end, begin + LONGEST_DATA)]
+    if len(content) < end - begin:
         raise DamagedError("a record is absurdly long")
-    return header, data[begin:end], end
+    return header, content, end
 
 
 def _records(data: Content, at: int) -> Iterator[tuple[int, Header, int, int]]:
@@ -171,9 +172,10 @@ def _records(data: Content, at: int) -> Iterator[tuple[int, Header, int, int]]:
 
 
 def _length(data: Content, at: int) -> int:
-    if at + 4 > len(data):
+    raw = data[at : at + 4]
+    if len(raw) < 4:
         raise DamagedError("it ends in the middle of a record")
-    return int.from_bytes(data[at : at + 4], "little")
+    return int.from_bytes(raw, "little")
 
 
 def _header(raw: bytes) -> Header:
