@@ -43,7 +43,7 @@ REFUSED = (
     SelectionCode.WORSE_AFTER_REFIT,
 )
 """Why least squares may have left out what innovations call for."""
-PERHAPS = 0.05
+WORTH_A_FIT = 0.05
 """Chance below which a secant lets a term be tried."""
 
 
@@ -158,7 +158,7 @@ class Innovations:
             if not row.kept
             and row.reason in REFUSED
             and any(name in COEFFICIENTS and COEFFICIENTS[name].begin for name in row.names)
-            and self._chance(model, row.names) < PERHAPS
+            and self._chance(model, row.names) < WORTH_A_FIT
         }
         if base is None or not lags:
             return None

@@ -107,7 +107,7 @@ MATERIAL = 0.01
 """Share of the loss below which a gain is no evidence: two simulators of a vehicle differ, too."""
 SMALLEST = 1e-6
 """Share of the loss that a flight has at least, where flights count alike."""
-SURE = 2.0
+SIGNIFICANT_GAIN = 2.0
 """Standard deviations by which what was left out must be predicted better."""
 MEMORY = 2
 """Stretches over which residuals are taken to be correlated."""
@@ -117,7 +117,7 @@ EARNING = (
     SelectionCode.SIGNIFICANT,
     SelectionCode.PREDICTS_SAMPLES,
 )
-NOTHING = np.empty(0, np.intp)
+NO_COLUMNS = np.empty(0, np.intp)
 """No columns."""
 DETERMINED = 1e-8
 """Share of a group's information that must be left once the model's coefficients follow it."""
@@ -185,7 +185,7 @@ def score(
     *,
     candidates: int,
     inside: bool = False,
-    gone: Columns = NOTHING,
+    gone: Columns = NO_COLUMNS,
     no_gust: bool = False,
     material: float = MATERIAL,
 ) -> Score:
@@ -235,7 +235,7 @@ def score(
     across = by_flight and linear.flights > 1
     folds = linear.flight if across else linear.section
     held_out = _held_out(linear, columns, (without, begin), folds)
-    reason, patience = SelectionCode.PREDICTS_FLIGHTS, SURE if inside else 1.0
+    reason, patience = SelectionCode.PREDICTS_FLIGHTS, SIGNIFICANT_GAIN if inside else 1.0
     if by_flight and inside:
         held_out = held_out.with_flights_apart(linear.flight)
     if not across:
@@ -270,7 +270,7 @@ def surviving(
     groups: Mapping[str, Columns],
     *,
     candidates: int,
-    without: Columns = NOTHING,
+    without: Columns = NO_COLUMNS,
     stand_ins: Collection[str] = (),
     no_gusts: Collection[str] = (),
     material: float = MATERIAL,
@@ -339,7 +339,7 @@ def surviving(
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    return np.concatenate([NOTHING, *parts])
+    return np.concatenate([NO_COLUMNS, *parts])
 
 
 @dataclass(frozen=True)
@@ -399,7 +399,7 @@ class _Gain:
 
     def is_sure(self, material: float) -> bool:
         """Whether it is material and exceeds its scatter."""
-        return self.share > max(SURE * self.scatter, material)
+        return self.share > max(SIGNIFICANT_GAIN * self.scatter, material)
 
 
 def _steps(

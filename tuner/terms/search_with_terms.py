@@ -28,9 +28,9 @@ from tuner.vehicle.selection_table import Groups
 
 MARKERS = ("marker_offset", "marker_tilt")
 """The groups of the motion capture's frame."""
-LEVEL = 3e-3
+LEAST_TILT = 3e-3
 """rad of tilt in hover below which markers are not freed for it."""
-SURE = 3.0
+SIGNIFICANT = 3.0
 """Standard errors, over the flights, by which the tilt exceeds zero."""
 
 
@@ -88,7 +88,7 @@ def _tilted(job: Job, tilt: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -
         return False
     mean = np.abs(tilt.mean(axis=0))
     error = tilt.std(axis=0, ddof=1) / np.sqrt(len(tilt))
-    return bool(((mean > LEVEL) & (mean > SURE * error)).any())
+    return bool(((mean > LEAST_TILT) & (mean > SIGNIFICANT * error)).any())
 
 
 def search_with_terms(

@@ -145,13 +145,13 @@ def scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:
     return np.asarray(meat), np.asarray(mean**2 / np.maximum(half_variance, 1e-300))
 
 
-QUARTILE = 2.0
+CENTRE_QUARTILE = 2.0
 """Of the logarithm of τ, a priori: half of all are between a seventh and seven."""
-APART = float(np.log(2.0))
+SPREAD_QUARTILE = float(np.log(2.0))
 """Quartile of how far the logarithms of the τ of one fit's coefficients are from their centre: half
 of them within a factor of two."""
 GRID = 200
-SMALLEST, BEYOND = 1e-3, 1e3
+SMALLEST, LARGEST = 1e-3, 1e3
 """Of the τ that are looked at, and times the observed one."""
 FREEDOM = (1.0, 200.0)
 """Degrees of freedom, at least and at most."""
@@ -192,7 +192,7 @@ def overdispersion_factors(
     squares of two errors are correlated as the square of the errors' correlation.
     """
     freedom = np.clip(freedom, *FREEDOM)
-    largest = BEYOND * np.sqrt(max(float(ratio.max()), 1.0))
+    largest = LARGEST * np.sqrt(max(float(ratio.max()), 1.0))
     log_excess = np.linspace(np.log(SMALLEST), np.log(largest), GRID)
     variance = 1.0 + np.exp(2.0 * log_excess)
     likelihood = -0.5 * freedom[:, None] * (np.log(variance) + ratio[:, None] / variance)
@@ -201,10 +201,10 @@ def overdispersion_factors(
     usual = 0.5 * np.log(expected)
     usual = usual - own @ usual / own.sum()
     beside = log_excess[:, None] - log_excess - usual[:, None, None]
-    about = 1.0 / (1.0 + (beside / APART) ** 2)
+    about = 1.0 / (1.0 + (beside / SPREAD_QUARTILE) ** 2)
     about /= about.sum(axis=1, keepdims=True)  # (K, excess, centre): of an excess, given a centre
     of_centre = np.log(np.einsum("kx,kxc->kc", likelihood, about))
-    centre = -np.log1p((log_excess / QUARTILE) ** 2) + own @ of_centre
+    centre = -np.log1p((log_excess / CENTRE_QUARTILE) ** 2) + own @ of_centre
     centre = np.exp(centre - centre.max())
     weight = likelihood * (about @ centre)
     weight /= weight.sum(axis=1, keepdims=True)
@@ -222,7 +222,7 @@ ROUNDING = 1e-9
 """Share of a variance that the flights must have in it to say anything of it."""
 LEAST = 1e-3
 """Of what is expected of a sum of squares: less is chance."""
-HARDLY = 0.1
+HALVED_AT = 0.1
 """Share of a variance that, if a fit leaves no more of it to be seen, halves what is made of it."""
 
 
@@ -313,7 +313,7 @@ def _disturbed(information: FisherInformation, inverse: Array, from_flights: Arr
     share = np.clip(1.0 - taken / np.where(speaks, from_flights, np.inf), 0.0, 1.0) * speaks
     expected = np.where(share > 0.0, share * from_flights, 1.0)
     log_ratio = np.log(np.maximum(seen / expected, LEAST))
-    told = share / (share + HARDLY)
+    told = share / (share + HALVED_AT)
     centre = told @ log_ratio / max(told.sum(), LEAST)
     return np.asarray(np.exp(told * (log_ratio - centre)))
 

@@ -341,13 +341,13 @@ SIMULATORS_STEP = 1.0 / 4000.0
 """s of a simulator's finest usual step. A lag that it steps by Euler's rule, as most do, is half a
 step shorter than its time constant says: ln(1 - h/τ) = -h/(τ - h/2) to second order. Not by more:
 the standard error of what is only known to lie within limits is their half-width over √3."""
-WIDER = float(stdtrit(DRAWS, 0.975) / Z95)
+STUDENT_FACTOR = float(stdtrit(DRAWS, 0.975) / Z95)
 """Times the root mean square of so many draws: Student's t, whose errors are as large by chance."""
 SAME_ERRORS = ("noise", "residuals", "left_out")
 """Parts that show the same errors, each in its way."""
 FEWEST = 3
 """Flights, or parts of them, that can disagree: of two, one degree of freedom is left."""
-TELLS = 1e-3
+LEAST_GROWTH = 1e-3
 """Share of a variance by which it must grow without a flight that tells of the coefficient."""
 
 
@@ -391,7 +391,7 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
         "left_out": left_out(information),
         "terms": information.in_doubt,
         "step": moved.get(STEP),
-        "readings": WIDER * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None,
+        "readings": STUDENT_FACTOR * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None,
         "lack": moved.get(LACK),
         "search": np.abs(inverse.matrix @ information.slope),
     }
@@ -429,7 +429,7 @@ def left_out(information: FisherInformation) -> Array | None:
         rest = Inverse.of(others + information.given, information.given)
         without = rest.matrix
         expected = np.maximum(np.diag(without) - known, 0.0)
-        tells = (expected > TELLS * known) & rest.known
+        tells = (expected > LEAST_GROWTH * known) & rest.known
         moved = (without @ parts.score[number]) ** 2
         weights[number] = np.where(tells, expected / (expected + known), 0.0)
         squares[number] = np.where(tells, moved / np.where(tells, expected, 1.0), 0.0)
@@ -443,7 +443,7 @@ def left_out(information: FisherInformation) -> Array | None:
 
 NAMED = 0.3
 """Move of a coefficient, relative to the largest, from which it takes part in a direction."""
-ALIKE = 0.1
+SCALE_TOLERANCE = 0.1
 """Deviation of a direction's moves from those of a common factor below which it is one."""
 WORST = 3
 """Directions that are reported."""
@@ -486,5 +486,5 @@ def is_common_scale(moves: Mapping[str, float]) -> bool:
     """Return whether a direction multiplies masses and forces by one factor."""
     group = [name for name in scale_group() if name in moves]
     others = [abs(move) for name, move in moves.items() if name not in group]
-    alike = [abs(moves[name] - 1.0) < ALIKE for name in group]
-    return "mass" in group and all(alike) and max(others, default=0.0) < ALIKE
+    alike = [abs(moves[name] - 1.0) < SCALE_TOLERANCE for name in group]
+    return "mass" in group and all(alike) and max(others, default=0.0) < SCALE_TOLERANCE

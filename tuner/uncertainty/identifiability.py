@@ -37,12 +37,12 @@ from tuner.vehicle import COEFFICIENTS
 
 MAX_ROUNDS = 3
 """Largest number of rounds: what is held may leave something else undetermined."""
-NOTHING = 0.002
+SEARCH_TOLERANCE = 0.002
 """Share of the loss by which it may rise where one of what trades off exactly is held: what an
 optimiser leaves. More says that the others cannot follow, their bounds being in the way, say."""
 RIDGE = 1e-12
 """Added to a Hessian of unit diagonal."""
-MUCH = 2.0
+CLOSED_LOOP_TOLERANCE = 2.0
 """Times the loss of flights in their closed loop, likewise: gusts make less of a difference."""
 
 
@@ -84,7 +84,9 @@ def with_undetermined_held(
             "others are fitted again."
         )
         rest = hold(job, fitted, stand_ins, on_progress, stages=LAST if predicts else LAST_TWO)
-        if not _rise(fitted, rest) < (1.0 + NOTHING if predicts else MUCH):
+        if not _rise(fitted, rest) < (
+            1.0 + SEARCH_TOLERANCE if predicts else CLOSED_LOOP_TOLERANCE
+        ):
             on_message(
                 f"With {listed(names)} at the initial value the flights are met worse: all keep "
                 "their values."
