@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from tuner.equation_error.measured import Measured, measured_with, with_rotors
+from tuner.equation_error.measured import Measured, measured_with, with_rotors, without_gaps_of
 from tuner.equation_error.model import Accelerations, Linear, values_at
-from tuner.objective.inlets import zero_order_hold
+from tuner.objective.inlets import MISSED, linear_interpolation, zero_order_hold
 from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.vehicle.coefficient import Parameter
@@ -96,10 +96,16 @@ def followed(model: Model, command: Series) -> Series:
     return Series(command.time, rotor_speeds(command.values, step, motor, lags))
 
 
+Commands = tuple[Series, ...]
+"""Of each flight."""
+
+
 def driven(
     model: Model, flights: Sequence[tuple[Flight, float]], rate: float
-) -> tuple[tuple[Measured, ...], tuple[Series, ...]] | None:
-    """Return the steps of some flights, and their commands; None where one says too little.
+) -> tuple[tuple[Measured, ...], tuple[Commands, Commands]] | None:
+    """Return the steps of some flights; their commands, and the same of every second sample.
+
+    None where a flight says too little.
 
     Parameters
     ----------
@@ -108,16 +114,31 @@ def driven(
     flights
         Each with the s by which its commands are stamped late.
     rate
-        Hz of the loop that computes commands, which were recorded as often.
+        Hz of the loop that computes commands.
     """
-    parts, commands = [], []
-    for flight, late in flights:
-        clock = np.arange(int(flight.duration * rate)) / rate
-        recorded = flight.series["command"]
-        held = zero_order_hold(Series(recorded.time - late, recorded.values), clock)
-        commands.append(Series(clock, held))
-        part = measured_with(flight, followed(model, commands[-1]), noise=0.0)
-        if part is None:
-            return None
-        parts.append(part)
-    return tuple(parts), tuple(commands)
+    commands, coarser = (
+        tuple(_held(*flight, rate, every) for flight in flights) for every in (1, 2)
+    )
+    pairs = zip(flights, commands, strict=True)
+    parts = [measured_with(flight, followed(model, c), noise=0.0) for (flight, _), c in pairs]
+    known = tuple(
+        without_gaps_of(_on_time(*flight), part)
+        for flight, part in zip(flights, parts, strict=True)
+        if part is not None
+    )
+    return (known, (commands, coarser)) if len(known) == len(parts) else None
+
+
+def _on_time(flight: Flight, late: float) -> Series:
+    recorded = flight.series["command"]
+    return Series(recorded.time - late, recorded.values)
+
+
+def _held(flight: Flight, late: float, rate: float, every: int) -> Series:
+    """Return one of so many recorded commands of a flight, on the loop's clock or their own."""
+    recorded = _on_time(flight, late)
+    taken = Series(recorded.time[::every], recorded.values[::every])
+    read = zero_order_hold if taken.rate * MISSED > rate else linear_interpolation
+    rate = max(rate, recorded.rate)
+    clock = np.arange(int(flight.duration * rate)) / rate
+    return Series(clock, read(taken, clock))

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from tuner.equation_error.driven import Driven
+from tuner.equation_error.driven import Commands, Driven
 from tuner.equation_error.measured import Mask, Measured
 from tuner.equation_error.model import Accelerations, Made, values_at
 from tuner.equation_error.regression import (
@@ -20,7 +20,7 @@ from tuner.equation_error.regression import (
     regress,
 )
 from tuner.objective.space import Space
-from tuner.recordings.flight import Array, Series
+from tuner.recordings.flight import Array
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import Model, with_terms_computed
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
@@ -76,7 +76,7 @@ def estimate(
     space: Space,
     candidates: Groups,
     flights: Sequence[Measured],
-    commands: Sequence[Series] = (),
+    commands: Sequence[Commands] = (),
 ) -> Estimate:
     """Return what some flights' accelerations say.
 
@@ -91,14 +91,15 @@ def estimate(
     flights
         What was recorded.
     commands
-        Of each flight, where its rotors follow these (`tuner.equation_error.driven`).
+        Where rotors follow these (`tuner.equation_error.driven`): all, and every second, which
+        tells what is not known of the time between two.
     """
     model = with_terms_computed(model, [n for n in space.free if _may_be_absent(model, n)])
     parts, noisy = tuple(flights), not commands
     made: Made = (
         Accelerations(model, space.parameters, parts)
         if noisy
-        else Driven(model, space.parameters, tuple(commands), parts)
+        else Driven(model, space.parameters, commands[0], parts)
     )
     names = np.array(space.names)
     begin = np.array([p.scaled(p.initial) for p in space.parameters])
@@ -118,11 +119,16 @@ def estimate(
     found = near(np.where(out, begin, full.point), noisy=noisy)
     halved = near(found.point, memory=0.5 * MEMORY, noisy=noisy)
     noiseless = near(found.point, noisy=False) if noisy else found
+    coarser = found
+    if commands:
+        seldom = Driven(model, space.parameters, commands[1], parts)
+        coarser = regress(seldom, found.point, free=free, near=True, noisy=False)
     errors = np.sqrt(
         np.diag(found.covariance)
         + (halved.point - found.point) ** 2
         + np.where(free, full.point - found.point, 0.0) ** 2
         + (NOISE_KNOWN * (noiseless.point - found.point)) ** 2
+        + (coarser.point - found.point) ** 2
     )
     predicted = predicting(made, found.point, free=acts & np.isin(names, GAINS), seconds=AHEAD)
     values = values_at(space.parameters, predicted)

@@ -148,6 +148,12 @@ def with_rotors(part: Measured, rotors: Series) -> Measured:
     )
 
 
+def without_gaps_of(series: Series, part: Measured) -> Measured:
+    """Return the steps, of which those in a signal's gaps are unknown."""
+    known = np.isfinite(_read(series, part.time)).all(axis=1, keepdims=True)
+    return replace(part, accelerations=np.where(known, part.accelerations, np.nan))
+
+
 def rows_of(vector: Vec3) -> Array:
     """Return a vector's components on the host (N, 3)."""
     return np.stack([np.asarray(vector.x), np.asarray(vector.y), np.asarray(vector.z)], axis=1)

@@ -13,13 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.errors import ConfigError
-from tuner.equation_error.driven import OF_MOTORS, driven
+from tuner.equation_error.driven import OF_MOTORS, Commands, driven
 from tuner.equation_error.estimate import GAINS, Estimate, estimate
 from tuner.equation_error.measured import Measured, measured
 from tuner.findings.findings import Code, Finding
-from tuner.objective.inlets import sparse
 from tuner.objective.space import extended
-from tuner.recordings.flight import Series
 from tuner.search.problem import Job, job_of
 from tuner.terms.candidates import candidate_groups, start_of
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, with_values
@@ -61,21 +59,19 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     return begun, (_finding(found),)
 
 
-def _steps(job: Job) -> tuple[tuple[Measured, ...], tuple[Series, ...]] | None:
+def _steps(job: Job) -> tuple[tuple[Measured, ...], tuple[Commands, ...]] | None:
     """Return the steps of the fitted flights, with commands where these turn the rotors.
 
-    None where they say too little: commands of which some were not recorded do not tell what turned
-    the vehicle between them.
+    None where they say too little.
     """
     fitted = [(r.flight, r.input_late) for r in job.recordings if not r.holdout]
     if job.inlets[0] == "rotor_speed":
         parts = [measured(flight, input_late=late) for flight, late in fitted]
         known = tuple(part for part in parts if part is not None)
         return (known, ()) if len(known) == len(parts) else None
-    rate = float(job.objective.schedule.rate_control_rate)
-    if job.inlets[0] != "actuator" or sparse(job.fitted, "command", rate):
+    if job.inlets[0] != "actuator":
         return None
-    return driven(job.objective.model, fitted, rate)
+    return driven(job.objective.model, fitted, float(job.objective.schedule.rate_control_rate))
 
 
 def _candidates(job: Job) -> Groups:

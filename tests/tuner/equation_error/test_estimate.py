@@ -55,10 +55,11 @@ def test_what_rotors_answer_makes_no_vehicle_heavy(begun):
         assert abs(error) < 3.0 * found.errors[name]
 
 
-def test_commands_alone_tell_inertia_by_the_lags_that_they_need(racer, tmp_path):
+@pytest.mark.parametrize("rate", [400.0, 100.0])
+def test_commands_alone_tell_inertia_by_the_lags_that_they_need(racer, rate, tmp_path):
     """The rotors turn faster than the new vehicle's are believed to, and are known by nothing."""
     vehicle, signals = racer
-    paths = fast_flights.write(vehicle, signals, tmp_path, seed=4, fed="command")
+    paths = fast_flights.write(vehicle, signals, tmp_path, seed=4, rotor_rate=rate, fed="command")
     settings = settle(Options([str(path) for path in paths], config=str(tmp_path / "tune.yaml")))
     recordings, _ = read_usable(settings)
     job, (finding,) = with_accelerations(job_of(settings, recordings))
@@ -69,7 +70,7 @@ def test_commands_alone_tell_inertia_by_the_lags_that_they_need(racer, tmp_path)
         assert abs(error) < 0.15, name
         assert abs(error) < 2.0 * found.errors[name], name
     lag = np.mean([found.values[f"time_constant_{way}"] for way in ("up", "down")])
-    assert lag + found.values["actuator_latency"] == pytest.approx(fast_flights.MOTOR_LAG, rel=0.1)
+    assert lag + found.values["actuator_latency"] == pytest.approx(fast_flights.MOTOR_LAG, rel=0.2)
     assert finding.numbers["explained_x"] < 0.9
     assert not set(job.space.names) & {*TILTING, "time_constant_up"}
 
