@@ -7,6 +7,7 @@ import pytest
 
 from tests.tuner.job.test_attitude import settings_of, sparse_log
 from tests.tuner.job.test_windows import job_through
+from tests.tuner.uncertainty.making import ended
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import errors_of
 from tuner.design import next_log
@@ -14,7 +15,6 @@ from tuner.design.next_log import what_to_log
 from tuner.design.proposals import LogProposal, next_log_in_words
 from tuner.objective.information import information_at
 from tuner.recordings.flight import Series
-from tuner.search.fitted import Fitted
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.search.progress import beginning, criterion_of, point_of
@@ -30,19 +30,13 @@ def at_truth(job, updated):
     stage = Stage(WHOLE, job.objective.samples, 1.0, False, False, 1, 1e-3, True, False)
     start = beginning(job.objective, vector[None])
     point = point_of(start.points, 0)
-    return Fitted(
+    return ended(
         objective=job.objective,
         point=point,
         criterion=criterion_of(stage, start.scales, np.asarray(point.offsets), start.states),
         noise=job.noise,
         scales={flight.name: dict.fromkeys(start.scales, 1.0) for flight in job.fitted},
-        iterations=(),
-        outcomes=(),
-        method="gradient",
-        evaluations=0,
-        wall_time=0.0,
         loss_best=0.0,
-        converged=True,
     )
 
 

@@ -39,8 +39,7 @@ def only(objective: Objective, segment: int) -> Objective:
 @pytest.fixture(scope="module")
 def fitted() -> Fitted:
     """A fit to the swing alone, which hardly turns about up, met 200 times worse than noise."""
-    exact = making.problem(FREE)
-    noisy = making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
+    noisy = making.problem(FREE, seed=0)
     swing = only(noisy, 0)
     exact_fit = making.fitted_of(swing, making.truth(swing))
     rough = {name: 200.0 * scale[:1] for name, scale in exact_fit.criterion.scale.items()}

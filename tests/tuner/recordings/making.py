@@ -6,6 +6,7 @@ import sqlite3
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -340,28 +341,6 @@ _PX4_TYPES = {
 }
 
 
-def to_px4_ros2(messages: Mapping[str, Column], folder: Path, *, boot: int = 0) -> Path:
-    """Write PX4's messages as its bridge publishes them."""
-    store = get_typestore(Stores.EMPTY)
-    types: dict[str, Any] = {}
-    for name, text in _PX4_TYPES.items():
-        types.update(get_types_from_msg(text, f"px4_msgs/msg/{name}"))
-    store.register(types)
-    rows = []
-    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for name, column in messages.items():
-            kind = "px4_msgs/msg/" + "".join(part.title() for part in name.split("_"))
-            side = "in" if name == "trajectory_setpoint" else "out"
-            connection = writer.add_connection(f"/fmu/{side}/{name}", kind, typestore=store)
-            make = _px4_maker(store, kind)
-            for when, row in zip(column.time, column.values, strict=True):
-                rows.append((int(when), connection, make, kind, row))
-        for when, connection, make, kind, row in sorted(rows, key=lambda item: item[0]):
-            message = make((when - boot) // 1000, row)
-            writer.write(connection, when + 700_000, store.serialize_cdr(message, kind))
-    return folder
-
-
 MOCAP_TYPES = {
     "mocap4r2_msgs/msg/RigidBodies": "std_msgs/Header header\nuint32 frame_number\n"
     "mocap4r2_msgs/RigidBody[] rigidbodies\n",
@@ -415,46 +394,45 @@ def mocap_message(store: Any, driver: str, when: int, row: np.ndarray) -> Any:
     return t[kind](header, pose)
 
 
-def to_px4_and_mocap(
+def to_px4_ros2(
     messages: Mapping[str, Column],
-    pose: Column,
-    driver: str,
     folder: Path,
     *,
-    boot: int,
+    boot: int = 0,
+    poses: Mapping[str, Column] | None = None,
     storage: StoragePlugin = StoragePlugin.MCAP,
 ) -> Path:
-    """Write PX4's messages, on its own clock, and the poses of a motion capture, on the host's."""
+    """Write PX4's messages as its bridge does, on its clock, and drivers' poses on the host's."""
     store, rows = px4_store(), []
     with Writer(folder, version=9, storage_plugin=storage) as writer:
+
+        def write(topic: str, kind: str, column: Column, make: Callable[..., Any]) -> None:
+            connection = writer.add_connection(topic, kind, typestore=store)
+            for when, row in zip(column.time, column.values, strict=True):
+                content = store.serialize_cdr(make(int(when), row), kind)
+                rows.append((int(when), connection, content))
+
         for name, column in messages.items():
             kind = "px4_msgs/msg/" + "".join(part.title() for part in name.split("_"))
             side = "in" if name == "trajectory_setpoint" else "out"
-            connection = writer.add_connection(f"/fmu/{side}/{name}", kind, typestore=store)
-            make = _px4_maker(store, kind)
-            for when, row in zip(column.time, column.values, strict=True):
-                message = make((int(when) - boot) // 1000, row)
-                rows.append((int(when), connection, store.serialize_cdr(message, kind)))
-        topic, kind = MOCAPS[driver]
-        connection = writer.add_connection(topic, kind, typestore=store)
-        for when, row in zip(pose.time, pose.values, strict=True):
-            message = mocap_message(store, driver, int(when), row)
-            rows.append((int(when), connection, store.serialize_cdr(message, kind)))
+            write(f"/fmu/{side}/{name}", kind, column, _px4_maker(store, kind, boot))
+        for driver, column in (poses or {}).items():
+            write(*MOCAPS[driver], column, partial(mocap_message, store, driver))
         for when, connection, content in sorted(rows, key=lambda item: item[0]):
             writer.write(connection, when + 700_000, content)
     return folder
 
 
-def _px4_maker(store: Any, kind: str) -> Callable[[int, np.ndarray], Any]:
-    """Return a function that fills a message's float fields in order."""
+def _px4_maker(store: Any, kind: str, boot: int) -> Callable[[int, np.ndarray], Any]:
+    """Return a function that fills a message's float fields in order, its time since boot."""
     fields = store.fielddefs[kind][1]
 
-    def make(microseconds: int, row: np.ndarray) -> Any:
+    def make(when: int, row: np.ndarray) -> Any:
         left = list(row)
         values = []
         for name, (node, detail) in fields:
             if name in ("timestamp", "timestamp_sample"):
-                values.append(microseconds)
+                values.append((when - boot) // 1000)
             elif name == "delta_xy":
                 values.append(np.zeros(2))
             elif node == Nodetype.BASE and detail[0] == "float64":

@@ -195,7 +195,8 @@ def test_motion_capture_beside_the_bridge(
     driver: str, bridged, pose, truth, tmp_path: Path
 ) -> None:
     beside = {n: m for n, m in bridged.items() if n != "vehicle_attitude"}
-    folder = making.to_px4_and_mocap(beside, pose, driver, tmp_path / driver, boot=boot_of(bridged))
+    boot = boot_of(bridged)
+    folder = making.to_px4_ros2(beside, tmp_path / driver, boot=boot, poses={driver: pose})
     flight = load_flight(folder)
     near(flight, truth, "position", "attitude", "body_rate", "rate_setpoint", "command")
     assert flight.signals["position"].shape == truth.signals["position"].shape
@@ -229,20 +230,19 @@ def test_the_bridges_odometry_alone(bridged, truth, tmp_path: Path) -> None:
 def test_databases_without_definitions_know_motion_capture(
     driver: str, pose, tmp_path: Path
 ) -> None:
-    folder = making.to_px4_and_mocap(
-        {}, pose, driver, tmp_path / driver, boot=0, storage=StoragePlugin.SQLITE3
+    folder = making.to_px4_ros2(
+        {}, tmp_path / driver, poses={driver: pose}, storage=StoragePlugin.SQLITE3
     )
     making.without_definitions(folder)
     position = load_flight(folder).series["position"].values
     assert np.abs(position[:100] - pose.values[:100, :3]).max() < 0.01
 
 
-def test_px4s_messages_without_definitions_are_asked_for(bridged, pose, tmp_path: Path) -> None:
+def test_px4s_messages_without_definitions_are_asked_for(bridged, tmp_path: Path) -> None:
     few = {n: bridged[n] for n in ("vehicle_local_position", "vehicle_attitude")}
-    folder = making.to_px4_and_mocap(
-        few, making.Column(pose.time[:0], pose.values[:0]), "vrpn_mocap", tmp_path / "old",
-        boot=boot_of(bridged), storage=StoragePlugin.SQLITE3,
-    )  # fmt: skip
+    folder = making.to_px4_ros2(
+        few, tmp_path / "old", boot=boot_of(bridged), storage=StoragePlugin.SQLITE3
+    )
     making.without_definitions(folder)
     with pytest.raises(RecordingError, match="not the definition of its type px4_msgs") as caught:
         load_flight(folder)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tuner.uncertainty.making import problem, truth, with_data
+from tests.tuner.uncertainty.making import problem
 from tuner.objective.batch import sums_at
 from tuner.objective.segments import OFFSETS
 from tuner.search import continuation, levenberg_marquardt
@@ -23,7 +23,7 @@ FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input
 
 @pytest.fixture(scope="module")
 def fit():
-    return with_data(problem(FREE), truth(problem(FREE)), noise=np.random.default_rng(5))
+    return problem(FREE, seed=5)
 
 
 def searched(fit, vectors, *, offsets=False):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.tuner.uncertainty.making import problem, truth, with_data
+from tests.tuner.uncertainty.making import problem
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.optimiser import Free
@@ -15,8 +15,7 @@ FREE = ("inertia_zz", "motor_constant", "moment_constant")
 
 @pytest.fixture(scope="module")
 def fit():
-    exact = problem(FREE)
-    return with_data(exact, truth(exact), noise=np.random.default_rng(5))
+    return problem(FREE, seed=5)
 
 
 def evolved(fit, *, seed, free=None):

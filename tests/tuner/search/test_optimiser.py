@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from tests.tuner.uncertainty.making import problem, truth, with_data
+from tests.tuner.uncertainty.making import problem
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.optimiser import OPTIMISERS, Free
@@ -63,7 +63,7 @@ def added(tmp_path, monkeypatch):
 
 
 def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
-    fit = with_data(problem(FREE), truth(problem(FREE)))
+    fit = problem(FREE)
     rate = float(fit.schedule.log_rate)
     stages = plan(added, fit.samples, rate, windows=False, robust=False, steps=40)
     stages = [stage for stage in stages if stage.name in ("first 3 s", WHOLE)]
@@ -84,7 +84,7 @@ def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
 
 
 def test_least_squares_reports_its_damping():
-    fit = with_data(problem(FREE), truth(problem(FREE)))
+    fit = problem(FREE)
     stage = plan("gradient", fit.samples, 200.0, windows=False, robust=False, steps=3)[3]
     progress = grow(
         fit,

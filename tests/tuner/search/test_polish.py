@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.tuner.uncertainty.making import FLIGHTS, NOISE, fitted_of, problem, truth, with_data
+from tests.tuner.uncertainty.making import FLIGHTS, NOISE, fitted_of, problem, truth
 from tuner.config import JobFile
 from tuner.search import polish
 from tuner.search.loop import Loop, loop_of, with_loop
@@ -50,9 +50,8 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
 @pytest.mark.parametrize(("left", "steps"), [(None, 2), (1e-3, 1)])
 def test_a_rough_fit_ends_where_a_linear_step_is_left(left, steps):
     """From where noise alone is left a step gains less than a thousandth of the loss."""
-    objective = problem(PLAIN)
+    objective = problem(PLAIN, seed=0)
     true = np.array(truth(objective).coefficients)
-    objective = with_data(objective, truth(objective), noise=np.random.default_rng(0))
     fitted = fitted_of(objective, objective.start(true + 0.02 * true))
     job = SimpleNamespace(
         objective=objective,

@@ -10,6 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from tests.tuner.uncertainty.making import ended
 from tuner.config import JobFile
 from tuner.disturbances.disturbances import USUAL
 from tuner.disturbances.refit import STEPS
@@ -23,19 +24,12 @@ NOBODY = cast(Any, None)
 
 
 def fitted(scale: float) -> Fitted:
-    return Fitted(
+    return ended(
         objective=NOBODY,
         point=NOBODY,
         criterion=NOBODY,
         noise={},
         scales={"circle": {"position": 1.0, "command": scale}},
-        iterations=(),
-        outcomes=(),
-        method="gradient",
-        evaluations=0,
-        wall_time=0.0,
-        loss_best=1.0,
-        converged=True,
     )
 
 

@@ -60,8 +60,13 @@ def references() -> ReferenceInlet:
     return ReferenceInlet(point, spins=jnp.asarray([False, True]), yaw_rate=jnp.asarray([0.0, 2.0]))
 
 
-def problem(free: Sequence[str], *, job: Mapping[str, object] | None = None) -> Objective:
-    """Return a fit of two noiseless flights; the truth is the space's initial vector."""
+def problem(
+    free: Sequence[str], *, job: Mapping[str, object] | None = None, seed: int | None = None
+) -> Objective:
+    """Return a fit of two flights, noiseless unless a seed is given; the truth is where it begins.
+
+    It is the space's initial vector.
+    """
     vehicle, controller = vehicle_file(), controller_file()
     space = space_of(vehicle, controller, JobFile(free=tuple(free), **(job or {})))
     model, schedule = model_of(vehicle, controller), schedule_of(controller)
@@ -72,7 +77,10 @@ def problem(free: Sequence[str], *, job: Mapping[str, object] | None = None) -> 
     )
     segments = Segments(references(), start, _sensors(), jnp.arange(2))
     objective = Objective(model, segments, space, schedule, samples, AIRBORNE)
-    return with_data(objective, truth(objective))
+    exact = with_data(objective, truth(objective))
+    if seed is None:
+        return exact
+    return with_data(exact, truth(exact), noise=np.random.default_rng(seed))
 
 
 def _sensors() -> dict[str, Measured]:
@@ -140,17 +148,13 @@ def criterion_of(objective: Objective, *, prior: float = 1.0) -> Criterion:
 
 
 def fitted_of(objective: Objective, point: Point) -> Fitted:
-    return Fitted(
-        objective=objective,
-        point=point,
-        criterion=criterion_of(objective),
-        noise=NOISE,
-        scales={name: dict.fromkeys(NOISE, 1.0) for name in FLIGHTS},
-        iterations=(),
-        outcomes=(),
-        method="gradient",
-        evaluations=0,
-        wall_time=0.0,
-        loss_best=1.0,
-        converged=True,
-    )
+    scales = {name: dict.fromkeys(NOISE, 1.0) for name in FLIGHTS}
+    criterion = criterion_of(objective)
+    return ended(objective=objective, point=point, criterion=criterion, noise=NOISE, scales=scales)
+
+
+def ended(**found: object) -> Fitted:
+    """Return a fit that has ended, of what it found."""
+    usual: dict[str, object] = {"iterations": (), "outcomes": (), "method": "gradient"}
+    usual |= {"evaluations": 0, "wall_time": 0.0, "loss_best": 1.0, "converged": True}
+    return Fitted(**(usual | found))  # type: ignore[arg-type]

@@ -33,8 +33,7 @@ OFFSETS_FITTED = np.array(
 
 @pytest.fixture(scope="module")
 def objective() -> Objective:
-    exact = making.problem(FREE)
-    return making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
+    return making.problem(FREE, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +127,7 @@ def test_intervals_are_in_units_and_inside_the_bounds(
 
 
 def test_tied_coefficients_share_their_estimate() -> None:
-    exact = making.problem(
+    noisy = making.problem(
         (
             "inertia_xx",
             "inertia_yy",
@@ -138,8 +137,8 @@ def test_tied_coefficients_share_their_estimate() -> None:
             "moment_constant",
         ),
         job={"ties": (("inertia_xx", "inertia_yy"),)},
+        seed=1,
     )
-    noisy = making.with_data(exact, making.truth(exact), noise=np.random.default_rng(1))
     tied = uncertainty_of(making.fitted_of(noisy, making.truth(noisy)))
     first, second = tied.estimates["inertia_xx"], tied.estimates["inertia_yy"]
     assert second.std_error / first.std_error == pytest.approx(second.value / first.value)

@@ -23,8 +23,7 @@ UNIT = {"position": 1.0, "attitude": 180.0 / np.pi, "body_rate": 1.0, "rotor_spe
 
 @pytest.fixture(scope="module")
 def objective() -> Objective:
-    exact = making.problem(FREE)
-    return making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
+    return making.problem(FREE, seed=0)
 
 
 @pytest.fixture(scope="module")

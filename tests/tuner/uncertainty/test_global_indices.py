@@ -20,8 +20,7 @@ FREE = ("motor_constant", "moment_constant", "rolling_moment_coefficient")
 
 @pytest.fixture(scope="module")
 def objective() -> Objective:
-    exact = making.problem(FREE)
-    return making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
+    return making.problem(FREE, seed=0)
 
 
 def indices(objective: Objective, method: Method, samples: int) -> GlobalSensitivity:

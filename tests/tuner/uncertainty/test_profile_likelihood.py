@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import equinox as eqx
-import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
@@ -31,8 +30,7 @@ FREE = (
 
 @pytest.fixture(scope="module")
 def objective() -> Objective:
-    exact = making.problem(FREE)
-    return making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
+    return making.problem(FREE, seed=0)
 
 
 @pytest.fixture(scope="module")
