@@ -17,23 +17,25 @@ if TYPE_CHECKING:
     from tuner.vehicle.scaling_laws import Airframe
 
 INCH = 0.0254
-#: Smallest and largest that a number may be.
-RANGES = {
-    "--mass": (0.01, 100.0, "kg"),
-    "--wheelbase": (0.03, 5.0, "m"),
-    "--cells": (1.0, 24.0, "cells"),
-    "--motor-kv": (30.0, 40000.0, "rpm/V"),
-    "--hover-throttle": (0.05, 0.95, "of full command"),
-    "--rotor-height": (-1.0, 1.0, "m"),
+ASKED = {
+    "--mass": (0.01, 100.0, "kg", "Mass, ready to fly [kg]: "),
+    "--wheelbase": (0.03, 5.0, "m", "Distance between opposite motors [m]: "),
+    "--cells": (1.0, 24.0, "cells", "Cells of the battery in series (empty if not known): "),
+    "--motor-kv": (30.0, 40000.0, "rpm/V", "kV of the motors [rpm/V] (empty if not known): "),
+    "--hover-throttle": (
+        0.05,
+        0.95,
+        "of full command",
+        "Throttle in hover, 0 to 1 (empty if not known): ",
+    ),
+    "--rotor-height": (
+        -1.0,
+        1.0,
+        "m",
+        "Height of the rotors above the centre of mass [m] (empty: 0): ",
+    ),
 }
-QUESTIONS = {
-    "--mass": "Mass, ready to fly [kg]: ",
-    "--wheelbase": "Distance between opposite motors [m]: ",
-    "--cells": "Cells of the battery in series (empty if not known): ",
-    "--motor-kv": "kV of the motors [rpm/V] (empty if not known): ",
-    "--hover-throttle": "Throttle in hover, 0 to 1 (empty if not known): ",
-    "--rotor-height": "Height of the rotors above the centre of mass [m] (empty: 0): ",
-}
+"""Option -> the smallest and the largest that it may be, its unit, and how it is asked for."""
 
 
 def new_vehicle(
@@ -88,7 +90,7 @@ def new_vehicle(
              "--motor-kv": motor_kv, "--hover-throttle": hover_throttle,
              "--rotor-height": rotor_height}  # fmt: skip
     if asking:
-        for option, question in QUESTIONS.items():
+        for option, (*_, question) in ASKED.items():
             if given[option] is None:
                 given[option] = _answer(option, input(question))
         if propeller is None:
@@ -144,7 +146,7 @@ def _answer(option: str, text: str) -> float | None:
 
 
 def _check(option: str, value: float | None) -> None:
-    low, high, unit = RANGES[option]
+    low, high, unit, _ = ASKED[option]
     if value is not None and not low <= value <= high:
         remedy = f"give {low:g} to {high:g} {unit}"
         raise InputError(option, f"{value:g} is not one of a multirotor", remedy)
