@@ -67,6 +67,19 @@ def differences(wanted: Mapping[str, float], read: Mapping[str, float]) -> list[
     ]
 
 
+def flattened(content: Mapping[str, Any]) -> dict[str, float]:
+    """Return key and place -> number of tables and lists in each other; words are left out."""
+    numbers: dict[str, float] = {}
+    for name, value in content.items():
+        if isinstance(value, Mapping):
+            numbers |= flattened({f"{name}.{key}": item for key, item in value.items()})
+        elif isinstance(value, list):
+            numbers |= flattened({f"{name}[{i}]": item for i, item in enumerate(value)})
+        elif not isinstance(value, str):
+            numbers[name] = float(value)
+    return numbers
+
+
 def assigned(path: Path) -> dict[str, Any]:
     """Return what a Python module that was written here assigns: name -> value; nothing is run."""
     return {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from tuner.core.disk import file_name
 from tuner.core.yaml_document import commented
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import DRONE_MODELS, rotor_speed, thrust_at
-from tuner.exporters.target import Draft, Target, differences, read_file
+from tuner.exporters.target import Draft, Target, differences, flattened, read_file
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
@@ -55,25 +54,11 @@ def params(vehicle: VehicleFile) -> dict[str, Any]:
     }
 
 
-def flattened(content: dict[str, Any]) -> dict[str, float]:
-    """Return key and place -> number of parameters that may be lists."""
-    numbers: dict[str, float] = {}
-    for name, value in content.items():
-        if isinstance(value, list):
-            numbers |= flattened({f"{name}[{i}]": item for i, item in enumerate(value)})
-        else:
-            numbers[name] = float(value)
-    return numbers
-
-
 def drone_models_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
     """Return a table to put into drone-models' ``data/params.toml``."""
     flown = DRONE_MODELS.flown(vehicle)
     wanted, key = params(flown), file_name(vehicle.name, "")
     lines = "".join(f"{name} = {value!r}\n" for name, value in wanted.items())
-
-    def faults(path: Path, _: object) -> list[str]:
-        return differences(flattened(wanted), flattened(tomllib.loads(read_file(path))[key]))
 
     text = f'{commented(provenance)}["{key}"]\n{lines}'
     arms = [abs(r.position[axis]) for r in vehicle.rotors for axis in (0, 1)]
@@ -85,7 +70,9 @@ def drone_models_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Dra
         text,
         flown,
         (),
-        faults,
+        lambda path, _: differences(
+            flattened(wanted), flattened(tomllib.loads(read_file(path))[key])
+        ),
         gates=(Gate("the simulator has such rotors", square or counts),),
         flier=_flier(wanted),
     )

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 from tuner.core.yaml_document import commented
 from tuner.exporters.simulators import ISAAC_LAB, hover_speed, rotor_speed, thrust_at
-from tuner.exporters.target import Draft, Target, assigned, differences
-from tuner.exporters.targets.drone_models import flattened
+from tuner.exporters.target import Draft, Target, assigned, differences, flattened
 from tuner.vehicle import VehicleFile
 
 TURN = 2 * math.pi
@@ -69,16 +67,6 @@ def configuration(vehicle: VehicleFile) -> dict[str, dict[str, Any]]:
     }
 
 
-def _numbers(content: dict[str, dict[str, Any]]) -> dict[str, float]:
-    return {
-        f"{section}.{name}": number
-        for section, values in content.items()
-        for name, number in flattened(
-            {name: value for name, value in values.items() if not isinstance(value, str)}
-        ).items()
-    }
-
-
 def isaaclab_text(content: dict[str, dict[str, Any]], provenance: str) -> str:
     """Return the module."""
     pieces = []
@@ -93,10 +81,12 @@ def isaaclab_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
     flown = ISAAC_LAB.flown(vehicle)
     wanted = configuration(flown)
 
-    def faults(path: Path, _: object) -> list[str]:
-        return differences(_numbers(wanted), _numbers(assigned(path)))
-
-    return Draft(isaaclab_text(wanted, provenance), flown, (), faults)
+    return Draft(
+        isaaclab_text(wanted, provenance),
+        flown,
+        (),
+        lambda path, _: differences(flattened(wanted), flattened(assigned(path))),
+    )
 
 
 TARGET = Target("isaaclab", "_isaaclab.py", isaaclab_draft, ISAAC_LAB)

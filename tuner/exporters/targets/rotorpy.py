@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tuner.core.yaml_document import commented
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import ROTORPY, rotor_speed
-from tuner.exporters.target import Draft, Target, assigned, differences
+from tuner.exporters.target import Draft, Target, assigned, differences, flattened
 from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]
@@ -51,7 +51,6 @@ def rotorpy_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
     """Return a Python module that RotorPy's ``Multirotor`` takes ``quad_params`` from."""
     flown = ROTORPY.flown(vehicle)
     params = quad_params(flown)
-    wanted = {name: value for name, value in params.items() if isinstance(value, float)}
     lines = "".join(f"    {name!r}: {value!r},\n" for name, value in params.items())
     text = (
         f"{commented(provenance)}import numpy as np\n\n_P = {{\n{lines}}}\nquad_params = {{\n"
@@ -63,7 +62,7 @@ def rotorpy_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
         text,
         flown,
         (),
-        lambda path, _: differences(wanted, assigned(path).get("_P", {})),
+        lambda path, _: differences(flattened(params), flattened(assigned(path).get("_P", {}))),
         flier=_flier(params),
     )
 
