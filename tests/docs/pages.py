@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from enum import Enum
+from functools import cache
 from pathlib import Path
 
 from cyclopts.exceptions import CycloptsError, MissingArgumentError
@@ -81,6 +82,7 @@ def in_the_text(page: Path) -> list[str]:
     ]
 
 
+@cache
 def is_whole(span: str) -> bool:
     """Return whether a command in the text can be typed as it stands there."""
     words = words_of(span)

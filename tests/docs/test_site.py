@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -35,35 +36,34 @@ def test_the_python_reference_has_its_signatures(site: Path):
         assert f'id="{name}"' in page
 
 
-@pytest.mark.parametrize("width", [1280, 390], ids=["desktop", "phone"])
-def test_a_browser_shows_it_whole(site: Path, width: int):
+@pytest.fixture(scope="module")
+def reading():
+    """Return what opens a page of the site in one browser for all."""
     browser = pytest.importorskip("tests.tuner.report.browser", reason="needs Playwright")
     if browser.CHROMIUM is None:
         pytest.skip("needs Chromium or Chrome on the path")
-    pages = ("index", "tutorials/first-fit", "explanations/model", "reference/messages")
     with browser.chromium() as started:
-        for name in pages:
-            with browser.reading(started, site / f"{name}.html", width=width) as opened:
-                page = opened.page
-                assert page.locator("h1").first.is_visible(), name
-                assert page.evaluate("document.documentElement.scrollWidth") <= width, name
-                asked = {address.partition(":")[0] for address in opened.requests}
-                assert asked <= {"file", "data", "blob"}, name
-                broken = "[...document.images].filter(i => i.complete && !i.naturalWidth).length"
-                assert page.evaluate(broken) == 0, name
+        yield partial(browser.reading, started)
 
 
-def test_search_works_in_pages_that_are_opened_as_files(site: Path):
-    browser = pytest.importorskip("tests.tuner.report.browser", reason="needs Playwright")
-    if browser.CHROMIUM is None:
-        pytest.skip("needs Chromium or Chrome on the path")
-    with (
-        browser.chromium() as started,
-        browser.reading(started, site / "tutorials/first-fit.html") as opened,
-    ):
+@pytest.mark.parametrize("width", [1280, 390], ids=["desktop", "phone"])
+def test_a_browser_shows_it_whole(site: Path, reading, width: int):
+    for name in ("index", "tutorials/first-fit", "explanations/model", "reference/messages"):
+        with reading(site / f"{name}.html", width=width) as opened:
+            page = opened.page
+            assert page.locator("h1").first.is_visible(), name
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+            asked = {address.partition(":")[0] for address in opened.requests}
+            assert asked <= {"file", "data", "blob"}, name
+            broken = "[...document.images].filter(i => i.complete && !i.naturalWidth).length"
+            assert page.evaluate(broken) == 0, name
+
+
+def test_search_works_in_pages_that_are_opened_as_files(site: Path, reading):
+    with reading(site / "tutorials/first-fit.html") as opened:
         page = opened.page
         field, links = page.locator(".md-search__input"), page.locator(".md-search-result__link")
-        deadline = time.monotonic() + browser.PATIENCE / 1000
+        deadline = time.monotonic() + 60.0
         while not links.count():  # what is typed before the page's script has begun is not heard
             assert time.monotonic() < deadline
             field.fill("")
