@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 
 MEMORY = 2**30
 """bytes that derivatives take at most by default while they are computed."""
-LOGGED = 4
+LOGGED = 8
 """Share of them, one in so many, that is logged at a time where residuals are kept."""
 
 
