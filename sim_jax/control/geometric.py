@@ -21,12 +21,12 @@ class ReferencePoint(eqx.Module):
     acceleration: Vec3
 
 
-def _direction(vector: Vec3) -> Vec3:
-    """Return the direction of a vector; upward where it has none."""
+def _direction(vector: Vec3, otherwise: Vec3 | None = None) -> Vec3:
+    """Return the direction of a vector; another one, or upward, where it has none."""
     length = vector.norm()
     has = length > 0
     scale = 1.0 / jnp.where(has, length, 1.0)
-    return where(has, vector * scale, Vec3.upward(vector.z))
+    return where(has, vector * scale, otherwise or Vec3.upward(vector.z))
 
 
 def attitude_from_acceleration(acceleration: Vec3, heading: Vec3) -> Quaternion:
@@ -126,10 +126,25 @@ def wanted_acceleration(
         World vector (cos ψ, sin ψ, 0), which turns the axes of the reference's drag.
     """
     up = Vec3.upward(position.z, CONTROLLER_GRAVITY)
-    wanted = attitude_from_acceleration(reference.acceleration + up, heading)
-    drag = wanted.to_world(gains.reference_drag.scaled_by(wanted.to_body(reference.velocity)))
     feedback = feedback_acceleration(gains, reference, position, velocity)
-    return feedback + reference.acceleration - drag + up
+    return feedback + reference.acceleration - _reference_drag(gains, reference, up, heading) + up
+
+
+def _reference_drag(
+    gains: PositionGains, reference: ReferencePoint, up: Vec3, heading: Vec3
+) -> Vec3:
+    """Return R_ref D R_refᵀ v_ref, by the axes that make `attitude_from_acceleration`'s attitude.
+
+    Its quaternion would take three roots more.
+    """
+    z_axis = _direction(reference.acceleration + up)
+    y_axis = _direction(z_axis.cross(heading), Vec3(-heading.y, heading.x, heading.z))
+    x_axis, along = y_axis.cross(z_axis), gains.reference_drag
+
+    def part(axis: Vec3, factor: Scalar) -> Vec3:
+        return axis * (axis.dot(reference.velocity) * factor)
+
+    return part(x_axis, along.x) + part(y_axis, along.y) + part(z_axis, along.z)
 
 
 def thrust_setpoint(gains: AttitudeGains, acceleration: Vec3, attitude: Quaternion) -> Scalar:
