@@ -8,9 +8,9 @@ from functools import partial
 
 import numpy as np
 
-from tuner.equation_error.driven import Commands, Driven
+from tuner.equation_error.command_accelerations import CommandAccelerations, Commands
 from tuner.equation_error.measured import Mask, Measured
-from tuner.equation_error.model import Accelerations, Made, values_at
+from tuner.equation_error.model import Accelerations, ModelAccelerations, values_at
 from tuner.equation_error.regression import (
     MEMORY,
     Regression,
@@ -91,15 +91,15 @@ def estimate(
     flights
         What was recorded.
     commands
-        Where rotors follow these (`tuner.equation_error.driven`): all, and every second, which
-        tells what is not known of the time between two.
+        Where rotors follow these: all, and every second, which tells what is not known of the time
+        between two.
     """
     model = with_terms_computed(model, [n for n in space.free if _may_be_absent(model, n)])
     parts, noisy = tuple(flights), not commands
-    made: Made = (
+    made: ModelAccelerations = (
         Accelerations(model, space.parameters, parts)
         if noisy
-        else Driven(model, space.parameters, commands[0], parts)
+        else CommandAccelerations(model, space.parameters, commands[0], parts)
     )
     names = np.array(space.names)
     begin = np.array([p.scaled(p.initial) for p in space.parameters])
@@ -121,7 +121,7 @@ def estimate(
     noiseless = near(found.point, noisy=False) if noisy else found
     coarser = found
     if commands:
-        seldom = Driven(model, space.parameters, commands[1], parts)
+        seldom = CommandAccelerations(model, space.parameters, commands[1], parts)
         coarser = regress(seldom, found.point, free=free, near=True, noisy=False)
     errors = np.sqrt(
         np.diag(found.covariance)
@@ -215,7 +215,7 @@ def _row(
     )
 
 
-def _explained(made: Made, point: Array) -> Array:
+def _explained(made: ModelAccelerations, point: Array) -> Array:
     """Return the shares (6,) of recorded accelerations that are explained."""
     left, there = [], []
     for one, part in zip(made.at(point, noise=False), made.flights, strict=True):
@@ -225,7 +225,7 @@ def _explained(made: Made, point: Array) -> Array:
     return np.asarray(1.0 - np.mean(np.concatenate(left) ** 2, axis=0) / varies)
 
 
-def _horizon(made: Made, point: Array) -> float | None:
+def _horizon(made: ModelAccelerations, point: Array) -> float | None:
     """Return the s up to which predictions of roll and pitch rate beat holding them."""
     linear, reached = made.at(point, noise=False), None
     for seconds in HORIZONS:

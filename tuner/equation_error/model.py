@@ -53,7 +53,7 @@ class Linear:
     crossed: Array
 
 
-class Made(Protocol):
+class ModelAccelerations(Protocol):
     """The model's accelerations at all steps of several flights, see `Accelerations`."""
 
     @property

@@ -24,7 +24,7 @@ from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to 
 
 from tuner.core.numerics import Z95, robust_sd
 from tuner.equation_error.measured import Mask, Measured
-from tuner.equation_error.model import Linear, Made
+from tuner.equation_error.model import Linear, ModelAccelerations
 from tuner.recordings.flight import Array
 
 MEMORY = 0.1
@@ -112,7 +112,7 @@ class Regression:
 
 
 def regress(
-    made: Made,
+    made: ModelAccelerations,
     begin: Array,
     *,
     free: Mask,
@@ -162,7 +162,7 @@ def regress(
     return Regression(point, sums, prior, pull, _covariance(sums, prior, pull, free))
 
 
-def predicting(made: Made, begin: Array, *, free: Mask, seconds: float) -> Array:
+def predicting(made: ModelAccelerations, begin: Array, *, free: Mask, seconds: float) -> Array:
     """Return the coordinates (K,) that predict velocity and body rate best, so many s ahead.
 
     Along the recorded motion, which is not simulated: errors are added up over the stretch, as an
@@ -188,7 +188,7 @@ def adding(part: Measured, seconds: float) -> Kernels:
 
 
 def _stepped(
-    made: Made, point: Array, sums: Sums, *, pull: Array, prior: Array, free: Mask
+    made: ModelAccelerations, point: Array, sums: Sums, *, pull: Array, prior: Array, free: Mask
 ) -> tuple[Array, bool]:
     """Return the point a step on, inside the bounds, and whether it has arrived there."""
     unit = np.array([p.usual or 1.0 for p in made.parameters])

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.errors import ConfigError
-from tuner.equation_error.driven import OF_MOTORS, Commands, driven
+from tuner.equation_error.command_accelerations import OF_MOTORS, Commands, read_commands
 from tuner.equation_error.estimate import GAINS, Estimate, estimate
 from tuner.equation_error.measured import Measured, measured
 from tuner.findings.findings import Code, Finding
@@ -71,7 +71,9 @@ def _steps(job: Job) -> tuple[tuple[Measured, ...], tuple[Commands, ...]] | None
         return (known, ()) if len(known) == len(parts) else None
     if job.inlets[0] != "actuator":
         return None
-    return driven(job.objective.model, fitted, float(job.objective.schedule.rate_control_rate))
+    return read_commands(
+        job.objective.model, fitted, float(job.objective.schedule.rate_control_rate)
+    )
 
 
 def _candidates(job: Job) -> Groups:

@@ -31,7 +31,7 @@ NUDGE = 1e-2
 
 
 @dataclass(frozen=True)
-class Driven:
+class CommandAccelerations:
     """As `tuner.equation_error.model.Accelerations`, with commands in place of rotor speeds.
 
     Attributes
@@ -85,10 +85,10 @@ class Driven:
     def _flown(self, point: Array) -> tuple[Measured, ...]:
         """Return the steps with the rotor speeds that a point's motors have."""
         model, parts = self._model(point), zip(self.flights, self.commands, strict=True)
-        return tuple(with_rotors(part, followed(model, command)) for part, command in parts)
+        return tuple(with_rotors(part, rotor_response(model, command)) for part, command in parts)
 
 
-def followed(model: Model, command: Series) -> Series:
+def rotor_response(model: Model, command: Series) -> Series:
     """Return the rotor speeds (n, 4) that follow commands on a clock."""
     motor, late = model.vehicle.motor, float(model.vehicle.setup.actuator_latency)
     lags = Lags(float(motor.time_constant_up), float(motor.time_constant_down), late)
@@ -100,7 +100,7 @@ Commands = tuple[Series, ...]
 """Of each flight."""
 
 
-def driven(
+def read_commands(
     model: Model, flights: Sequence[tuple[Flight, float]], rate: float
 ) -> tuple[tuple[Measured, ...], tuple[Commands, Commands]] | None:
     """Return the steps of some flights; their commands, and the same of every second sample.
@@ -120,7 +120,7 @@ def driven(
         tuple(_held(*flight, rate, every) for flight in flights) for every in (1, 2)
     )
     pairs = zip(flights, commands, strict=True)
-    parts = [measured_with(flight, followed(model, c), noise=0.0) for (flight, _), c in pairs]
+    parts = [measured_with(flight, rotor_response(model, c), noise=0.0) for (flight, _), c in pairs]
     known = tuple(
         without_gaps_of(_on_time(*flight), part)
         for flight, part in zip(flights, parts, strict=True)
