@@ -328,10 +328,15 @@ def _gyro_scale(numbers: Numbers) -> str:
 
 def _tachometer_lag(numbers: Numbers) -> str:
     value, error = numbers["tachometer_lag"], numbers["tachometer_lag_error"]
-    by = "behind" if value > 0.0 else "ahead of"
+    late = f"{1e3 * abs(value):.2g} ± {1e3 * error:.1g} ms"
+    if value > 0.0:
+        return (
+            f"Recorded rotor speeds are {late} behind the rotors that turn the vehicle: they look "
+            "filtered."
+        )
     return (
-        f"Recorded rotor speeds are {1e3 * abs(value):.2g} ± {1e3 * error:.1g} ms {by} the rotors "
-        "that turn the vehicle: they look filtered."
+        f"The turning comes {late} later than recorded rotor speeds say: the gyro looks filtered, "
+        "or is stamped late."
     )
 
 
@@ -360,7 +365,7 @@ _SHOWS: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
         "Mount it straight, or calibrate its level (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF).",
     ),
     "gyro_scale": (_gyro_scale, "Calibrate the gyro, or compare it with another."),
-    "tachometer_lag": (_tachometer_lag, "Log them unfiltered, or with the gyro's stamps."),
+    "tachometer_lag": (_tachometer_lag, "Log both unfiltered, by one clock."),
 }
 """Group of terms -> what it says, and what to do."""
 

@@ -265,3 +265,17 @@ def test_numbers_stand_in_the_unit_that_people_use():
     assert "CMA-ES then searched more widely and ended lower" in sentence(
         MADE[Code.STARTS_DISAGREE]
     )
+
+
+@pytest.mark.parametrize(
+    ("lag", "says"),
+    [
+        (0.015, "rotor speeds are 15 ± 0.8 ms behind the rotors that turn the vehicle"),
+        (-0.0025, "turning comes 2.5 ± 0.8 ms later than recorded rotor speeds say: the gyro"),
+    ],
+)
+def test_a_lag_is_of_what_comes_late(lag: float, says: str) -> None:
+    numbers = {"tachometer_lag": lag, "tachometer_lag_error": 8e-4}
+    assert says in sentence(
+        Finding(Code.TERM_SHOWS, "warning", "tachometer_lag", numbers, ("tachometer_lag",))
+    )
