@@ -15,17 +15,10 @@ from tuner.equation_error.model import Accelerations, Linear, values_at
 from tuner.objective.inlets import MISSED, linear_interpolation, zero_order_hold
 from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.recordings.flight import Array, Flight, Series
+from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model, with_coefficients
 
-OF_MOTORS = (
-    "input_scaling",
-    "zero_position_armed",
-    "time_constant_up",
-    "time_constant_down",
-    "actuator_latency",
-)
-"""What moves a rotor's speed."""
 NUDGE = 1e-2
 """Step of a logarithm, or of a number over its usual size, for derivatives."""
 
@@ -37,7 +30,7 @@ class CommandAccelerations:
     Attributes
     ----------
     model, parameters
-        As there; of the parameters those of `OF_MOTORS` move rotor speeds.
+        As there; of the parameters those that `moves_rotors` tells move rotor speeds.
     commands
         Of each flight (n, 4), held from tick to tick of a clock.
     flights
@@ -51,7 +44,7 @@ class CommandAccelerations:
     _moving: tuple[int, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        moving = tuple(n for n, p in enumerate(self.parameters) if p.name in OF_MOTORS)
+        moving = tuple(n for n, p in enumerate(self.parameters) if moves_rotors(p.name))
         object.__setattr__(self, "_moving", moving)
 
     def at(self, point: Array, *, noise: bool = True) -> tuple[Linear, ...]:
@@ -86,6 +79,12 @@ class CommandAccelerations:
         """Return the steps with the rotor speeds that a point's motors have."""
         model, parts = self._model(point), zip(self.flights, self.commands, strict=True)
         return tuple(with_rotors(part, rotor_response(model, command)) for part, command in parts)
+
+
+def moves_rotors(name: str) -> bool:
+    """Return whether a coefficient is of the motors' curve and lags that `rotor_response` has."""
+    row = COEFFICIENTS[name]
+    return row.part == "motors" and not row.is_effect
 
 
 def rotor_response(model: Model, command: Series) -> Series:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.errors import ConfigError
-from tuner.equation_error.command_accelerations import OF_MOTORS, Commands, read_commands
+from tuner.equation_error.command_accelerations import Commands, moves_rotors, read_commands
 from tuner.equation_error.estimate import GAINS, Estimate, estimate
 from tuner.equation_error.measured import Measured, measured
 from tuner.findings.findings import Code, Finding
@@ -86,7 +86,7 @@ def _candidates(job: Job) -> Groups:
 def _begun(job: Job, found: Estimate) -> Job | None:
     """Return the job with its search's coefficients, start and windows; None for no rigid body."""
     settings = job.settings
-    moving = tuple(name for name in found.values if name not in (*OF_INERTIA, *OF_MOTORS))
+    moving = tuple(n for n in found.values if n not in OF_INERTIA and not moves_rotors(n))
     try:
         vehicle = with_values(settings.vehicle, found.values)
     except ConfigError:
