@@ -10,8 +10,9 @@ import pytest
 from benchmarks import fast_flights
 from tuner.config import Options, settle
 from tuner.config.job import Search
+from tuner.equation_error.command_accelerations import read_commands
 from tuner.equation_error.estimate import GAINS
-from tuner.equation_error.measured import measured
+from tuner.equation_error.measured import measured, without_gaps_of
 from tuner.job.accelerations import with_accelerations
 from tuner.recordings.flight import Series
 from tuner.search.inlet_choice import predicts_turning, regressors
@@ -73,6 +74,32 @@ def test_commands_alone_tell_inertia_by_the_lags_that_they_need(racer, rate, tmp
     assert lag + found.values["actuator_latency"] == pytest.approx(fast_flights.MOTOR_LAG, rel=0.2)
     assert finding.numbers["explained_x"] < 0.9
     assert not set(job.space.names) & {*TILTING, "time_constant_up"}
+
+
+def test_commands_that_were_recorded_seldom_leave_more_unknown(racer, tmp_path, monkeypatch):
+    paths = fast_flights.write(*racer, tmp_path, seed=4, rotor_rate=100.0, fed="command")
+    settings = settle(Options([str(path) for path in paths], config=str(tmp_path / "tune.yaml")))
+    job = job_of(settings, read_usable(settings)[0])
+    seldom = with_accelerations(job)[0].accelerations.errors
+
+    def as_if_all(*given):
+        steps, (commands, _) = read_commands(*given)
+        return steps, (commands, commands)
+
+    monkeypatch.setattr("tuner.job.accelerations.read_commands", as_if_all)
+    often = with_accelerations(job)[0].accelerations.errors
+    assert all(seldom[name] > often[name] for name in (*TILTING, "actuator_latency"))
+
+
+def test_steps_in_a_gap_of_the_commands_are_unknown(flown):
+    flight = flown[2][0].flight
+    part, clock = measured(flight), np.arange(0.0, flight.duration, 0.01)
+    kept = clock[(clock < 2.0) | (clock > 2.5)]
+    left = without_gaps_of(Series(kept, np.ones((len(kept), 4))), part)
+    inside = (part.time > 2.0) & (part.time < 2.5)
+    assert part.known[inside].all()
+    assert not left.known[inside].any()
+    assert left.known[part.time < 1.9].all()
 
 
 def test_a_plain_regression_takes_the_answer_for_inertia(flown):
