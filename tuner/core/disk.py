@@ -11,6 +11,7 @@ import glob
 import hashlib
 import os
 import re
+import stat
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -203,9 +204,11 @@ def readable(path: Path) -> Iterator[None]:
     Raises
     ------
     RecordingError
-        The system refused.
+        The system refused, or the path is a device or a pipe, which may never end.
     """
     try:
+        if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
+            raise RecordingError(path, "is neither a file nor a folder", "give a recording")
         yield
     except FileNotFoundError:
         raise RecordingError(path, "no such file", "check the path") from None

@@ -106,15 +106,15 @@ def test_without_a_pose_topics_are_still_listed(short: Path, tmp_path: Path) -> 
 
 def test_one_broken_file_does_not_hide_the_others(tmp_path: Path) -> None:
     (tmp_path / "bad.bag").write_bytes(b"nothing")
-    inspection, errors = inspect_recordings(
-        [tmp_path / "bad.bag", making.CIRCLE, tmp_path / "none"]
+    os.mkfifo(pipe := tmp_path / "pipe.bag")
+    inspections, errors = inspect_recordings(
+        [tmp_path / "bad.bag", making.CIRCLE, tmp_path / "none", pipe]
     )
-    assert [Path(inspect_one_recording.path).name for inspect_one_recording in inspection] == [
-        "circle_3mps.bag"
-    ]
+    assert [Path(inspection.path).name for inspection in inspections] == ["circle_3mps.bag"]
     assert [str(error).split(": ")[1].split(";")[0] for error in errors] == [
         "is of no known format",
         "no such file",
+        "is neither a file nor a folder",
     ]
 
 
