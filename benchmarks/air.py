@@ -46,8 +46,6 @@ def air(
 
     Parameters
     ----------
-    random
-        Where chance comes from.
     shape
         Ticks, and flights.
     rate

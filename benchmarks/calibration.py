@@ -103,10 +103,6 @@ class Ranked:
         Coefficient -> the quoted standard error, of the scaled coordinate.
     oracle
         Coefficient -> what someone would quote who knows the truth and the gusts' law.
-    seconds
-        Of processor time.
-    converged
-        Whether the search says that it did.
     """
 
     off: dict[str, float]

@@ -21,16 +21,8 @@ class Contest:
 
     Attributes
     ----------
-    held_out
-        Names of what was predicted.
-    fitted
-        What was fitted, in words.
-    seconds
-        Of the fit.
     predictions
         Predictor -> its predictions, one a held-out flight.
-    remark
-        A sentence that a reader needs.
     """
 
     held_out: tuple[str, ...]
@@ -47,10 +39,6 @@ def simple(
 
     Parameters
     ----------
-    fitted, held_out
-        Flights.
-    signal
-        What is fed in.
     like
         Predictions whose starts are taken, one a held-out flight.
     """

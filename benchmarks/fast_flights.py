@@ -137,12 +137,8 @@ def write(
     ----------
     racer, flown
         What flew, and all of `paths` as of `fly`.
-    seed
-        Of the noise.
     rotor_rate
         Hz at which rotor speeds are recorded, or commands.
-    fed
-        Which of both.
     """
     random = np.random.default_rng([seed, 2])
     write_text(folder / "topics.yaml", TOPICS.format(fed=fed))

@@ -43,14 +43,8 @@ def remembered(
 
     Parameters
     ----------
-    page
-        What holds the lines so far.
     bars
         What was measured; those that could not be are left out.
-    when
-        Of the measure, UTC.
-    version
-        Of the program that was measured.
     whole
         Whether everything was measured, which begins a line; a part joins the last line where that
         is of the same day and version.

@@ -58,16 +58,10 @@ class Trial:
 
     Attributes
     ----------
-    lab
-        The truth.
-    found
-        Groups of terms in the fit.
     estimates
         Coefficient -> estimate, of those that are free and not held.
     oracle
         Coefficient -> what an oracle would quote, in the estimate's standard errors.
-    seconds
-        Of processor time.
     voltage
         V at which the fit's motors were taken to run, if it has a battery.
     said

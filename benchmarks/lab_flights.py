@@ -75,18 +75,10 @@ class Lab:
 
     Attributes
     ----------
-    vehicle
-        The truth.
-    groups
-        Groups of terms that it has.
     resistance, drain
         Ω of the battery, and V per A s by which it declines.
-    gusts
-        Whether the air moves.
     sees_markers
         Whether its position and attitude controllers see the motion capture's frame.
-    effect
-        What a fit may not know of it.
     """
 
     vehicle: VehicleFile

@@ -36,12 +36,8 @@ def oracle_error(
 
     Parameters
     ----------
-    fitted
-        The fit.
     truth
         (K,) its search vector.
-    gusts, random
-        As of `recorded`.
     log_voltage
         What the voltage (ticks, F) may have been that the fit takes for what it read, by chance;
         None where it knows.

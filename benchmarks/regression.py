@@ -27,8 +27,6 @@ class Regression:
 
     Attributes
     ----------
-    signal
-        The recorded input.
     weights
         (features, 6): m/s² and rad/s², body axes.
     """

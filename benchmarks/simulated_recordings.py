@@ -33,8 +33,6 @@ class Flown:
 
     Attributes
     ----------
-    objective
-        The problem with what was recorded of them.
     setpoints
         What asked for their body rates (3, samples, F) and thrust.
     """
@@ -75,10 +73,6 @@ def recorded(
         Whole flights: their plan, stamps and noise.
     vector
         (K,) search vector of the truth.
-    random
-        Where noise and gusts come from.
-    gusts
-        Whether the air pushes them.
     log_voltage
         (ticks, F) logarithm of the battery's voltage in V, where it is not as the problem has it.
 

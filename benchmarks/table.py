@@ -11,21 +11,7 @@ from benchmarks.timing import Spread
 
 @dataclass(frozen=True)
 class Bar:
-    """What is asked for.
-
-    Attributes
-    ----------
-    what
-        In words.
-    measured
-        None where it could not be measured here.
-    limit
-        The number to meet.
-    sense
-        Whether more or less is better.
-    unit
-        After the numbers.
-    """
+    """What is asked for."""
 
     what: str
     measured: float | None

@@ -42,8 +42,6 @@ class Contestant:
 
     Attributes
     ----------
-    name
-        For the table.
     command
         Prints ``ready AMOUNT REMARK`` when it has warmed up; then, for every line that it reads,
         the seconds of one run.

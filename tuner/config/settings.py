@@ -37,8 +37,6 @@ class Settings:
         The recordings, those held out too; their stems are distinct.
     vehicle
         Where the fit starts, the weighed mass in it.
-    controller
-        What flew.
     job
         The job file with the command line's choices in it; ``holdout`` names given flights only.
     job_path

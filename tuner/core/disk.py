@@ -271,8 +271,6 @@ def folder_for(out: Path | None, *, resume: bool = False) -> Path:
 
     Parameters
     ----------
-    out
-        What the user named.
     resume
         Whether a search that was interrupted there is gone on with.
 

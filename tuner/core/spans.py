@@ -152,8 +152,6 @@ class Row:
 
     Attributes
     ----------
-    stage
-        Its name.
     seconds
         From its begins to its ends.
     processor

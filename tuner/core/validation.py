@@ -22,10 +22,6 @@ def config_error(
 
     Parameters
     ----------
-    error
-        From validating what a file holds.
-    path
-        The file.
     lines
         Place of a value in the file -> its line, where lines are known.
     """

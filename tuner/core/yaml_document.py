@@ -25,8 +25,6 @@ class Document:
 
     Attributes
     ----------
-    path
-        The file.
     data
         Plain dicts, lists, strings, numbers, booleans and None.
     lines

@@ -112,10 +112,6 @@ def section_of(options: type, *, leaving: Collection[str] = (), text: Any = str)
 
     Parameters
     ----------
-    options
-        The dataclass.
-    leaving
-        Fields that are not the model's.
     text
         What stands for ``str``, as a shorter text.
     """

@@ -64,10 +64,6 @@ def signals_to_add(
     ----------
     fitted, known
         A fit, and the information (K, K) about its coefficients, priors included.
-    inlets
-        Where its flights enter.
-    vehicle
-        Whose rotors would be measured.
     """
     objective = fitted.objective
     silent = set.intersection(*(set(INLETS[inlet].silences) for inlet in inlets))
@@ -137,12 +133,8 @@ def what_to_log(
 
     Parameters
     ----------
-    job, fitted
-        The flights and their fit.
     known
         (K, K) information about the fitted coefficients, priors included.
-    vehicle
-        With the fitted coefficients.
     """
     found = signals_to_add(fitted, known, job.inlets, vehicle)
     for otherwise in (_faster, _fed):

@@ -127,10 +127,6 @@ def candidate_problem(
     ----------
     objective
         The problem of the recorded flights, which are whole.
-    flights
-        The candidates.
-    seconds
-        How long each lasts.
     spin_channels
         Channels that a yaw spin is compared by.
     """
@@ -255,14 +251,8 @@ def rank_next_flights(
 
     Parameters
     ----------
-    examination
-        Of the recorded flights.
     criterion
         Whose weights the recorded residuals have.
-    arena
-        Where the next flight must fit.
-    seconds
-        How long it would last.
     spin_channels
         Channels that a yaw spin is compared by.
     """

@@ -83,8 +83,6 @@ def run_task(content: bytes, identity: str, topic: str) -> Any:
     ----------
     content
         Function and argument, pickled.
-    identity, topic
-        Of the task and its reports.
 
     Raises
     ------
@@ -168,17 +166,7 @@ R = TypeVar("R")
 
 
 class OnDask(Engine):
-    """Computes tasks in the workers of a Dask cluster.
-
-    Parameters
-    ----------
-    client
-        Connected.
-    at_once
-        Workers that there are or will be.
-    store
-        Through which shared values travel.
-    """
+    """Computes tasks in the workers of a Dask cluster."""
 
     def __init__(self, client: Client, at_once: int, store: ContentStore) -> None:
         self.at_once = self.ahead = at_once

@@ -75,8 +75,6 @@ class Engine(ABC):
 
         Parameters
         ----------
-        function, tasks
-            As of `submit`.
         on_report
             Called with the number of a task and its report.
         """
@@ -91,13 +89,7 @@ class Engine(ABC):
             raise
 
     def stream(self, function: Task[T, R], tasks: Iterable[T]) -> Iterator[R]:
-        """Yield the results of tasks in their order, no more of them at a time than needed.
-
-        Parameters
-        ----------
-        function, tasks
-            As of `submit`.
-        """
+        """Yield the results of tasks in their order, no more of them at a time than needed."""
         waiting: deque[Future[R]] = deque()
         try:
             for task in tasks:

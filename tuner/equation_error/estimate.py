@@ -49,8 +49,6 @@ class Estimate:
         which they predict best.
     errors
         Coefficient -> standard error of its scaled coordinate, of the physical ones.
-    rows
-        The table of the terms.
     explained
         (6,) share of the recorded specific force and angular acceleration, axis by axis, that the
         physical values explain; below zero where they make it worse.
@@ -88,8 +86,6 @@ def estimate(
         Free coefficients, those of candidates and `GAINS` among them, at neutral values.
     candidates
         Groups that are added if flights left out are predicted better with them.
-    flights
-        What was recorded.
     commands
         Where rotors follow these: all, and every second, which tells what is not known of the time
         between two.

@@ -81,8 +81,6 @@ class Accelerations:
         Holds the coefficients that do not move.
     parameters
         The K that do.
-    flights
-        Their steps.
     """
 
     model: Model

@@ -96,8 +96,6 @@ class Regression:
     ----------
     point
         (K,) scaled coordinates.
-    sums
-        About that point.
     prior, pull
         (K,) information and slope of the priors there.
     covariance
@@ -124,8 +122,6 @@ def regress(
 
     Parameters
     ----------
-    made
-        What the model makes of the recordings.
     begin
         (K,) scaled coordinates from which it begins.
     free
@@ -210,10 +206,6 @@ def sums_of(
 
     Parameters
     ----------
-    linear, flights
-        Of each flight.
-    kernels
-        Of each flight.
     noisy
         Whether the noise of rotor speeds is taken off.
     """

@@ -77,8 +77,6 @@ class Comparison:
     recordings
         At least one. Their clock offsets are taken as known (`with_offsets` of
         `tuner.search.job_flights`); one that a fit would estimate counts as zero.
-    controller
-        What flew.
     window
         s, length of the windows of flights that are not simulated in a closed loop; None takes
         that of their inlet.
@@ -126,8 +124,6 @@ class Comparison:
 
         Parameters
         ----------
-        vehicle
-            What flies.
         flier
             What flies segments: another simulator than this project's.
 

@@ -70,8 +70,6 @@ def acting(
 
     Parameters
     ----------
-    vehicle
-        What flew.
     motion
         (F, n, 9) logged position, velocity (world) and body rate.
     attitude
@@ -136,8 +134,6 @@ def forces_of(vehicle: Vehicle, time: Array, signals: Mapping[str, Array]) -> Fo
 
     Parameters
     ----------
-    vehicle
-        What flew.
     time, signals
         Of a `tuner.evaluate.simulate.Simulation`.
     """

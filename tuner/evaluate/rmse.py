@@ -51,8 +51,6 @@ class FlightErrors:
 
     Attributes
     ----------
-    name
-        Of the flight.
     position
         In m.
     attitude

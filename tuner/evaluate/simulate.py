@@ -71,8 +71,6 @@ def fly(
     ----------
     asked
         What flies, for how long and along what; all but the engine, which is the one in force.
-    grid, forces
-        As of `simulate`.
 
     Raises
     ------
@@ -199,10 +197,6 @@ def simulate(
 
     Parameters
     ----------
-    vehicle, controller
-        What flies.
-    trajectory
-        What is flown.
     duration
         s.
     rate

@@ -312,8 +312,6 @@ class Summary:
 
     Attributes
     ----------
-    coefficients
-        What was varied.
     crash_time
         s; None for a flight that did not crash.
     top_speed
@@ -337,8 +335,6 @@ def write_flights(
     ----------
     simulations
         The flights, with their forces where ``forces`` is given.
-    path
-        Where they go.
     forces
         A ``.csv`` for what acted along them, term by term (`tuner.evaluate.forces`).
 

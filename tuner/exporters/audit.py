@@ -79,8 +79,6 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
 
     Parameters
     ----------
-    path
-        The model.
     params
         PX4's parameters that fly it.
     run

@@ -162,8 +162,6 @@ def write_draws(
         The draws, and the vehicle that they are draws of.
     folder, target
         Where the files lie, and their format.
-    provenance
-        One line.
 
     Returns
     -------

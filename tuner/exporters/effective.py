@@ -187,15 +187,6 @@ def fitted_in(
 
     What was known of its coefficients beforehand is about the vehicle, not about a simulator that
     lacks terms: each is held weakly at its start.
-
-    Parameters
-    ----------
-    run, simulator, recorded
-        As of `effective_in`.
-    lost
-        Coefficients that the simulator lacks.
-    on_progress
-        Called after every iteration.
     """
     settings, recordings = recorded
     begins = run.vehicle if simulator.start is None else simulator.start(run.vehicle)
@@ -321,8 +312,6 @@ def refly(
     ----------
     run
         Gives the recordings, the controller that flew, and each flight's clock offset.
-    vehicle
-        What flies now.
     flier
         Flies it in another simulator, as of `tuner.exporters.flier.flier`.
 

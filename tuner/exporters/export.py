@@ -49,8 +49,6 @@ class Exported:
 
     Attributes
     ----------
-    path
-        The file.
     gates
         The conditions that were checked; those not met were accepted.
     notes
@@ -80,10 +78,6 @@ def export(
     asked
         The format, and where to write. A reason to export in spite of gates that are not met goes
         into the provenance.
-    today
-        For the provenance.
-    refly
-        Flies the run's flights with a vehicle.
     copies
         Folder for a copy of the model, which then stays as it is.
 
@@ -264,12 +258,8 @@ def exports_of_job(
 
     Parameters
     ----------
-    folder
-        A finished result folder.
     wanted
         Formats, and the model for ``sdf``, which stays as it is.
-    today, refly
-        As of `export`.
 
     Yields
     ------

@@ -387,8 +387,6 @@ def _entries(title: str, *groups: tuple[str, ...], **keys: str) -> Callable[...,
 
     Parameters
     ----------
-    title
-        Of the simulator.
     groups, keys
         Coefficients under their own names, beside body and motors, and coefficient -> key.
     """

@@ -31,8 +31,6 @@ class Draft:
 
     Attributes
     ----------
-    text
-        All of it.
     vehicle
         The vehicle as whoever reads the file will fly it.
     notes
@@ -95,8 +93,6 @@ def write(draft: Draft, path: Path, others: Mapping[Path, Path] | None = None) -
 
     Parameters
     ----------
-    draft
-        What to write.
     path
         Where to; it appears whole.
     others
@@ -152,8 +148,6 @@ class Target:
     ----------
     name
         As `Coefficient.exported_as` has it.
-    suffix
-        Of its files.
     draft
         Vehicle, provenance in one line, simulator, and the model to patch, or None for a file of
         its own -> the file before it is written, which knows how it is read back.

@@ -37,8 +37,6 @@ class Conflict:
 
     Attributes
     ----------
-    experiment
-        Its name.
     names
         The coefficients that its number depends on.
     measured, expected
@@ -104,8 +102,6 @@ def combine(measurements: Sequence[Measurement], known: Mapping[str, float]) -> 
 
     Parameters
     ----------
-    measurements
-        At least one.
     known
         Coefficient -> scaled coordinate in the vehicle file.
     """

@@ -51,8 +51,6 @@ def bifilar(
 
     Parameters
     ----------
-    name, path
-        Of the experiment and its recording.
     samples
         ``time`` s and ``angle`` rad.
     axis

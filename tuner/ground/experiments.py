@@ -65,10 +65,6 @@ def measure(  # noqa: PLR0911 (one return a kind)
 
     Parameters
     ----------
-    name
-        For people.
-    experiment
-        Of ``bench.yaml``.
     vehicle
         Its mass, rotors and, where a spin's fast pair was not measured, its motor constant.
     folder

@@ -67,12 +67,6 @@ def hover_weights(
 
     Parameters
     ----------
-    name
-        Of the experiment.
-    points
-        Each a hover.
-    rotors
-        How many carry the weight.
     mass_error, rotor_speed_error
         Standard errors of one point, kg and rad/s; where three and more points scatter by more,
         their scatter counts.
@@ -114,8 +108,6 @@ def yaw_spin(
 
     Parameters
     ----------
-    name
-        Of the experiment.
     points
         Yaw rate rad/s, speed of the slow pair rad/s, and of the fast pair or None.
     mass, radius

@@ -64,14 +64,10 @@ class Curve:
 
         Parameters
         ----------
-        titles
-            Of the panel, of x and of y.
         samples, fit
             x and y: (n,) samples, NaN where unknown, and (m,) of the fitted law.
         used
             (n,) as of the attribute; None for all.
-        law
-            As of the attribute.
         """
         x, measured = samples
         known = np.flatnonzero(np.isfinite(x) & np.isfinite(measured))
@@ -115,10 +111,6 @@ class Measurement:
         (K,) measured.
     covariance
         (K, K) of ``value``.
-    remarks
-        What the checks of the data noticed.
-    curves
-        The picture.
     """
 
     experiment: str

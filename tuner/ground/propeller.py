@@ -74,8 +74,6 @@ def propeller(name: str, table: Array, *, diameter: float, air_density: float) -
 
     Parameters
     ----------
-    name
-        Of the experiment.
     table
         One row a speed; the median counts.
     diameter, air_density

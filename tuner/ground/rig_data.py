@@ -311,8 +311,6 @@ class SteadyFlight:
         (4,) rad/s in PX4's motor order.
     yaw_rate
         rad/s; NaN where it was not recorded.
-    curve
-        Shows which samples were used.
     """
 
     rotor_speed: Array
@@ -386,8 +384,6 @@ def angle_of_attitude(path: str, quaternion: Array, axis: str) -> Array:
 
     Parameters
     ----------
-    path
-        Of the recording.
     quaternion
         (n, 4) w, x, y, z: body to world, world z up; rows that are not finite give NaN.
     axis

@@ -53,14 +53,10 @@ def stand(
 
     Parameters
     ----------
-    name, path
-        Of the experiment and its recording.
     samples
         ``time`` s, ``rotor_speed`` rad/s, ``force`` N.
     row
         What k is: `THRUST` or `TORQUE`.
-    rotors
-        How many turned.
     lever, lever_error
         Thrust over the force that the sensor reads, or torque over it in m, and the relative
         standard error.
@@ -178,8 +174,6 @@ def rpm_curve(
 
     Parameters
     ----------
-    name, path
-        Of the experiment and its recording.
     samples
         ``time`` s, ``command`` 0..1, ``rotor_speed`` rad/s, and ``voltage`` V if it was recorded.
     reference_voltage

@@ -48,8 +48,6 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
 
     Parameters
     ----------
-    name, path
-        Of the experiment and its recording.
     samples
         ``time`` s, ``command`` 0..1, ``rotor_speed`` rad/s.
 

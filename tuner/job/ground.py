@@ -63,8 +63,6 @@ class BenchResult:
         The content of ``result.json``.
     measurements
         Of each experiment, in the order of ``bench.yaml``.
-    combination
-        What they say together.
     """
 
     folder: Path
@@ -78,12 +76,8 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
 
     Parameters
     ----------
-    path
-        ``bench.yaml``.
     out
         Result folder; None makes one under ``runs/`` named by the time.
-    command
-        What the user typed, for the record.
 
     Raises
     ------
@@ -131,8 +125,6 @@ def written(
 
     Parameters
     ----------
-    folder
-        Is made.
     given, vehicle
         As the user has it, and with the measured coefficients.
     measurements, combination, findings

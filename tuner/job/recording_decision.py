@@ -20,8 +20,6 @@ def decide(path: Path, settings: Settings) -> Verdict:
     ----------
     path
         The recording, the only one of the settings.
-    settings
-        Of the job.
     """
     settings, logged = as_logged(settings)
     gains = tuple(g for f in logged if f.code is Code.LOGGED_GAINS for g in f.names)

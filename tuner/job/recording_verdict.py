@@ -21,8 +21,6 @@ class Verdict:
 
     Attributes
     ----------
-    path
-        The recording.
     fits
         Whether something can be fitted to it.
     inlets
@@ -57,13 +55,6 @@ def verdict_of(
     vehicle: str | None = None,
 ) -> Verdict:
     """Return what `tune` would do with a recording, by the job file beside it.
-
-    Parameters
-    ----------
-    inspection
-        What it holds.
-    topics, namespace, vehicle
-        As of the command line.
 
     Raises
     ------

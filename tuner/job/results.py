@@ -378,8 +378,6 @@ def write_next_flight(
 
     Parameters
     ----------
-    folder
-        The result folder.
     job, examination, fitted
         The recorded flights, what they identify, and the fit.
     arena

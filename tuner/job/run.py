@@ -82,16 +82,10 @@ def run(
 
     Parameters
     ----------
-    options
-        What the user asked for.
     out
         Result folder; None makes one under ``runs/`` named by the time.
     resume
         Go on from the folder's checkpoint.
-    listener
-        Whom to report to.
-    command
-        What the user typed, for the record.
 
     Returns
     -------

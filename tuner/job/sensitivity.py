@@ -130,10 +130,6 @@ def examine_vehicle(
         held-out flights are examined like the others.
     arena
         m along x, y and up; None takes what the recorded flights took, and some more.
-    command
-        What the user typed, for the record.
-    on_message
-        Called with a line on what is being done.
 
     Raises
     ------

@@ -51,10 +51,6 @@ def fit_without_pose(
         Findings of those that already were.
     out
         Result folder; None makes one under ``runs/`` named by the time.
-    listener
-        Whom to report to.
-    command
-        What the user typed, for the record.
 
     Raises
     ------

@@ -104,12 +104,8 @@ def recalled(kind: type[T], path: Path, find: Callable[[], T]) -> T:
 
     Parameters
     ----------
-    kind
-        The dataclass.
     path
         The file; one that is damaged holds nothing.
-    find
-        What takes long.
     """
     if (content := load(path)) is not None:
         with contextlib.suppress(ValidationError):

@@ -62,8 +62,6 @@ def message_times(
 
     Parameters
     ----------
-    samples
-        Topic -> messages.
     receive_only
         Topics whose stamps are not to be used.
     unhurried
@@ -284,8 +282,6 @@ def align_pose(
 
     Parameters
     ----------
-    series
-        Signals in seconds.
     topics
         Signal -> topic; what shares the attitude's topic is moved with it.
     """

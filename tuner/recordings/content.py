@@ -70,13 +70,9 @@ class ReadOptions:
 
     Attributes
     ----------
-    path
-        The recording.
     given
         The topic map that the user or, failing that, the side-car names; None takes the shipped map
         that finds most signals.
-    sidecar
-        What the file beside it states.
     namespace
         Prefix of the recorded topics that the map does not have, as ``uav1``.
     rate
@@ -101,8 +97,6 @@ class ReadOptions:
 
         Parameters
         ----------
-        path, namespace, rate
-            As of the attributes.
         topics
             Topic map, its file, or the name of a shipped one; None takes the side-car's, if any.
 
@@ -125,10 +119,6 @@ class Signals:
 
     Attributes
     ----------
-    recording
-        The file.
-    topic_map
-        The map that was used.
     places
         Signal -> where it was found.
     samples
@@ -137,8 +127,6 @@ class Signals:
         Signal -> topic.
     series
         Signal -> cleaned samples, in seconds since the first pose, or the first sample without one.
-    notes
-        What was dropped, repaired or doubted.
     damage
         What the file has lost, with times as those of ``series``.
     no_pose
@@ -165,11 +153,6 @@ class Content(Signals):
 
 def read_signals(options: ReadOptions) -> Signals:
     """Read and clean all signals that a topic map finds in a recording.
-
-    Parameters
-    ----------
-    options
-        Which recording, and how it is to be read.
 
     Raises
     ------
@@ -256,13 +239,6 @@ def read_content(options: ReadOptions) -> Content:
 
 def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     """Return the signals of a recording on one clock and in one frame, and its missions.
-
-    Parameters
-    ----------
-    signals
-        Of the recording.
-    sidecar
-        What the file beside it states.
 
     Raises
     ------
@@ -356,8 +332,6 @@ class Raw:
 
     Attributes
     ----------
-    topic
-        Where it comes from.
     time
         (n,) ns; in the order of the file, with its defects.
     values

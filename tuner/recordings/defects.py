@@ -68,8 +68,6 @@ def clean(
     ----------
     signal
         Name in `SIGNALS`; decides which tests apply.
-    topic
-        Named in the notes.
     time
         (n,) seconds, any order.
     values
@@ -246,8 +244,6 @@ def outliers(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
         (n,) s, strictly increasing.
     values
         (n,) one column.
-    limits
-        What the signal may do by itself.
     """
     if len(values) < 7:
         return np.zeros(len(values), dtype=bool)

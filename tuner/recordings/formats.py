@@ -27,8 +27,6 @@ class Head:
 
     Attributes
     ----------
-    path
-        The file or folder.
     start
         The first 4096 bytes; none of a folder.
     """
@@ -177,10 +175,6 @@ class Layout:
 
     Attributes
     ----------
-    encoding
-        A codec's name.
-    separator
-        Between two cells.
     decimal_comma
         Whether numbers are written as ``1,5``.
     columns

@@ -235,8 +235,6 @@ def contradiction(series: Mapping[str, Series], missions: Sequence[Mission]) -> 
     ----------
     series
         Signal -> its samples, in the frames that `frames` finds best.
-    missions
-        What was flown.
     """
     longest = max(missions, key=lambda m: m.end - m.start, default=None)
     if longest is None or longest.end - longest.start < SHORTEST_MISSION:

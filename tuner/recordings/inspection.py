@@ -36,8 +36,6 @@ class TopicReport:
 
     Attributes
     ----------
-    name, type, count
-        As recorded.
     rate
         Hz, the median; None where the topic was not read.
     longest_gap
@@ -46,8 +44,6 @@ class TopicReport:
         s, the standard deviation of the stamps' steps about a steady rate.
     delay
         s, the median by which messages were recorded after their stamps.
-    signals
-        What is taken from it.
     """
 
     name: str
@@ -66,12 +62,6 @@ class SignalReport:
 
     Attributes
     ----------
-    name, topic
-        Where it comes from.
-    unit
-        Of its values.
-    samples
-        How many are left.
     rate
         Hz, the median.
     columns
@@ -94,8 +84,6 @@ class MissionReport:
     ----------
     start, duration
         s, the start since the first pose.
-    begins_with
-        What marks its start.
     laps
         Completed laps, None where none are recorded.
     mean_speed, top_speed
@@ -112,8 +100,6 @@ class MissionReport:
         m, lowest and highest.
     known
         Part of the ticks with a pose.
-    fitted
-        Whether `tune` fits it.
     """
 
     start: float
@@ -168,19 +154,13 @@ class Inspection:
         UTC, ISO 8601; None where the clock counts from a start-up.
     duration
         s between the first and the last message that was read.
-    topic_map
-        The map that fits best.
     problem
         Why no flight can be read from it, in one line; None if one can.
-    topics, signals, missions, inlets, coefficients
-        See there.
     clock
         Seconds: ``spread`` of the reference's stamps on their ticks, ``drift`` of its clock (s/s),
         ``pose_offset`` of the pose against the gyro; what is unknown is left out.
     battery
         V at the start and at the end, None where it was not recorded.
-    notes
-        What was dropped, repaired or doubted.
     damage
         What the file has lost, with times in s since the first pose.
     """
@@ -214,10 +194,6 @@ def inspect_recordings(
 
     Parameters
     ----------
-    paths
-        The recordings.
-    topics, namespace
-        As of `tuner.recordings.load_flight`.
     cache
         Keep what was found in the user's cache, and take it from there.
 
@@ -262,8 +238,6 @@ def as_json(
 
     Parameters
     ----------
-    inspections, errors
-        As of `inspect_recordings`.
     verdicts
         Path -> what `tune` would do with the recording, if that was asked.
     """
@@ -287,8 +261,6 @@ def render(
 
     Parameters
     ----------
-    inspections
-        Of them.
     verdicts
         Path -> lines that say first whether and how it can be fitted.
     """

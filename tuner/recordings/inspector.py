@@ -74,8 +74,6 @@ def examine(
 
     Parameters
     ----------
-    path, topics, namespace
-        As of `tuner.recordings.inspect_recordings`.
     keep
         Whether its flights are kept in the user's cache, for a fit.
 
@@ -316,8 +314,6 @@ def informed(
         Signal -> cleaned samples.
     measured
         Signal -> columns that were measured.
-    missions
-        What was flown.
     """
     if not missions:
         return ()

@@ -277,14 +277,10 @@ class InertialFlight:
 
     Attributes
     ----------
-    name, path
-        Where it comes from.
     series
         `NEEDS`, and the battery's voltage where it was recorded; in s since the first sample.
     flying
         Stretches, in s, in which the motors turn faster than idle.
-    notes
-        What was dropped, repaired or doubted.
     """
 
     name: str
@@ -313,8 +309,6 @@ def obstacle(signals: Signals, flown: tuple[tuple[float, float], ...]) -> Record
 
     Parameters
     ----------
-    signals
-        Of the recording.
     flown
         The stretches in which its motors turn.
     """

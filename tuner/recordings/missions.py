@@ -63,8 +63,6 @@ class Mission:
     ----------
     start, end
         Seconds in the time of the series.
-    begins_with
-        What marks its start, for the report.
     fitted
         Whether it is fitted: of a long recording only the manoeuvres that show most are.
     """
@@ -274,8 +272,6 @@ def manoeuvres(series: Mapping[str, Series], missions: Sequence[Mission]) -> tup
 
     Parameters
     ----------
-    series
-        Signals; position among them.
     missions
         In the order of flight.
     """

@@ -195,8 +195,6 @@ class Note:
 
     Attributes
     ----------
-    code
-        What it is.
     kind
         ``info`` for what was done, ``warning`` for what a user should look at.
     topic
@@ -244,8 +242,6 @@ class Damage:
 
     Attributes
     ----------
-    cause
-        How it is broken.
     subject
         The topic or file concerned; empty for the whole recording.
     salvaged

@@ -133,12 +133,8 @@ class Recording(ABC):
 
     Attributes
     ----------
-    path
-        Where the recording lies.
     format
         The `Reader.format` by which it was opened.
-    topics
-        Every topic in the file.
     parameters
         Of the flight controller, where its log holds them: name -> value.
     units
@@ -187,12 +183,8 @@ class TabularRecording(Recording):
 
     Parameters
     ----------
-    path
-        The file.
     format_name
         The `Reader.format`.
-    columns
-        Their names.
     """
 
     def __init__(self, path: Path, format_name: str, columns: Sequence[str]) -> None:

@@ -111,8 +111,6 @@ def guess(name: str, written: str | None = None) -> Guess | None:
 
     Parameters
     ----------
-    name
-        As it stands in the table.
     written
         What a row of units says of it.
     """
@@ -220,8 +218,6 @@ def recognised(
 
     Parameters
     ----------
-    columns
-        Their names.
     units
         Column -> unit, of a row of units.
     """
@@ -297,10 +293,6 @@ def locate(
 
     Parameters
     ----------
-    recording
-        An open recording.
-    topics
-        The map.
     strict
         Whether a user wrote the map, so that a topic without the fields named is an error;
         otherwise such a topic is passed over with a note.
@@ -462,8 +454,6 @@ def pose_error(
 
     Parameters
     ----------
-    recording, topics, places
-        As of `locate`.
     given
         Whether a user wrote the map.
     """

@@ -192,8 +192,6 @@ def read_times(
 
     Parameters
     ----------
-    path
-        The table, for errors.
     column
         As it stands in the table: whole numbers, floats, time stamps or text.
     clock

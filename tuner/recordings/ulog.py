@@ -326,8 +326,6 @@ class Wanted:
         Its name, and others that serve as well.
     rate
         Hz that are enough.
-    shows
-        What it shows.
     profiles
         Bits of ``SDLOG_PROFILE`` of which each logs it at full rate.
     """
@@ -374,12 +372,8 @@ class Advice:
 
     Attributes
     ----------
-    message
-        Its name.
     logged, wanted
         Hz; 0 of one that is not there.
-    shows
-        What it would show.
     """
 
     message: str
@@ -406,15 +400,7 @@ def advice_of(rates: Mapping[str, float]) -> tuple[Advice, ...]:
 
 
 def settings_in_words(advice: tuple[Advice, ...], parameters: Mapping[str, float]) -> str:
-    """Return which logger settings would log what is advised; empty if nothing is.
-
-    Parameters
-    ----------
-    advice
-        Of `advice_of`.
-    parameters
-        Of the log.
-    """
+    """Return which logger settings would log what is advised; empty if nothing is."""
     if not advice:
         return ""
     profile = round(parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))

@@ -267,8 +267,6 @@ def scale_of(lengths: Stamped, attitude: Stamped, *, speeds: bool = False) -> Sc
 
     Parameters
     ----------
-    lengths, attitude
-        As of `scales_of`.
     speeds
         Whether the lengths are speeds.
     """
@@ -401,8 +399,6 @@ def unit_by_range(signal: str, values: Array, assumed: str) -> str:
         Name in `SIGNALS`.
     values
         (n, k) as recorded; NaN where not measured.
-    assumed
-        What is usual.
     """
     rule = _RULES.get(signal)
     known = values[np.isfinite(values).all(axis=1)] if signal != "command" else values
@@ -452,8 +448,6 @@ def unit_of_angles(path: object, attitude: Stamped, position: Stamped | None, *,
 
     Parameters
     ----------
-    path
-        The recording, for errors.
     attitude
         (n, 3) as recorded.
     position

@@ -75,8 +75,6 @@ class Heat:
         With how many decimals each value is written into its cell; None writes nothing.
     diverging
         Whether zero lies in the middle: then the colours go from −1 to 1.
-    bar
-        Title of the colour bar.
     ticks
         Colour-bar position -> label, for logarithms.
     """

@@ -33,24 +33,10 @@ class Contents:
 
     Attributes
     ----------
-    folder
-        Where everything lies.
     about
         What it was made of: of a run, too.
-    run
-        The fit.
-    knowledge
-        What is known about each coefficient.
-    proposals
-        What to fly next.
     global_sensitivity, profiles
         Indices between the bounds, and profiles of the likelihood.
-    bench
-        Ground measurements.
-    search, laps
-        How the fit went, and how closely laps are met.
-    exports
-        What was exported into the folder, or refused.
     traces
         Flight -> name -> array, see `write_traces`.
     """

@@ -74,8 +74,6 @@ class FlightOutcome:
 
     Attributes
     ----------
-    name, held_out
-        Which flight.
     position, attitude
         RMSE before, after, and that of the measurement noise alone: distance in m, the three angles
         together in degrees; None for a crash or what is not simulated.
@@ -96,8 +94,6 @@ class Outcome:
 
     Attributes
     ----------
-    usability
-        Whether it can be used.
     what
         What was fitted to what, as a sentence.
     uses, reasons

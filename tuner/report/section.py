@@ -14,8 +14,6 @@ class Cell:
 
     Attributes
     ----------
-    text
-        What it says.
     small
         Quieter, below it.
     look
@@ -60,18 +58,8 @@ class Section:
     ----------
     key
         Its anchor.
-    title
-        Heading.
-    sentences
-        Said first.
-    points
-        A list below them.
     tables, charts
         Below those; charts that name a fold of theirs are folded under it.
-    note
-        How to read it.
-    folded
-        Whether it is opened only by who wants it.
     """
 
     key: str

@@ -184,8 +184,6 @@ def serve(
 
     Parameters
     ----------
-    settings
-        See there.
     host, port
         To listen to; port 0 takes a free one.
     say

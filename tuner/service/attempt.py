@@ -78,13 +78,9 @@ def attempt(
     ----------
     folder, claim, store
         Of the job, and where its recordings are and its result goes.
-    limits, cores
-        For the process.
     report
         Called with events and the job's progress, at least every `BEAT`; returns whether the
         attempt still holds its job.
-    is_unwanted
-        Returns whether the server is ending.
 
     Raises
     ------

@@ -130,12 +130,6 @@ class Dispatcher:
 
     Parameters
     ----------
-    settings
-        Of the server.
-    queue
-        The job table.
-    store
-        Recordings and results.
     engine
         What machines of a cluster do the work; None for processes of this machine.
     """

@@ -62,10 +62,6 @@ def zipped(store: ContentStore, files: Sequence[FileRow], folder: str) -> Iterat
 
     Parameters
     ----------
-    store
-        With the files.
-    files
-        Of a job.
     folder
         What the archive unpacks to: a plain name.
     """

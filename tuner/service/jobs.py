@@ -45,10 +45,6 @@ def submit(
 
     Parameters
     ----------
-    database
-        With the tables.
-    request
-        What a user sent.
     limits
         On recordings of one job and on unfinished jobs.
     submission
@@ -173,14 +169,10 @@ def page(
 
     Parameters
     ----------
-    database
-        With the tables.
     vehicle, state
         Which jobs; None takes all.
     after
         Id of the last job of the page before.
-    limit
-        Jobs of a page.
 
     Raises
     ------

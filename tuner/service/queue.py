@@ -29,14 +29,10 @@ class Claim:
 
     Attributes
     ----------
-    number, id
-        Of the job.
     word
         What the table names the attempt by.
     deaths
         Earlier attempts whose process died.
-    request
-        What is to be fitted.
     flights
         Name of each recording in the job -> its digest.
     checkpoint
@@ -61,10 +57,6 @@ class Outcome:
 
     Attributes
     ----------
-    state
-        That the job goes into.
-    error, exit_status
-        For the user, see `JobRow`.
     files, points
         Rows of a result, without their job.
     """
@@ -81,8 +73,6 @@ class Queue:
 
     Parameters
     ----------
-    database
-        With the table.
     owner
         A name that the server keeps when it is started again.
     lease

@@ -130,8 +130,6 @@ def checked(
 
     Parameters
     ----------
-    request
-        What a user sent.
     flights
         The files' names of its recordings, fit to be names here.
     earlier

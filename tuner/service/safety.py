@@ -59,10 +59,6 @@ class Guard:
 
     Parameters
     ----------
-    app
-        What answers.
-    service, metrics
-        Of the server.
     refuse
         Makes the answer to a request that is refused.
     """
@@ -182,15 +178,7 @@ def _add_headers(headers: MutableHeaders) -> None:
 
 
 class RateLimit:
-    """A bucket for each visitor.
-
-    Parameters
-    ----------
-    per_second
-        At which a bucket refills.
-    burst
-        That it holds.
-    """
+    """A bucket for each visitor."""
 
     def __init__(self, per_second: float, burst: float) -> None:
         self._per_second = per_second

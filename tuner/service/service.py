@@ -32,8 +32,6 @@ class Service:
 
     Attributes
     ----------
-    settings, database, store, dispatcher
-        See there.
     stopping
         Set once the server ends, so that answers which last for long end too.
     """
@@ -51,8 +49,6 @@ class Service:
 
         Parameters
         ----------
-        settings
-            See there.
         engine
             A cluster that does the work; None for this machine.
 

@@ -82,8 +82,6 @@ class ServiceSettings:
         Whether a visitor must show a token.
     hosts
         Names under which visitors may address the server; none means any.
-    limits
-        See there.
     """
 
     data: Path

@@ -34,8 +34,6 @@ class Upload:
         Where it lies, until it is moved away.
     name
         What its sender calls it, without folders.
-    sha256, size
-        Of what it holds.
     """
 
     path: Path
@@ -126,14 +124,8 @@ async def receive(
 
     Parameters
     ----------
-    stream
-        The body of the request.
-    content_type
-        Its header.
     folder
         For files that are not complete; nothing is left there if anything fails.
-    limits
-        On the file's size.
 
     Raises
     ------

@@ -75,8 +75,6 @@ class Uncertainty:
         Coefficient -> estimate, tied ones each.
     names
         The K parameters, in the order of every array: for a tie, the first of the group.
-    covariance
-        See `Covariance`.
     reference
         (K,) change of the scaled coordinate that counts as one hundred percent: 1 for logarithms,
         else the larger of the value and the coefficient's usual uncertainty.
@@ -109,8 +107,6 @@ def uncertainty_of(
 
     Parameters
     ----------
-    fitted
-        A search's result.
     offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     """
@@ -280,8 +276,6 @@ def _source(
     ----------
     shares
         (C, F) of the information.
-    channels, flights
-        Their names.
     """
     if shares.sum() <= 0:
         return None, None
@@ -370,8 +364,6 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
 
     Parameters
     ----------
-    information
-        Of the fit.
     residuals
         (K,) standard errors with all that is in the residuals.
     lags

@@ -38,8 +38,6 @@ class Examination:
 
     Attributes
     ----------
-    uncertainty
-        Of the fitted ones.
     freed
         Fixed coefficient -> the uncertainty had it been fitted beside the others; it is the last
         parameter there.
@@ -48,12 +46,8 @@ class Examination:
         one is; the fixed ones in the order of ``freed``, the fitted in that of ``uncertainty``.
     sensitivity
         Of the flights to all, the fitted first.
-    residuals
-        Of every flight and channel.
     full_problem, information
         The problem in all coefficients, the fitted first, and the information about them.
-    lack
-        What the model is known to lack.
     """
 
     uncertainty: Uncertainty
@@ -87,15 +81,11 @@ def examine(
 
     Parameters
     ----------
-    fitted
-        A search's result.
     otherwise
         What might be simulated differently -> the problem so simulated, for the parts of errors.
     in_doubt
         Coefficient -> how far it would move, in the scaled coordinate, with terms that were left
         out of the model; empty where none was tried.
-    lack
-        What the model is known to lack.
     predictor
         Whose innovations say how well coefficients are known, rather than residuals.
     at_minimum
@@ -184,8 +174,6 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
 
     Parameters
     ----------
-    examination
-        Of the fit.
     space, point
         The fitted coefficients and where the fit ended.
     """
@@ -318,8 +306,6 @@ class FullProblem:
     ----------
     objective, point
         With K + L parameters: the fit's own K first, then the L fixed ones.
-    fitted, fixed
-        Their names.
     fit_space
         The K parameters of the fit.
     """

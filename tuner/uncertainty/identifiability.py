@@ -191,14 +191,8 @@ def hold(
 
     Parameters
     ----------
-    job, fitted
-        The problem and where its search ended.
     stand_ins
         Coefficient -> stand-in, as of `stand_ins_of`; the stand-ins are held, the others stay free.
-    on_progress
-        Called after every iteration.
-    stages
-        As of `polished`.
     """
     names, space = set(stand_ins.values()), job.space
     is_held = np.array([name in names for name in space.names])

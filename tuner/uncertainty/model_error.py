@@ -182,8 +182,6 @@ def alternatives_of(
 
     Parameters
     ----------
-    objective, point
-        The fit.
     flights
         Those that are flown whole in it, to have their voltmeters read again where the fit has a
         battery; none for a fit in which that is not asked.

@@ -49,8 +49,6 @@ def profile_likelihood(
     criterion
         Whose weights the residuals have; of the priors, only as much is kept as keeps the other
         coefficients from diverging.
-    name
-        The coefficient.
     """
     space, indices = full_problem.subspace(uncertainty.names)
     objective = replace(full_problem.objective, space=space)

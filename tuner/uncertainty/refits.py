@@ -58,10 +58,6 @@ def refits(
 
     Parameters
     ----------
-    job, fitted
-        What all refits start from.
-    draws
-        What each is to.
     on_iteration
         Gets the iterations; of refits side by side, the last of each stage.
     """
@@ -130,14 +126,8 @@ def bootstrap(
 
     Parameters
     ----------
-    job, fitted
-        The fit to all flights.
-    count
-        How many refits.
     folder
         Gets ``bootstrap.csv``: a row a refit, how often each flight was drawn and what came out.
-    on_iteration
-        Gets the iterations.
 
     Returns
     -------

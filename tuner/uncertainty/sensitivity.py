@@ -89,14 +89,8 @@ def local_sensitivity(
 
     Parameters
     ----------
-    objective, point, criterion
-        The problem, and where it is examined.
-    jacobian
-        At that point.
     reference
         (K,) change of the scaled coordinate that counts as one hundred percent.
-    flights
-        Names by number.
     """
     space, vector = objective.space, np.asarray(point.coefficients)
     moved = SMALL_STEP * reference / space.slope(vector)
@@ -242,14 +236,10 @@ def global_sensitivity(
         The problem; of the point only the offsets matter.
     method
         ``morris`` or ``sobol``.
-    flights
-        Names by number.
     bounds
         Coefficient -> between which values it is varied.
     samples
         Trajectories of Morris, base points of Sobol (rounded up to a power of two).
-    seed
-        Of the sampling.
     """
     space = objective.space
     problem = {

@@ -166,8 +166,6 @@ def judge(
 
     Parameters
     ----------
-    name
-        The coefficient.
     known
         All that a reason may hold; the one returned keeps what bears on the verdict.
     directions
@@ -212,8 +210,6 @@ def judge_after_holding(
 
     Parameters
     ----------
-    name
-        The coefficient.
     verdict, reason
         Of the examination after the fit with the stand-ins held.
     stand_in

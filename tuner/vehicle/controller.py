@@ -273,8 +273,6 @@ def with_parameters(
     ----------
     controller
         With what no parameter tells.
-    parameters
-        Of the log.
 
     Returns
     -------

@@ -27,8 +27,6 @@ class JointPrior:
 
     Attributes
     ----------
-    names
-        The coefficients.
     mean
         (N,) scaled coordinates.
     information

@@ -127,8 +127,6 @@ def anchored(airframe: Airframe, like: str, known: Mapping[str, float]) -> dict[
 
     Parameters
     ----------
-    airframe
-        The vehicle.
     like
         One of `KNOWN`, similar to it.
     known
@@ -175,8 +173,6 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
 
     Parameters
     ----------
-    airframe
-        What can be read off the vehicle.
     out
         The vehicle file; the job file has the same name and ends in ``.job.yaml``.
     like

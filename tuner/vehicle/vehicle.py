@@ -312,8 +312,6 @@ def write_vehicle(vehicle: VehicleFile, path: str | Path, *, header: str = "") -
 
     Parameters
     ----------
-    vehicle
-        What to write.
     path
         The file to make or replace; it appears whole.
     header

@@ -89,8 +89,6 @@ def base_for(
         (3, 3) kg m², about the common centre of mass, along the model's axes.
     base
         Inertial frame of the base, which stays where it is unless a centre is wanted.
-    others
-        The other bodies.
     centre
         (3,) where the common centre of mass shall lie; None leaves it where it comes to lie.
 
@@ -142,12 +140,8 @@ class Model:
 
     Attributes
     ----------
-    root
-        Its ``<model>``.
     base
         The ``<link>`` whose inertial is ours to set.
-    rotors
-        How many rotors the vehicle has.
     """
 
     root: Element

@@ -51,8 +51,6 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     path
         The model: SDF of Gazebo classic or gz-sim, or a Jinja template of one. What it includes and
         merges from folders beside its own is patched where it stands.
-    vehicle
-        Whose coefficients.
     provenance
         One line that says where they come from; it becomes a comment in each file that changes.
 

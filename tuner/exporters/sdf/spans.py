@@ -38,14 +38,10 @@ class Element:
     ----------
     source
         Its file, ``text`` of which is meant below.
-    tag, attributes
-        As written.
     start, end
         The whole element is ``text[start:end]``.
     content, content_end
         What lies between its tags is ``text[content:content_end]``; empty for ``<tag/>``.
-    children
-        Elements directly inside.
     """
 
     source: Source
@@ -103,8 +99,6 @@ def parse(text: str, path: Path, raw: str | None = None) -> Element:
     ----------
     text
         Characters; places count in them.
-    path
-        Its file.
     raw
         The file as it stands, where the text was made from it.
 
@@ -258,10 +252,6 @@ def read_tree(
 
     Parameters
     ----------
-    path
-        Of the model.
-    read
-        Returns a file's text.
     prepare
         Text and path -> the XML to take apart, places kept where it is to be edited.
     above

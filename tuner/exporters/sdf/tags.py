@@ -141,8 +141,6 @@ def values_in(root: Element, vehicle: VehicleFile) -> dict[str, float]:
 
     Parameters
     ----------
-    root
-        Of the model.
     vehicle
         How many rotors it has and where, whether they are alike, and whether its centre of mass is
         where rotor positions count from.

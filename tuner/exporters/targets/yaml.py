@@ -9,15 +9,7 @@ from tuner.vehicle import VehicleFile, read_vehicle, vehicle_text
 
 
 def yaml_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
-    """Return a vehicle file that ``tune --vehicle`` reads.
-
-    Parameters
-    ----------
-    vehicle
-        What to write, its ``source`` included.
-    provenance
-        One line for the top of the file.
-    """
+    """Return a vehicle file that ``tune --vehicle`` reads."""
 
     def faults(path: Path, _: object) -> list[str]:
         return [] if read_vehicle(path) == vehicle else ["it holds another vehicle"]

@@ -26,13 +26,7 @@ NEAR = 1 << 16
 
 
 class FileBytes:
-    """A file as bytes, of which only those that are asked for are read.
-
-    Parameters
-    ----------
-    stream
-        The open file.
-    """
+    """A file as bytes, of which only those that are asked for are read."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -67,12 +61,8 @@ class Container(ABC):
 
     Attributes
     ----------
-    path
-        Where it lies.
     aligned
         Whether messages are CDR (ROS 2), else ROS 1.
-    connections
-        By their number.
     damage
         What could not be read so far.
 
@@ -97,8 +87,6 @@ class DamagedError(Exception):
 
     Parameters
     ----------
-    text
-        Why.
     cause
         What that says of the recording, where the error ends the use of its index.
     """

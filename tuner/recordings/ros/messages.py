@@ -261,8 +261,6 @@ class Block:
 
     Attributes
     ----------
-    buffer
-        Bytes.
     start, end
         (n,) where each message's payload begins and ends in the buffer.
     time
@@ -302,12 +300,8 @@ def decode(
 
     Parameters
     ----------
-    definitions, kind
-        The message type.
     fields
         Paths that `missing_fields` finds.
-    block
-        The messages.
     aligned
         Whether numbers are padded to their size, as CDR has it.
     """
@@ -382,14 +376,6 @@ class _Walker:
         ----------
         what
             rosbags' description of the value.
-        path
-            Leads to it.
-        of
-            The messages.
-        cursor
-            Where it begins.
-        depth
-            How deep in the type it is.
         """
         self.left -= 1
         node, detail = what

@@ -177,8 +177,6 @@ class RosRecording(Recording):
 
     Parameters
     ----------
-    path
-        The recording.
     messages
         ``.msg`` files for types that the container does not define.
     """
