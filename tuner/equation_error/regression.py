@@ -250,16 +250,17 @@ def spread(values: Array) -> float:
 def whitening(one: Linear, part: Measured, memory: float) -> Kernels:
     """Return for each axis the filter that leaves of errors what those before do not predict."""
     order = max(1, round(memory / part.step))
-    whole = np.lib.stride_tricks.sliding_window_view(part.known, order + 1).all(axis=1)
-    kernels = []
-    for axis in range(one.left.shape[1]):
-        errors = np.where(part.known, one.left[:, axis], 0.0)
-        limit = 2.0 * ROBUST * spread(errors[part.known])
-        errors = np.clip(errors, -limit, limit)
-        rows = np.lib.stride_tricks.sliding_window_view(errors, order + 1)[whole]
-        predicted = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-9)[0]
-        kernels.append(np.concatenate([[1.0], -predicted[::-1]]))
-    return tuple(kernels)
+    return tuple(whitening_filter(errors, part.known, order) for errors in one.left.T)
+
+
+def whitening_filter(errors: Array, known: Mask, order: int) -> Array:
+    """Return the filter that leaves of errors (N,) what so many before do not predict."""
+    whole = np.lib.stride_tricks.sliding_window_view(known, order + 1).all(axis=1)
+    limit = 2.0 * ROBUST * spread(errors[known])
+    errors = np.clip(np.where(known, errors, 0.0), -limit, limit)
+    rows = np.lib.stride_tricks.sliding_window_view(errors, order + 1)[whole]
+    predicted = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-9)[0]
+    return np.concatenate([[1.0], -predicted[::-1]])
 
 
 def _squares(kernel: Array, weights: Array) -> float:

@@ -30,7 +30,6 @@ from tuner.evaluate.held_out import (
     validate,
     vehicle_fitted,
 )
-from tuner.evaluate.predict import with_inputs_on_time
 from tuner.exporters.effective import Effective, effective_in
 from tuner.exporters.export import exports_of_job
 from tuner.exporters.simulators import GAZEBO_CLASSIC
@@ -52,6 +51,7 @@ from tuner.search.estimation import OnProgress, parameters_of
 from tuner.search.explanation import Explanation
 from tuner.search.findings import inputs_late, turning_unexplained, voltage_taken
 from tuner.search.fitted import Fitted
+from tuner.search.input_lag import with_inputs_on_time
 from tuner.search.iteration import Iteration
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.search.problem import Job, job_of

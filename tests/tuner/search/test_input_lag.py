@@ -7,12 +7,14 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from tuner.evaluate.predict import input_lag, with_inputs_on_time
+from benchmarks import fast_flights
+from tuner.config import Options, settle
 from tuner.findings.findings import Code
 from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
-from tuner.search.job_flights import Recording
+from tuner.search.input_lag import input_lag, with_inputs_on_time
+from tuner.search.job_flights import Recording, read_usable
 
 RATE = 500.0
 
@@ -121,3 +123,29 @@ def test_the_order_of_measured_speeds_is_seen_in_how_they_turn_the_vehicle(broad
     series = dict(broadband.series) | {"rotor_speed": swapped}
     (finding,) = order_findings("a", series, updated, span, "rotor_speed")
     assert (finding.code, finding.names) == (Code.MOTOR_ORDER, ("1", "3", "2", "4"))
+
+
+def test_what_the_loop_answers_to_hidden_torques_is_no_lateness(tmp_path):
+    racer = fast_flights.drawn(32)
+    signals = fast_flights.fly(racer, seed=32, seconds=10.0)
+    path, *_ = fast_flights.write(racer, signals, tmp_path, seed=32)
+    settings = settle(Options([str(path)], config=str(tmp_path / "tune.yaml")))
+    (recording,), _ = read_usable(settings)
+    lag = input_lag(recording.flight, "rotor_speed", settings.vehicle)
+    assert lag.seconds < -3.0 * lag.sd  # by spectra alone
+
+    def believed(seconds):
+        (moved,) = with_inputs_on_time([_stamped(recording, seconds)], settings.vehicle)
+        return moved.input_late
+
+    assert believed(0.0) == 0.0
+    assert believed(-0.01) == pytest.approx(lag.seconds - 0.01, abs=1e-3)
+
+
+def _stamped(recording, seconds):
+    """Return a recording whose rotor speeds are stamped later."""
+    speed = recording.flight.series["rotor_speed"]
+    series = {"rotor_speed": Series(speed.time + seconds, speed.values)}
+    return replace(
+        recording, flight=replace(recording.flight, series=recording.flight.series | series)
+    )

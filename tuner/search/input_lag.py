@@ -1,0 +1,254 @@
+"""By how much recorded rotor speeds or commands are stamped later than the state they make.
+
+What disturbs a vehicle is answered by its loop with its rotors, and what the rotors do then goes
+with the turning that they answer: later, and against it. To a spectrum that is a lateness, and the
+slower the larger. So a lateness that spectra show is believed only if the innovations of the same
+regression say so too: the part of each acceleration that those before it do not predict, of which
+no answer is (`tuner.equation_error.regression`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_jax.constants import GRAVITY
+from tuner.core.numerics import Z95
+from tuner.equation_error.measured import Mask, measured_with, with_rotors
+from tuner.equation_error.regression import MEMORY, convolved, whitening_filter
+from tuner.objective.inlets import INLETS
+from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.states import states_at
+from tuner.search.inlet_choice import regressors
+from tuner.search.job_flights import Recording
+from tuner.vehicle import VehicleFile
+
+BAND = (0.7, 8.0)
+"""Hz between which accelerations are compared."""
+GRID = np.arange(-24, 25) * 0.0025
+"""s of lateness that are tried: five samples at 100 Hz, and as much again for a rotor's lag."""
+KNOWN = 0.003
+"""s of standard deviation up to which a lateness is believed."""
+ENDS = 10
+"""Ticks at either end of a flight, where its derivatives are worse."""
+ROUNDS = 3
+"""In which a regression and the filter of its errors are found in turn."""
+INDEPENDENT = 3.0
+"""Neighbouring frequencies that say the same, on average: the taper and the filter join them."""
+
+Spectrum = NDArray[np.complex128]
+
+
+@dataclass(frozen=True)
+class Lag:
+    """A lateness and its standard deviation, in s."""
+
+    seconds: float
+    sd: float
+
+
+def with_inputs_on_time(
+    recordings: Sequence[Recording], vehicle: VehicleFile
+) -> tuple[Recording, ...]:
+    """Return recordings with the lateness of what is fed in, where it can be told.
+
+    Rotor speeds are late by themselves; commands are by what their flight's lateness differs from
+    the flights' mean, which is the vehicle's own lag. What may be chance, or the loop's answer to
+    what disturbs the vehicle, is no lateness. A flight that does not tell has the mean of the
+    others' rotor speeds, and so have flights that are held out: nothing is fitted to them.
+    """
+    late: dict[str, float] = {}
+    for inlet in {recording.inlet for recording in recordings}:
+        same = [recording for recording in recordings if recording.inlet == inlet]
+        if not INLETS[inlet].starts_recorded:
+            continue
+        signal, is_measured = INLETS[inlet].needs[0], "actuator_latency" in INLETS[inlet].bypasses
+        lags = [
+            (recording.flight, lag)
+            for recording in same
+            if not recording.holdout
+            and recording.time_offset is None
+            and (lag := input_lag(recording.flight, signal, vehicle)) is not None
+        ]
+        if not lags:
+            continue
+        own = 0.0 if is_measured else float(np.mean([lag.seconds for _, lag in lags]))
+        told = {
+            flight.name: lag.seconds - own if _is_later(flight, signal, vehicle, lag, own) else 0.0
+            for flight, lag in lags
+        }
+        mean = float(np.mean(list(told.values()))) if is_measured else 0.0
+        late |= {r.flight.name: told.get(r.flight.name, mean) for r in same}
+    return tuple(
+        replace(r, input_late=late.get(r.flight.name, r.input_late)) if r.time_offset is None else r
+        for r in recordings
+    )
+
+
+def _is_later(flight: Flight, signal: str, vehicle: VehicleFile, lag: Lag, than: float) -> bool:
+    """Return whether inputs are late by more, or less, than so many s, beyond chance and answers.
+
+    By the turning alone: the velocity, of which forces are, is filtered.
+    """
+    if abs(lag.seconds - than) <= Z95 * lag.sd:
+        return False
+    inputs = flight.series[signal]
+    known = np.isfinite(inputs.values).all(axis=1)
+    rotors = Series(inputs.time[known], _speed_like(inputs.values[known], signal, vehicle))
+    steps = measured_with(flight, rotors, noise=0.0)
+    if steps is None:
+        return False
+    late, on_time = (
+        with_rotors(steps, Series(rotors.time - seconds, rotors.values))
+        for seconds in (lag.seconds, than)
+    )
+    known, order = late.known & on_time.known, max(1, round(MEMORY / steps.step))
+    gain = 0.0
+    for axis in range(3):
+        turning = steps.accelerations[:, 3 + axis]
+        better, worse = (
+            _innovation(turning, regressors(part, vehicle)[axis], known, order)
+            for part in (late, on_time)
+        )
+        gain += 0.5 * known.sum() * np.log(worse / better)
+    return bool(gain > 0.5 * Z95**2)
+
+
+def _innovation(answer: Array, columns: Array, known: Mask, order: int) -> float:
+    """Return the mean square of what is new in the errors of a regression."""
+    rows = np.column_stack([answer, columns])
+    filtered = rows[known]
+    for _ in range(ROUNDS):
+        weights = np.linalg.lstsq(filtered[:, 1:], filtered[:, 0], rcond=None)[0]
+        kernel = whitening_filter(answer - columns @ weights, known, order)
+        filtered = convolved(rows, known, kernel)
+    left, _ = _left(filtered[:, 1:], filtered[:, 0])
+    return left / len(filtered)
+
+
+def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
+    """Return by how much a flight's rotor speeds or commands are stamped later than its state.
+
+    Parameters
+    ----------
+    flight
+        With a pose; the lateness counts from the stamps of its body rate.
+    signal
+        ``rotor_speed`` or ``command``.
+    vehicle
+        Gives the rotors' places, and thrust up to a factor.
+
+    Returns
+    -------
+    Lag or None
+        None where the flight does not tell.
+    """
+    clock = flight.time[ENDS:-ENDS]
+    rows = flight.series[signal]
+    if len(clock) < 200 or not np.isfinite(rows.values).any(axis=0).all():
+        return None
+    state = states_at(flight.series, clock)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import, seldom needed)
+
+    body = Rotation.from_quat(state.attitude, scalar_first=True).inv()
+    moving = body.apply(state.velocity)
+    faster = np.gradient(state.velocity, clock, axis=0)
+    force = body.apply(faster + np.array([0.0, 0.0, GRAVITY]))
+    turning = np.gradient(state.body_rate, clock, axis=0)
+    if not (np.isfinite(force).all() and np.isfinite(turning).all()):
+        return None
+    inputs = np.column_stack(
+        [
+            np.interp(clock, rows.time[np.isfinite(column)], column[np.isfinite(column)])
+            for column in rows.values.T
+        ]
+    )
+    thrust = _speed_like(inputs, signal, vehicle) ** 2
+    place = np.array([rotor.position for rotor in vehicle.rotors])
+    spin = np.array([1.0 if rotor.spin == "ccw" else -1.0 for rotor in vehicle.rotors])
+    driven = np.column_stack(
+        [thrust @ place[:, 1], -thrust @ place[:, 0], -thrust @ spin, thrust.sum(axis=1)]
+    )
+    rate, along = state.body_rate, np.abs(moving[:, 2:])
+    across = (moving[:, :2] ** 2).sum(axis=1, keepdims=True)
+    damping = [
+        np.column_stack([rate[:, 0], moving[:, 1]]),
+        np.column_stack([rate[:, 1], moving[:, 0]]),
+        rate[:, 2:],
+        np.column_stack([moving[:, 2:], along, across]),
+    ]
+    answers = np.column_stack([turning, force[:, 2]])
+    of_axes = np.stack(
+        [
+            _likelihoods(answers[:, axis], driven[:, axis], damping[axis], flight.rate)
+            for axis in range(4)
+        ]
+    )
+    return _peak(of_axes / INDEPENDENT)
+
+
+def _speed_like(inputs: Array, signal: str, vehicle: VehicleFile) -> Array:
+    """Return what goes with the rotors' speed (n, 4)."""
+    if signal == "rotor_speed":
+        return inputs
+    return vehicle.motor.zero_position_armed + vehicle.motor.input_scaling * inputs
+
+
+def _likelihoods(answer: Array, driven: Array, damping: Array, rate: float) -> Array:
+    """Return the log-likelihood of every lateness of `GRID` for one axis."""
+    frequency = np.fft.rfftfreq(len(answer), 1.0 / rate)
+    inside = (frequency > BAND[0]) & (frequency < BAND[1])
+    taper = np.hanning(len(answer))[:, None]
+
+    def spectrum(columns: Array) -> Spectrum:
+        centred = (columns - columns.mean(axis=0)) * taper
+        found: Spectrum = np.fft.rfft(centred, axis=0)[inside]
+        return found
+
+    there, moved = _real(spectrum(answer[:, None]))[:, 0], spectrum(driven[:, None])
+    others, turn = _real(spectrum(damping)), 2j * np.pi * frequency[inside][:, None]
+    left, _ = _left(others, there)
+    gains = []
+    for late in GRID:
+        remains, weight = _left(np.hstack([others, _real(moved * np.exp(turn * late))]), there)
+        gains.append(inside.sum() * np.log(left / remains) if weight > 0 else 0.0)
+    return np.array(gains)
+
+
+def _left(matrix: Array, there: Array) -> tuple[float, float]:
+    """Return the sum of squares that is left of a column, and the last regressor's weight."""
+    weights = np.linalg.lstsq(matrix, there, rcond=None)[0]
+    return float(np.sum((there - matrix @ weights) ** 2)), float(weights[-1])
+
+
+def _real(columns: Spectrum) -> Array:
+    return np.concatenate([columns.real, columns.imag])
+
+
+def _peak(of_axes: Array) -> Lag | None:
+    """Return the likeliest lateness of all axes, by the parabola through the peak of their sum.
+
+    None for no sharp one. Where the axes contradict each other by more than chance, its standard
+    deviation grows by Birge's ratio.
+
+    Parameters
+    ----------
+    of_axes
+        (axes, latenesses) log-likelihoods.
+    """
+    likelihood = of_axes.sum(axis=0)
+    at = int(np.argmax(likelihood))
+    if at in (0, len(GRID) - 1):
+        return None
+    before, top, after = likelihood[at - 1 : at + 2]
+    bend, step = before - 2.0 * top + after, float(GRID[1] - GRID[0])
+    if bend >= 0.0:
+        return None
+    fallen = 2.0 * np.sum(of_axes.max(axis=1) - of_axes[:, at])
+    birge = np.sqrt(max(fallen / (len(of_axes) - 1), 1.0))
+    sd = birge * step / np.sqrt(-bend)
+    place = float(GRID[at] + 0.5 * (before - after) / bend * step)
+    return Lag(place, float(sd)) if sd < KNOWN else None
