@@ -23,7 +23,6 @@ from functools import lru_cache
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binom, norm
 
 from benchmarks.oracle import oracle_error
@@ -32,6 +31,7 @@ from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from sim_jax.inlet import ReferenceInlet
 from tuner.config import Options, settle
+from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
 from tuner.objective.normal import Objective
@@ -71,8 +71,6 @@ INSIDE = 0.01
 """Share of its range by which a truth keeps away from a coefficient's bounds."""
 STAGES = 3
 """Of the search: whole flights, and the polish."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -4,30 +4,23 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks.contestants import fit
-from benchmarks.contestants.derivatives import (
-    FLIGHTS,
-    FORWARD,
-    GRADIENT,
-    JACOBIAN,
-    REVERSED,
-    SAMPLES,
-)
 from benchmarks.table import Bar, Section, figure, seconds
 from benchmarks.timing import Contestant, Spread, compete
 
+FLIGHTS, SAMPLES, REVERSED = 64, 2000, 8
+FORWARD, JACOBIAN, GRADIENT = "forward", "jacobian", "gradient"
+OURS = (sys.executable, "-m", "benchmarks.contestants.ours")
 ROUNDS = 11
 STEPS = REVERSED * SAMPLES * 10
 
 
 def measure() -> Section:
     """Run all three in turn."""
-    module = "benchmarks.contestants.derivatives"
     measured = {
         contestant.name: contestant
         for contestant in compete(
             [
-                Contestant(what, (sys.executable, "-m", module, what), {})
+                Contestant(what, (*OURS, "derivatives", what), {})
                 for what in (FORWARD, JACOBIAN, GRADIENT)
             ],
             ROUNDS,
@@ -36,10 +29,7 @@ def measure() -> Section:
     loss, jacobian = (
         _time(contestant.rate)
         for contestant in compete(
-            [
-                Contestant(what, (sys.executable, "-m", "benchmarks.contestants.fit", what), {})
-                for what in (fit.LOSS, fit.JACOBIAN)
-            ],
+            [Contestant(what, (*OURS, "fit", what), {}) for what in ("loss", JACOBIAN)],
             ROUNDS,
         )
     )

@@ -28,13 +28,14 @@ from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure, table
 from sim_jax.schedule import Schedule
 from tuner.config import Options, settle
+from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
 from tuner.findings.findings import Code, Finding, one_line
 from tuner.job.run import prepared
 from tuner.objective.battery import VOLTAGE, log_voltage_of
 from tuner.objective.windows import Window
-from tuner.recordings.flight import Array, Flight
+from tuner.recordings.flight import Flight
 from tuner.search.explanation import Explanation
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job

@@ -7,14 +7,11 @@ from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.simulated_recordings import recorded
-from tuner.core.numerics import Inverse
+from tuner.core.numerics import Array, Inverse
 from tuner.objective.information import information_at
 from tuner.search.fitted import Fitted
-
-Array = NDArray[np.float64]
 
 DRAWS = 8
 """Of noise and gusts: their spread is then known to a quarter."""

@@ -63,7 +63,7 @@ def to_ros2(bag: Path, folder: Path, storage: StoragePlugin) -> Path:
 def wanted(path: Path) -> dict[str, Request]:
     """Return what a flight takes from a recording."""
     recording = open_recording(path)
-    places, _ = locate(recording, choose_map(recording, shipped_maps()))
+    places, _ = locate(recording, choose_map(recording, shipped_maps(recording.format)))
     fields: dict[str, list[str]] = {}
     for place in places.values():
         rotor = [place.source.rotor] if place.source.rotor else []

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tuner.core.numerics import Array
 from tuner.evaluate.predict import Predictions, errors_of
-from tuner.recordings.flight import Array, Flight
+from tuner.recordings.flight import Flight
 from tuner.recordings.states import States, filtered, states_at
 
 MEMORY = 4

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
@@ -16,6 +15,7 @@ from sim_jax.environment import Disturbance
 from sim_jax.numeric import Array as JaxArray
 from sim_jax.rollout import rollout
 from sim_jax.state import Setpoints
+from tuner.core.numerics import Array
 from tuner.disturbances.recorded import SETPOINTS
 from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.normal import Objective
@@ -23,8 +23,6 @@ from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import CLOCKS, OFFSETS, Measured
 from tuner.recordings.flight import Flight, Series
 from tuner.vehicle.model import Model
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

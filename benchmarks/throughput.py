@@ -41,7 +41,7 @@ def contestants(vehicles: int, yardstick: Path | None) -> list[Contestant]:
     peers = os.environ.get("TUNE_PEERS", sys.executable)
     module = "benchmarks.contestants."
     all_contestants = [
-        Contestant(f"tune, {p}", (sys.executable, "-m", module + "ours", p, batch), {})
+        Contestant(f"tune, {p}", (sys.executable, "-m", module + "ours", "kernel", p, batch), {})
         for p in ("float32", "float64")
     ]
     if yardstick is not None:

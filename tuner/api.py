@@ -12,6 +12,7 @@ from threadpoolctl import threadpool_limits
 from tuner.config.job import TrajectoryName
 from tuner.core.disk import exists
 from tuner.core.errors import ExportError
+from tuner.core.numerics import Array
 from tuner.core.runtime import configure
 from tuner.engine import engine_for
 from tuner.options import (
@@ -22,7 +23,6 @@ from tuner.options import (
     SimulationOptions,
     taking,
 )
-from tuner.recordings.flight import Array
 from tuner.recordings.loader import load_flight
 from tuner.result import Run, read_run
 from tuner.vehicle import VehicleFile

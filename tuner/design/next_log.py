@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sim_jax.state import hover_speed
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
-from tuner.core.numerics import errors_of
+from tuner.core.numerics import Array, errors_of
 from tuner.design.proposals import LogProposal
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_at
@@ -33,8 +33,6 @@ from tuner.search.problem import Job, job_of
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import COEFFICIENTS, VehicleFile
 from tuner.vehicle.model import vehicle_of
-
-Array = NDArray[np.float64]
 
 RATE = 100.0
 """Hz at which a signal would be logged besides."""

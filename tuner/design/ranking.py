@@ -25,7 +25,7 @@ from sim_jax.state import hover
 from sim_jax.trajectory import Shape, shapes
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
-from tuner.core.numerics import log_determinant, scaled_inverse
+from tuner.core.numerics import Array, log_determinant, scaled_inverse
 from tuner.design.proposals import Proposal, Proposals
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_from_jacobian
@@ -234,9 +234,6 @@ def _sampled(
     constant = np.where(silent, 0.0, equivalent.max(axis=1)[:, None])
     weights = np.broadcast_to(constant, (rows, *constant.shape))
     return Measured(time=np.asarray(time), values=np.asarray(values), weight=np.asarray(weights))
-
-
-Array = NDArray[np.float64]
 
 
 def rank_next_flights(

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tuner.core.numerics import Array
 from tuner.equation_error.measured import Measured, measured_with, with_rotors, without_gaps_of
 from tuner.equation_error.model import Accelerations, Linear, values_at
 from tuner.objective.inlets import MISSED, linear_interpolation, zero_order_hold
 from tuner.objective.rotor_response import Lags, rotor_speeds
-from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.flight import Flight, Series
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model, with_coefficients

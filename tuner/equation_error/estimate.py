@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from tuner.core.numerics import Array
 from tuner.equation_error.command_accelerations import CommandAccelerations, Commands
 from tuner.equation_error.measured import Mask, Measured
 from tuner.equation_error.model import Accelerations, ModelAccelerations, values_at
@@ -20,7 +21,6 @@ from tuner.equation_error.regression import (
     regress,
 )
 from tuner.objective.space import Space
-from tuner.recordings.flight import Array
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import Model, with_terms_computed
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow

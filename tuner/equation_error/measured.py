@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from sim_jax.constants import GRAVITY
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
+from tuner.core.numerics import Array
 from tuner.objective.noise import white_noise
-from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import filtered, states_at
 
 Mask = NDArray[np.bool_]

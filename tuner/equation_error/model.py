@@ -17,9 +17,9 @@ from sim_jax.environment import Air
 from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.terms import total
 from sim_jax.terms.total import total_wrench
+from tuner.core.numerics import Array
 from tuner.equation_error.measured import Measured
 from tuner.objective.flown import CODE
-from tuner.recordings.flight import Array
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model, with_coefficients
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.recordings.flight import Array
+from tuner.core.numerics import Array
 
 STRETCH = 1.0
 """s whose scores are summed up."""

@@ -22,10 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import Z95, robust_sd
+from tuner.core.numerics import Z95, Array, robust_sd
 from tuner.equation_error.measured import Mask, Measured
 from tuner.equation_error.model import Linear, ModelAccelerations
-from tuner.recordings.flight import Array
 
 MEMORY = 0.1
 """s of errors from which the next one is predicted."""

@@ -25,10 +25,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tuner.core.numerics import Array
 from tuner.equation_error.measured import Measured, rows_of
 from tuner.equation_error.model import Accelerations, Linear
 from tuner.equation_error.regression import ROBUST, convolved, spread, whitening
-from tuner.recordings.flight import Array
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model
 

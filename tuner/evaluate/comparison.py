@@ -23,6 +23,7 @@ from sim_jax.state import AIRBORNE
 from tuner.config import Settings, settle
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
+from tuner.core.numerics import Array
 from tuner.core.shipped import find_config
 from tuner.evaluate.forces import Forces, acting, in_order
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse, Row, Table, check_table_file, write_table
@@ -48,7 +49,6 @@ from tuner.objective.segments import (
 from tuner.objective.space import Space
 from tuner.objective.windows import Window, windows_of
 from tuner.options import RecordingOptions
-from tuner.recordings.flight import Array
 from tuner.search.job_flights import Recording, as_logged, read_usable
 from tuner.search.least_squares import FAR
 from tuner.search.problem import limits_of

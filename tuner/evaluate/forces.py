@@ -23,8 +23,8 @@ from sim_jax.rigid_body import Motion
 from sim_jax.terms import total
 from sim_jax.terms.total import wrench_of_each_term
 from sim_jax.vehicle import Vehicle
+from tuner.core.numerics import Array
 from tuner.objective.flown import CODE
-from tuner.recordings.flight import Array
 
 COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
 """Force in N and moment in N m, about the centre of mass in body axes."""

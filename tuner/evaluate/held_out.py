@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tuner.core.numerics import Array
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.predict import Predictions, hold, predict
 from tuner.evaluate.records import PredictedErrors
@@ -20,7 +21,7 @@ from tuner.findings.sentences import PREDICTED
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import CLOCKS, OFFSETS
-from tuner.recordings.flight import Array, Flight
+from tuner.recordings.flight import Flight
 from tuner.search.fitted import Fitted
 from tuner.search.iteration import PointEstimate
 from tuner.search.job_flights import with_conditions, with_offsets

@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 from sim_jax.schedule import Schedule
 from sim_jax.state import AIRBORNE
 from tuner.config.job import InletName
+from tuner.core.numerics import Array
 from tuner.findings.sentences import PREDICTED
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.flight import MOTION
 from tuner.objective.flown import fly
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import Segments, window_segments
-from tuner.recordings.flight import Array, Flight
+from tuner.recordings.flight import Flight
 from tuner.recordings.states import States, states_at
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle.model import Model, model_of, schedule_of

@@ -9,9 +9,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.evaluate.forces import Forces
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse
-from tuner.recordings.flight import Array, Flight
+from tuner.recordings.flight import Flight
 
 Pose = Literal["position", "attitude"]
 

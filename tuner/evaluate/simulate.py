@@ -28,6 +28,7 @@ from sim_jax.state import State, hover
 from sim_jax.terms import total
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError, did_you_mean
+from tuner.core.numerics import Array
 from tuner.core.shipped import find_config
 from tuner.core.yaml_section import Number, Section, build
 from tuner.engine import Here, Report, current
@@ -36,7 +37,7 @@ from tuner.objective.flight import MOTION, SETPOINTS, SPEEDS, TURNED, recorded_o
 from tuner.objective.flown import CODE
 from tuner.objective.trajectory import Published, at_speed, published
 from tuner.options import SimulationOptions
-from tuner.recordings.flight import Array, Series
+from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import resample
 from tuner.vehicle import (
     COEFFICIENTS,

@@ -16,9 +16,9 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tuner.core.disk import check_file, whole_file
 from tuner.core.errors import InputError
+from tuner.core.numerics import Array
 from tuner.evaluate.forces import COMPONENTS
 from tuner.evaluate.simulate import Simulation
-from tuner.recordings.flight import Array
 
 #: ns since 1970 of the first sample; a fixed one, so that the same flight gives the same file.
 EPOCH = 1_577_836_800_000_000_000

@@ -15,9 +15,9 @@ import numpy as np
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import ExportError
+from tuner.core.numerics import Array
 from tuner.exporters.sdf.model import (
     MOST_ROTORS,
-    Array,
     Inertial,
     Model,
     composite,

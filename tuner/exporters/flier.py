@@ -13,7 +13,6 @@ from typing import Any, Protocol
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_jax.frames import estimated
 from sim_jax.geometry import Quaternion, Vec3
@@ -26,12 +25,11 @@ from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import packed, push, switched
 from sim_jax.state import Limits, State
+from tuner.core.numerics import Array
 from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.flown import Flown
 from tuner.objective.segments import Segments
 from tuner.vehicle.model import Model
-
-Array = NDArray[np.float64]
 
 
 class Body(Protocol):

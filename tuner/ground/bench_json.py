@@ -15,9 +15,9 @@ from scipy.special import chdtrc  # scipy.stats takes a second to import
 
 from tuner.core.errors import InputError
 from tuner.core.files import Part, ResultFile
-from tuner.core.numerics import scaled_inverse, scaled_solve, symmetric_eigen
+from tuner.core.numerics import Array, scaled_inverse, scaled_solve, symmetric_eigen
 from tuner.core.phrases import listed
-from tuner.ground.measurement import Array, Curve, Measurement, Remark, error_of, value_of
+from tuner.ground.measurement import Curve, Measurement, Remark, error_of, value_of
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.joint_prior import JointPrior
 

@@ -11,7 +11,8 @@ from scipy.optimize import least_squares
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
-from tuner.ground.measurement import Array, Curve, Measurement, Remark
+from tuner.core.numerics import Array
+from tuner.ground.measurement import Curve, Measurement, Remark
 
 FEWEST_SWINGS = 5.0
 LARGE_SWING = math.radians(20)

@@ -12,9 +12,10 @@ import numpy as np
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import ConfigError, RecordingError
+from tuner.core.numerics import Array
 from tuner.ground.bifilar import bifilar
 from tuner.ground.hovers import hover_weights, yaw_spin
-from tuner.ground.measurement import Array, Measurement
+from tuner.ground.measurement import Measurement
 from tuner.ground.plan import (
     FASTEST_SPIN,
     SLOWEST_SPIN,

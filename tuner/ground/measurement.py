@@ -13,10 +13,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.vehicle import COEFFICIENTS
-
-Array = NDArray[np.float64]
-
 
 MOST_DRAWN = 800
 """Samples of a curve that are kept."""

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from tuner.core.errors import RecordingError
-from tuner.ground.measurement import Array, Curve, Measurement, Remark
+from tuner.core.numerics import Array
+from tuner.ground.measurement import Curve, Measurement, Remark
 
 THEORY = 0.4
 """Standard deviation of the logarithm by which a table's propeller on a vehicle differs from it."""

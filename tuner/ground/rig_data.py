@@ -18,8 +18,8 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import Z95, robust_sd
-from tuner.ground.measurement import Array, Curve
+from tuner.core.numerics import Z95, Array, robust_sd
+from tuner.ground.measurement import Curve
 from tuner.recordings.content import Content, ReadOptions, read_content
 from tuner.recordings.recording import ROWS, Clock, Request, TabularRecording
 

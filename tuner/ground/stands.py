@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import scaled_inverse
-from tuner.ground.measurement import Array, Curve, Measurement, Remark
+from tuner.core.numerics import Array, scaled_inverse
+from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.ground.rig_data import kept_levels, mean_and_error, widened
 
 SHORTEST = 1.0

@@ -12,8 +12,8 @@ from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import robust_sd, scaled_solve
-from tuner.ground.measurement import Array, Curve, Measurement, Remark
+from tuner.core.numerics import Array, robust_sd, scaled_solve
+from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.ground.rig_data import OUTLIER, student
 
 STEP = 0.02

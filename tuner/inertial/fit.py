@@ -33,11 +33,10 @@ from scipy import linalg, optimize, signal
 
 from sim_jax.constants import GRAVITY
 from sim_jax.vehicle import Motor
-from tuner.core.numerics import Inverse, scaled_solve
+from tuner.core.numerics import Array, Inverse, scaled_solve
 from tuner.inertial.signals import Stretch, blocks_of, low_passed, smoothed
 from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.objective.rotor_signals import levers
-from tuner.recordings.flight import Array
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
 from tuner.vehicle.model import model_of
 

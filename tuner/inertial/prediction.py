@@ -17,10 +17,10 @@ from itertools import starmap
 
 import numpy as np
 
+from tuner.core.numerics import Array
 from tuner.inertial.signals import Stretch, smoothed
 from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.objective.rotor_signals import levers
-from tuner.recordings.flight import Array
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
 from tuner.vehicle.model import model_of
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from tuner.recordings.flight import Array, Series
+from tuner.core.numerics import Array
+from tuner.recordings.flight import Series
 
 CUTOFF = 30.0
 """Hz of the low-pass that measured and modelled signals pass alike: above it are propellers' and

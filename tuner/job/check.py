@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
 from sim_jax.control.mixer import ROTORS
-from tuner.core.numerics import symmetric_eigen, unit_diagonal
+from tuner.core.numerics import Array, symmetric_eigen, unit_diagonal
 from tuner.findings.findings import Code, Finding
 from tuner.objective.inlets import INLETS, bypassed_by, sparse
 from tuner.objective.rotor_signals import Source, order_findings, squared_speed
 from tuner.objective.setpoints import setpoint_findings
-from tuner.recordings.flight import Array, Flight
+from tuner.recordings.flight import Flight
 from tuner.search.problem import Job
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import COEFFICIENTS, VehicleFile

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from tuner.core.errors import RecordingError
+from tuner.core.numerics import Array
 from tuner.recordings.clocks import align_pose, message_times
 from tuner.recordings.defects import clean, without_stale
-from tuner.recordings.flight import SIGNALS, Array, Series
+from tuner.recordings.flight import SIGNALS, Series
 from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.frames import DOUBTS, contradiction, correct_frames
 from tuner.recordings.missions import Mission, find_missions, manoeuvres
@@ -161,15 +162,18 @@ def read_signals(options: ReadOptions) -> Signals:
     """
     path, given, sidecar = options.path, options.given, options.sidecar
     recording = open_recording(path, given.messages if given is not None else ())
-    candidates = [given] if given is not None else list(shipped_maps())
-    candidates = [candidate.under(options.namespace) for candidate in candidates]
-    if all(candidate.format != recording.format for candidate in candidates):
+    maps = [given] if given is not None else list(shipped_maps(recording.format))
+    candidates = [topic_map.under(options.namespace) for topic_map in maps]
+    if given is not None and given.format != recording.format:
         raise RecordingError(
             path,
-            f"is read as '{recording.format}', the topic map '{candidates[0].name}' is for "
-            f"'{candidates[0].format}'",
+            f"is read as '{recording.format}', the topic map '{given.name}' is for "
+            f"'{given.format}'",
             "give a map for this format",
         )
+    if not candidates:
+        what = f"is read as '{recording.format}', for which no topic map ships"
+        raise RecordingError(path, what, "give one with --topics")
     chosen = choose_map(recording, candidates)
     taken: tuple[Note, ...] = ()
     if given is None:

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.recordings.flight import Array, Series
+from tuner.core.numerics import Array
+from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import runs
 from tuner.recordings.notes import Kind, Note, NoteCode
 

@@ -16,7 +16,8 @@ from dataclasses import replace
 import numpy as np
 
 from sim_jax.constants import GRAVITY
-from tuner.recordings.flight import Array, Series
+from tuner.core.numerics import Array
+from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import (
     body_rate_of,
     correlation,

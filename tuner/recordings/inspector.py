@@ -18,6 +18,7 @@ import yaml
 
 from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
+from tuner.core.numerics import Array
 from tuner.recordings.clocks import clock_of, pose_offset
 from tuner.recordings.content import (
     Content,
@@ -28,7 +29,7 @@ from tuner.recordings.content import (
     read_signals,
 )
 from tuner.recordings.defects import is_stale
-from tuner.recordings.flight import SIGNALS, Array, Series
+from tuner.recordings.flight import SIGNALS, Series
 from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.frames import noted_contradiction
 from tuner.recordings.inspection import (
@@ -418,8 +419,7 @@ def suggested_map(path: Path) -> str:
     """
     recording = open_recording(path)
     if not is_tabular(recording.format):
-        maps = [topic_map for topic_map in shipped_maps() if topic_map.format == recording.format]
-        chosen = choose_map(recording, maps)
+        chosen = choose_map(recording, shipped_maps(recording.format))
         places, _ = locate(recording, chosen)
         if not places:
             listed = ", ".join(topic.name for topic in recording.topics[:12])

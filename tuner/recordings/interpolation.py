@@ -7,7 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tuner.recordings.flight import SIGNALS, Array, Series
+from tuner.core.numerics import Array
+from tuner.recordings.flight import SIGNALS, Series
 
 #: Beyond this gap between two samples, in s, nothing is known; slower signals get three periods.
 LONGEST_GAP = 0.25

@@ -22,6 +22,7 @@ from pydantic import ConfigDict, TypeAdapter
 
 from tuner.core.disk import exists, readable
 from tuner.core.errors import RecordingError
+from tuner.core.numerics import Array
 from tuner.recordings.cache import cached, digest, load, store
 from tuner.recordings.clocks import Grid, clock_of
 from tuner.recordings.content import (
@@ -32,7 +33,7 @@ from tuner.recordings.content import (
     read_content,
     read_signals,
 )
-from tuner.recordings.flight import SIGNALS, Array, Flight, Series
+from tuner.recordings.flight import SIGNALS, Flight, Series
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.interpolation import longest_gap, resample, runs, without_gaps
 from tuner.recordings.missions import IDLE, stretches, yaw_spin

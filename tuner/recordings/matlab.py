@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.flight import Array
+from tuner.core.numerics import Array
 from tuner.recordings.notes import Note
 from tuner.recordings.recording import (
     ROWS,

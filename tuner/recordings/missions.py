@@ -13,7 +13,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.recordings.flight import Array, Series
+from tuner.core.numerics import Array
+from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import runs
 
 AT_REST = 1e-5

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from tuner.core.errors import RecordingError
+from tuner.core.numerics import Array
 from tuner.core.yaml_section import Section
-from tuner.recordings.flight import Array
 from tuner.recordings.notes import Damage, Note
 
 Nanoseconds = NDArray[np.int64]

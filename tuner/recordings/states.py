@@ -14,8 +14,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from tuner.core.numerics import robust_sd
-from tuner.recordings.flight import SIGNALS, Array, InitialState, Series
+from tuner.core.numerics import Array, robust_sd
+from tuner.recordings.flight import SIGNALS, InitialState, Series
 from tuner.recordings.interpolation import body_rate_from
 
 FILTER_HALF_WIDTH = 0.03

@@ -27,7 +27,7 @@ from pyarrow import (
 from pyarrow import csv as arrow_csv
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.flight import Array
+from tuner.core.numerics import Array
 from tuner.recordings.formats import LONGEST_LINE, layout_of
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode
 from tuner.recordings.recording import (

@@ -179,11 +179,11 @@ def load_topic_map(reference: str | Path, *, base: Path | None = None, depth: in
         The file is missing, no YAML, or says something that no map can say.
     """
     path = find_config("topics", str(reference), base or Path())
-    topic_map = read_model(TopicMap, path)
+    ships = path.parent == configs_folder() / "topics"
+    topic_map = _shipped(path) if ships else read_model(TopicMap, path)
     if topic_map.messages:
-        topic_map = topic_map.replace(
-            messages=tuple(path.parent / file for file in topic_map.messages)
-        )
+        messages = tuple(path.parent / file for file in topic_map.messages)
+        topic_map = topic_map.model_copy(update={"messages": messages})
     if topic_map.extends is None:
         return topic_map
     if depth >= DEEPEST:
@@ -193,19 +193,27 @@ def load_topic_map(reference: str | Path, *, base: Path | None = None, depth: in
         raise ConfigError(
             path, f"extends '{under.name}' of another format", "extend one of its own"
         )
-    return topic_map.replace(
-        signals={**under.signals, **topic_map.signals},
-        time=topic_map.time or under.time,
-        motor_order=topic_map.motor_order or under.motor_order,
-        messages=(*topic_map.messages, *under.messages),
-    )
+    merged = {
+        "signals": {**under.signals, **topic_map.signals},
+        "time": topic_map.time or under.time,
+        "motor_order": topic_map.motor_order or under.motor_order,
+        "messages": (*topic_map.messages, *under.messages),
+    }
+    return topic_map.model_copy(update=merged)  # of parts that were validated
 
 
 @cache
-def shipped_maps() -> tuple[TopicMap, ...]:
-    """Return every map in ``configs/topics``, by file name."""
+def _shipped(path: Path) -> TopicMap:
+    """Return a map that ships, which others extend, read once."""
+    return read_model(TopicMap, path)
+
+
+@cache
+def shipped_maps(kind: str) -> tuple[TopicMap, ...]:
+    """Return the maps in ``configs/topics`` for recordings of a format, by file name."""
     files = sorted((configs_folder() / "topics").glob("*.yaml"))
-    return tuple(load_topic_map(file) for file in files)
+    own = [f for f in files if f"format: {kind}" in f.read_text(encoding="utf-8").splitlines()]
+    return tuple(map(load_topic_map, own))
 
 
 class Sidecar(Section):

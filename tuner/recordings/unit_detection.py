@@ -23,7 +23,7 @@ import numpy as np
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
-from tuner.recordings.flight import Array
+from tuner.core.numerics import Array
 from tuner.recordings.interpolation import upward
 from tuner.recordings.notes import Note, NoteCode
 

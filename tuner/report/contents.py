@@ -13,11 +13,11 @@ from pydantic import JsonValue
 from tuner.core.disk import exists, file_name, whole_file
 from tuner.core.errors import InputError
 from tuner.core.files import Part, ResultFile, read_arrays
+from tuner.core.numerics import Array
 from tuner.design.proposals import Proposals
 from tuner.evaluate.records import Table
 from tuner.findings.findings import Finding
 from tuner.ground.bench_json import BenchRecord
-from tuner.recordings.flight import Array
 from tuner.result import ExportRecord, ExportRecords, Run, RunResult, read_run
 from tuner.search.iteration import Iteration, Outcome
 from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles

@@ -10,13 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import Z95, Inverse, scaled_root, symmetric_eigen
+from tuner.core.numerics import Z95, Array, Inverse, scaled_root, symmetric_eigen
 from tuner.objective.information import BLOCK, FisherInformation
-
-Array = NDArray[np.float64]
 
 WIDE = 100.0
 """Factor on the priors' widths that leaves practically the information of the flights alone."""

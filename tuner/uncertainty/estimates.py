@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import Z95, Inverse, scaled_inverse, symmetric_eigen
+from tuner.core.numerics import Z95, Array, Inverse, scaled_inverse, symmetric_eigen
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.information import FisherInformation, information_at
@@ -20,8 +20,6 @@ from tuner.uncertainty.covariance import Covariance, IndependentErrors, covarian
 from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict, judge
 from tuner.vehicle import COEFFICIENTS, scale_group, term_groups
-
-Array = NDArray[np.float64]
 
 STEP = "step"
 """Simulated otherwise: half the physics step, controllers and log at their own rates."""

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.numerics import Z95, scaled_solve
+from tuner.core.numerics import Z95, Array, scaled_solve
 from tuner.disturbances.information import with_hidden, with_strengths
 from tuner.disturbances.predictor import Predictor
 from tuner.objective.criterion import Criterion, Jacobian, Point
@@ -28,8 +28,6 @@ from tuner.uncertainty.sensitivity import LocalSensitivity, local_sensitivity
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.vehicle import Size, sized
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

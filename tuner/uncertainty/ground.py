@@ -5,17 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tuner.core.numerics import scaled_inverse, unit_diagonal
+from tuner.core.numerics import Array, scaled_inverse, unit_diagonal
 from tuner.findings.findings import Code, Finding
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.records import CONFLICT, Sources
 from tuner.vehicle import COEFFICIENTS
-
-Array = NDArray[np.float64]
 
 
 def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[str, Sources]:

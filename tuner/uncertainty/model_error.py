@@ -27,6 +27,7 @@ from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from sim_jax.vehicle import Motor
+from tuner.core.numerics import Array
 from tuner.equation_error.measured import FEWEST, Measured, measured
 from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, answers
 from tuner.equation_error.unexplained import Law, Pair, unexplained
@@ -38,7 +39,7 @@ from tuner.objective.flown import Flown, fly
 from tuner.objective.inlets import zero_order_hold
 from tuner.objective.normal import Objective
 from tuner.objective.windows import Window
-from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.flight import Flight, Series
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import DRAWS, READINGS, STEP, Uncertainty
 from tuner.vehicle.model import Model

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin
@@ -20,8 +20,6 @@ from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import FullProblem
 from tuner.uncertainty.records import THRESHOLD, Profile
 from tuner.vehicle import COEFFICIENTS
-
-Array = NDArray[np.float64]
 
 POINTS = 13
 """Number of the coefficient's values, the middle one where it stands."""

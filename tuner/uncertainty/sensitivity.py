@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.objective.batch import Batch, evaluate
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
@@ -27,8 +28,6 @@ from tuner.uncertainty.records import (
     OutputSensitivity,
     SensitivityIndex,
 )
-
-Array = NDArray[np.float64]
 
 SMALL_STEP = 0.01
 """Relative change whose effect is computed from the derivative."""

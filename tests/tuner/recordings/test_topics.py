@@ -14,15 +14,19 @@ from tests.tuner.recordings import making
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.shipped import configs_folder
 from tuner.recordings.flight import SIGNALS
+from tuner.recordings.formats import READERS
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode, note_in_words
 from tuner.recordings.topics import load_topic_map, read_sidecar, shipped_maps
 from tuner.recordings.unit_detection import UNITS, to_enu_flu
 
+FORMATS = [reader.format for reader in READERS]
+
 
 def test_every_shipped_map_is_valid_and_named_after_its_file() -> None:
     files = {path.stem for path in (configs_folder() / "topics").glob("*.yaml")}
-    assert {topic_map.name for topic_map in shipped_maps()} == files
+    assert {m.name for kind in FORMATS for m in shipped_maps(kind)} == files
+    assert all(m.format == kind for kind in FORMATS for m in shipped_maps(kind))
     assert {"thesis_lab", "mavros", "mocap", "gazebo", "px4_ros2", "px4_ulog", "table"} <= files
 
 
@@ -96,7 +100,7 @@ def test_what_the_guide_shows_is_valid(tmp_path: Path) -> None:
     assert "command" in lab.signals
     (tmp_path / "flight.yaml").write_text(sidecar)
     assert read_sidecar(tmp_path / "flight.bag").start == 12.5
-    for topic_map in shipped_maps():
+    for topic_map in (one for kind in FORMATS for one in shipped_maps(kind)):
         assert f"`{topic_map.name}`" in guide
     for signal in SIGNALS:
         assert f"`{signal}`" in guide
@@ -228,3 +232,10 @@ def test_single_tachometers_of_four_rotors_are_put_in_their_columns(
     steps = [(b - a) * 60 / 6.283185 for a, b in pairwise(level)]
     assert steps == pytest.approx([100, 100, 100], abs=30)
     assert not any(note.code is NoteCode.NO_TACHOMETER for note in got.notes)
+
+
+def test_a_format_without_a_shipped_map_asks_for_one(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("tuner.recordings.content.shipped_maps", lambda _: ())
+    (tmp_path / "a.csv").write_text("t,x\n0,1\n1,2\n")
+    with pytest.raises(RecordingError, match="'table', for which no topic map ships; give one"):
+        load_flight(tmp_path / "a.csv", cache=False)

@@ -10,17 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuner.core.errors import ExportError
+from tuner.core.numerics import Array
 from tuner.exporters.sdf.spans import (
     MERGED,
     Element,
     model_in,
     pose_numbers,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from xml.etree import ElementTree
 import numpy as np
 
 from tuner.core.errors import ExportError
-from tuner.exporters.sdf.model import Array, Model, composite, read_model
+from tuner.core.numerics import Array
+from tuner.exporters.sdf.model import Model, composite, read_model
 from tuner.exporters.sdf.spans import Element, sources, without_comments
 from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of, with_values
 

@@ -8,18 +8,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
 from tuner.core.disk import file_name
+from tuner.core.numerics import Array
 from tuner.core.yaml_document import commented
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import DRONE_MODELS, rotor_speed, thrust_at
 from tuner.exporters.target import Draft, Target, differences, flattened, read_file
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
-
-Array = NDArray[np.float64]
 
 RPM = 2 * math.pi / 60
 """rad/s of one rpm."""

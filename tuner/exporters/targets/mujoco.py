@@ -9,15 +9,13 @@ from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuner.core.errors import ExportError
+from tuner.core.numerics import Array
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import MUJOCO, drag_at_hover, full_thrust, rotor_speed, thrust_at
 from tuner.exporters.target import Draft, Target, differences, read_file
 from tuner.vehicle import VehicleFile
-
-Array = NDArray[np.float64]
 
 _AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
 _USE = """

@@ -6,15 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.core.yaml_document import commented
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import ROTORPY, rotor_speed
 from tuner.exporters.target import Draft, Target, assigned, differences, flattened
 from tuner.vehicle import VehicleFile
-
-Array = NDArray[np.float64]
 
 
 def quad_params(vehicle: VehicleFile) -> dict[str, Any]:

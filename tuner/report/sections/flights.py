@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from tuner.core.numerics import Array
 from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse
 from tuner.findings.sentences import PREDICTED
-from tuner.recordings.flight import Array
 from tuner.report.chart import (
     FITTED,
     INITIAL,
