@@ -17,10 +17,10 @@ from sim_jax.rollout import rollout
 from sim_jax.state import Setpoints
 from tuner.core.numerics import Array
 from tuner.disturbances.recorded import SETPOINTS
-from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import CLOCKS, OFFSETS, Measured
+from tuner.objective.simulation import beginning_of, recorded_of
 from tuner.recordings.flight import Flight, Series
 from tuner.vehicle.model import Model
 
@@ -79,7 +79,7 @@ def recorded(
     Flown or None
         None where a flight crashed.
     """
-    model = objective.tunable.at(jnp.asarray(vector))
+    model = objective.model_at(vector)
     pushing = _air(objective, model, random) if gusts else None
     flown = objective
     if log_voltage is not None:

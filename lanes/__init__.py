@@ -13,6 +13,6 @@ Nothing here knows what is computed.
 from lanes.dependence import dependent
 from lanes.layout import Argument
 from lanes.machine import keep_code_in
-from lanes.program import Program, Run, joined
+from lanes.program import Program, Run, joined, program_of
 
-__all__ = ["Argument", "Program", "Run", "dependent", "joined", "keep_code_in"]
+__all__ = ["Argument", "Program", "Run", "dependent", "joined", "keep_code_in", "program_of"]

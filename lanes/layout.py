@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import prod
 from typing import Any, NamedTuple, TypeAlias
 
+import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
@@ -46,6 +47,12 @@ class Argument:
     lanes: bool
     moves: bool = False
     apart: bool = False
+
+    @staticmethod
+    def of(leaf: Any, *, lanes: bool, moves: bool = False) -> Argument:
+        """Return how an array is given: the lanes along its last axis, or shared by all."""
+        shape = np.shape(leaf)[:-1] if lanes else np.shape(leaf)
+        return Argument(shape, np.result_type(leaf), lanes, moves)
 
 
 class _Frame(NamedTuple):

@@ -7,11 +7,11 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache, partial
 from itertools import pairwise
 from math import lcm
 from typing import Any, TypeAlias
@@ -30,7 +30,7 @@ from lanes.layout import Argument, Layout, Lengths, is_laid_by_loop
 from lanes.machine import Code, keep_code_in, kept, object_code, register_bytes
 from lanes.values import UnsupportedError
 
-__all__ = ["Argument", "Program", "Run", "joined", "keep_code_in"]
+__all__ = ["Argument", "Program", "Run", "joined", "keep_code_in", "program_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -85,6 +85,36 @@ def joined(columns: NDArray[Any], count: int) -> NDArray[Any]:
 
 
 Function: TypeAlias = Callable[[Any, Lengths], Any]
+
+
+def program_of(
+    function: Callable[..., Any], arguments: Any, *static: Hashable, **options: Any
+) -> Program:
+    """Return a program, the same one wherever the same is asked for.
+
+    Parameters
+    ----------
+    function
+        As of `Program`, of all that is static before the arguments and lengths.
+    arguments
+        As of `Program`.
+    options
+        Those of `Program`, hashable.
+    """
+    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
+    return _program_of(function, tuple(leaves), structure, static, tuple(options.items()))
+
+
+@lru_cache(maxsize=128)
+def _program_of(
+    function: Callable[..., Any],
+    leaves: tuple[Argument, ...],
+    structure: Any,
+    static: tuple[Hashable, ...],
+    options: tuple[tuple[str, Any], ...],
+) -> Program:
+    arguments = jax.tree.unflatten(structure, leaves)
+    return Program(partial(function, *static), arguments, **dict(options))
 
 
 class Program:

@@ -117,9 +117,7 @@ def _information(fitted: Fitted, signal: str, noise: float) -> Array:
     )
     alone: Objective = eqx.tree_at(lambda o: o.segments.measured, objective, {signal: measured})
     scale = {signal: np.full(objective.flights, beyond_noise(criterion))}
-    plain: Criterion = eqx.tree_at(
-        lambda c: (c.scale, c.huber), criterion, (scale, np.asarray(np.inf))
-    )
+    plain = replace(criterion, scale=scale, huber=np.inf)
     information = information_at(alone, fitted.point, plain)
     return np.asarray(information.blocks.sum(axis=(0, 1, 2)))
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
@@ -21,11 +21,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
-from jax.typing import ArrayLike
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from lanes import Argument, Program, Run
+from lanes import Argument, Run, program_of
 from sim_jax.numeric import row_of
 from sim_jax.schedule import Schedule
 from sim_jax.state import State
@@ -46,8 +45,7 @@ from tuner.disturbances.observer import (
     first_errors,
 )
 from tuner.objective.criterion import Either
-from tuner.objective.flown import CODE, flown_part, laid_out
-from tuner.vehicle.model import with_coefficients
+from tuner.objective.simulation import CODE, flown_part, laid_out
 
 GATE = 4.0
 """Standard deviations beyond which an innovation corrects no further: an outlier."""
@@ -143,7 +141,7 @@ def _shortly_delayed(schedule: Schedule, expected: Expected) -> tuple[Schedule, 
     """
     if schedule.longest_actuator_latency == 0.0:
         return schedule, 0
-    latency = float(expected.tunable.values(expected.coefficients)["actuator_latency"])
+    latency = float(expected.coefficients["actuator_latency"])
     count = max(int(np.ceil(latency / schedule.step - 1e-9)), 1)
     return replace(schedule, longest_actuator_latency=count * schedule.step), count
 
@@ -159,7 +157,7 @@ def filtered(schedule: Schedule, feed: Feed, expected: Expected, *, gains: bool 
         Whether gains are kept, which take most of the memory.
     """
     short, in_flight = _shortly_delayed(_undelayed(schedule), expected)
-    static = _Static("filter", short, feed.conditions, in_flight, moves=False)
+    static = _Static("filter", short, in_flight, moves=False)
     wanted = (*[True] * 3, *[gains] * 2)
     *rows, gain, factors = _run(_given(feed, expected), static, wanted=wanted).values
     white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)
@@ -168,7 +166,11 @@ def filtered(schedule: Schedule, feed: Feed, expected: Expected, *, gains: bool 
 
 
 def innovations(
-    schedule: Schedule, feed: Feed, gains: Gains, expected: Expected, directions: ArrayLike | None
+    schedule: Schedule,
+    feed: Feed,
+    gains: Gains,
+    expected: Expected,
+    tangents: Mapping[str, NDArray[np.float64]] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
     """Return whitened innovations (T, m, F) with given gains, and derivatives; None for none.
 
@@ -180,27 +182,29 @@ def innovations(
         As of `filtered`.
     gains
         Of the observer.
-    directions
-        (N, K + offsets): along which is differentiated; None for nothing.
+    tangents
+        Directions along which is differentiated: coefficient -> (Q,), and ``"offsets"`` ->
+        (Q, offsets). None differentiates by nothing.
     """
-    moves = directions is not None
-    static = _Static("innovations", _undelayed(schedule), feed.conditions, 0, moves=moves)
-    moved = None if directions is None else _tangents(expected, np.asarray(directions, float))
+    moved = None
+    if tangents is not None:
+        still = np.zeros(len(tangents["offsets"]))
+        names = sorted(expected.coefficients)  # the order of the leaves
+        moved = [tangents["offsets"], *(tangents.get(name, still) for name in names)]
+    static = _Static("innovations", _undelayed(schedule), 0, moves=moved is not None)
     wanted = (True, False) if moved is None else ((True, False), (False, True))
     run = _run(_given(feed, expected, gains), static, moved, wanted)
     return np.moveaxis(run.values[0], 0, -1), run.columns and run.columns[1]
 
 
 class _Given(NamedTuple):
-    """What a program is given of a model, and of each segment."""
+    """What a program is given: of each segment, of what is taken for true, and of the samples.
 
-    model: Any
-    coefficients: dict[str, Any]
-    offsets: Any
-    segments: Any
-    samples: Any
-    strengths: Any
-    noise: Any
+    ``order`` says at each tick (T, m + 1) which rows are sampled in any segment, and how many.
+    """
+
+    feed: Feed
+    expected: Expected
     order: Any
     gains: Gains | None
 
@@ -211,7 +215,6 @@ class _Static:
 
     kind: Literal["filter", "innovations"]
     schedule: Schedule
-    conditions: tuple[str, ...]
     in_flight: int
     moves: bool
 
@@ -219,37 +222,12 @@ class _Static:
 def _given(feed: Feed, expected: Expected, gains: Gains | None = None) -> _Given:
     """Return the arguments of a program."""
     weights = [np.asarray(feed.samples[name].weight) for name in feed.widths]
-    given: _Given = jax.tree.map(
-        np.asarray,
-        _Given(
-            model=expected.tunable.model,
-            coefficients=expected.tunable.values(np.asarray(expected.coefficients)),
-            offsets=feed.offsets,
-            segments=flown_part(feed.segments),
-            samples=feed.samples,
-            strengths=expected.strengths,
-            noise=expected.noise,
-            order=_order_of(np.concatenate([(w > 0).any(axis=-1) for w in weights], axis=1)),
-            gains=gains,
-        ),
-    )
+    sampled = np.concatenate([(weight > 0).any(axis=-1) for weight in weights], axis=1)
+    first = np.argsort(~sampled, axis=1, kind="stable")
+    order = np.concatenate([first, np.count_nonzero(sampled, axis=1)[:, None]], axis=1)
+    feed = replace(feed, segments=flown_part(feed.segments))
+    given: _Given = jax.tree.map(np.asarray, _Given(feed, expected, order, gains))
     return given
-
-
-def _order_of(sampled: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return at each tick (T, m) which rows are sampled in any segment, and last how many are."""
-    order = np.argsort(~sampled, axis=1, kind="stable")
-    return np.concatenate([order, np.count_nonzero(sampled, axis=1)[:, None]], axis=1)
-
-
-def _tangents(expected: Expected, directions: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Return how coefficients, in the order of their names, and offsets move."""
-    count = len(np.asarray(expected.coefficients))
-    slopes = expected.tunable.slopes(np.asarray(expected.coefficients))
-    names = sorted(expected.tunable.names)
-    still = np.zeros(count)
-    moved = [directions[:, :count] @ slopes.get(name, still) for name in names]
-    return [*moved, directions[:, count:]]
 
 
 def _run(
@@ -267,53 +245,36 @@ def _run(
         shape = ("ticks", *np.shape(leaf)[2:])
         return Argument(shape, np.result_type(leaf), lanes=True, apart=True)
 
-    def single(leaf: Any) -> Argument:
-        return Argument(np.shape(leaf)[:-1], np.result_type(leaf), lanes=True)
-
-    def shared(leaf: Any) -> Argument:
-        return Argument(np.shape(leaf), np.result_type(leaf), lanes=False)
-
+    feed, expected, moves = given.feed, given.expected, static.moves
     arguments = _Given(
-        model=jax.tree.map(shared, given.model),
-        coefficients={
-            name: Argument((), float, lanes=False, moves=static.moves)
-            for name in given.coefficients
-        },
-        offsets=replace(single(given.offsets), moves=static.moves),
-        segments=laid_out(given.segments),
-        samples=jax.tree.map(table, given.samples),
-        strengths=single(given.strengths),
-        noise=single(given.noise),
+        Feed(
+            segments=laid_out(feed.segments),
+            offsets=Argument.of(feed.offsets, lanes=True, moves=moves),
+            samples=jax.tree.map(table, feed.samples),
+            conditions=feed.conditions,
+        ),
+        Expected(
+            model=jax.tree.map(partial(Argument.of, lanes=False), expected.model),
+            coefficients=jax.tree.map(
+                partial(Argument.of, lanes=False, moves=moves), expected.coefficients
+            ),
+            strengths=Argument.of(expected.strengths, lanes=True),
+            noise=Argument.of(expected.noise, lanes=True),
+        ),
         order=Argument(("ticks", *given.order.shape[1:]), int, lanes=False),
         gains=jax.tree.map(apart, given.gains),
     )
-    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
-    program = _program(tuple(leaves), structure, static)
-    count, ticks = given.offsets.shape[-1], len(given.order)
-    return program(given, tangents, lanes=count, turns=ticks, wanted=wanted)
-
-
-@lru_cache(maxsize=16)
-def _program(leaves: tuple[Argument, ...], structure: Any, static: _Static) -> Program:
-    flown = _filter if static.kind == "filter" else _innovations
-
-    def function(given: _Given, lengths: Mapping[str, int]) -> Any:
-        return flown(given, static, lengths["turns"])
-
-    return Program(
-        function,
-        jax.tree.unflatten(structure, leaves),
+    program = program_of(
+        _filter if static.kind == "filter" else _innovations,
+        arguments,
+        static,
         name=static.kind,
         at_once=AT_ONCE,
         made_of=(static, total.TERMS),
         packages=CODE,
     )
-
-
-def _observer(given: _Given, static: _Static) -> tuple[Observer, State]:
-    model = with_coefficients(given.model, given.coefficients)
-    feed = Feed(given.segments, given.offsets, given.samples, static.conditions)
-    return Observer.of(static.schedule, feed, model, given.strengths)
+    count, ticks = feed.offsets.shape[-1], len(given.order)
+    return program(given, tangents, lanes=count, turns=ticks, wanted=wanted)
 
 
 def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Array]:
@@ -325,19 +286,19 @@ def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Arra
     return order, order(jnp.asarray(given.order.shape[1] - 1))
 
 
-def _filter(given: _Given, static: _Static, ticks: int) -> Any:
+def _filter(static: _Static, given: _Given, lengths: Mapping[str, int]) -> Any:
     """Filter one segment: white, root and loss of `Filtered`, gains and factors of `Gains`."""
-    observer, first = _observer(given, static)
+    observer, first = Observer.of(static.schedule, given.feed, given.expected)
     in_flight, processes = static.in_flight, observer.processes
     first_sd = jnp.asarray(first_errors(first, in_flight))
-    size, wide = len(first_sd) + COUNT, len(given.noise)
+    size, wide = len(first_sd) + COUNT, len(given.expected.noise)
     shown = len(first_errors(first, 0))  # to samples: commands on their way are not, nor pushes
     unrest = jnp.concatenate([jnp.zeros(size - COUNT), processes.added])
 
     def tick(carried: Any, number: Array) -> Any:
         state, pushed, matrices, before, beyond = carried
         covariance, gain, scratch = matrices
-        read = row_of(given.samples, number)
+        read = row_of(given.feed.samples, number)
 
         def compare(change: list[Array]) -> list[Array]:
             now = observer.seen(observer.corrected(state, change, number, 0), number)
@@ -346,7 +307,7 @@ def _filter(given: _Given, static: _Static, ticks: int) -> Any:
             return observer.errors(now, along, read)
 
         error, changes = jax.linearize(compare, [jnp.zeros(())] * shown)
-        variance = jnp.where(observer.sampled(read), given.noise**2, 1.0)
+        variance = jnp.where(observer.sampled(read), given.expected.noise**2, 1.0)
         samples = Samples(
             jnp.concatenate(error), variance, Sparse.of(changes, shown), *_sampled(given, number)
         )
@@ -390,16 +351,16 @@ def _filter(given: _Given, static: _Static, ticks: int) -> Any:
         observer.seen(first, jnp.asarray(0)),
         jnp.zeros(wide, int),
     )
-    return lax.scan(tick, begin, jnp.arange(ticks))[1]
+    return lax.scan(tick, begin, jnp.arange(lengths["turns"]))[1]
 
 
-def _innovations(given: _Given, static: _Static, ticks: int) -> tuple[Array, Array]:
+def _innovations(static: _Static, given: _Given, lengths: Mapping[str, int]) -> tuple[Array, Array]:
     """Fly one segment with gains that are given: its whitened innovations (ticks, m).
 
     And the same in single precision, of which derivatives are taken: they take most of the memory.
     """
     assert given.gains is not None
-    observer, first = _observer(given, static)
+    observer, first = Observer.of(static.schedule, given.feed, given.expected)
     gains, factors = given.gains.gain, given.gains.factors
     wide, size = gains.shape[1:]
     in_flight, finer = commands_in_flight(first, size - COUNT), 1
@@ -415,7 +376,7 @@ def _innovations(given: _Given, static: _Static, ticks: int) -> tuple[Array, Arr
 
     def tick(carried: Any, number: Array) -> tuple[Any, tuple[Array, Array]]:
         state, pushed, before, beyond = carried
-        read = row_of(given.samples, number)
+        read = row_of(given.feed.samples, number)
         error = jnp.concatenate(observer.errors(observer.seen(state, number), before, read))
         order, count = _sampled(given, number)
 
@@ -447,5 +408,5 @@ def _innovations(given: _Given, static: _Static, ticks: int) -> tuple[Array, Arr
         return carried, (white, white.astype(jnp.float32))
 
     begin = first, jnp.zeros(COUNT), observer.seen(first, jnp.asarray(0)), jnp.zeros(wide, int)
-    rows: tuple[Array, Array] = lax.scan(tick, begin, jnp.arange(ticks))[1]
+    rows: tuple[Array, Array] = lax.scan(tick, begin, jnp.arange(lengths["turns"]))[1]
     return rows

@@ -31,11 +31,10 @@ from tuner.disturbances.disturbances import (
     processes_of,
 )
 from tuner.disturbances.recorded import Sampled
-from tuner.objective.criterion import OFFSET_UNIT, units_of
-from tuner.objective.flight import beginning_of
+from tuner.objective.criterion import OFFSET_UNIT, Either, units_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
-from tuner.objective.space import Tunable
-from tuner.vehicle.model import Model
+from tuner.objective.simulation import beginning_of
+from tuner.vehicle.model import Model, with_coefficients
 
 CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
 """What corrects, in this order: a dictionary's own order is lost where jax takes it apart."""
@@ -57,7 +56,7 @@ class Feed(eqx.Module):
     """
 
     segments: Segments
-    offsets: Float[Array, "O F"]
+    offsets: Float[Either, "O F"]
     samples: dict[str, Sampled]
     conditions: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -76,18 +75,20 @@ class Expected(eqx.Module):
 
     Attributes
     ----------
-    tunable, coefficients
-        The model, and its search vector (K,).
+    model
+        What flies.
+    coefficients
+        Name -> value that replaces the model's, of all that it has.
     strengths
         (7, F) of the disturbances, each segment's own.
     noise
         (m, F) factors on the standard deviations of the samples.
     """
 
-    tunable: Tunable
-    coefficients: Float[Array, " K"]
-    strengths: Float[Array, "7 F"]
-    noise: Float[Array, "m F"]
+    model: Model
+    coefficients: dict[str, Either]
+    strengths: Float[Either, "7 F"]
+    noise: Float[Either, "m F"]
 
 
 class Observer(eqx.Module):
@@ -100,13 +101,9 @@ class Observer(eqx.Module):
     rate: float = eqx.field(static=True)
 
     @staticmethod
-    def of(
-        schedule: Schedule, feed: Feed, model: Model, strengths: Float[Array, "7 *F"]
-    ) -> tuple[Observer, State]:
-        """Return the observer of a model, and the state in which the segments begin.
-
-        ``strengths`` of the disturbances, each segment's own.
-        """
+    def of(schedule: Schedule, feed: Feed, expected: Expected) -> tuple[Observer, State]:
+        """Return the observer of a model, and the state in which the segments begin."""
+        model = with_coefficients(expected.model, expected.coefficients)
         units = units_of(feed.conditions)
         conditions = {
             name: feed.offsets[len(OFFSETS) + row] * units[row]
@@ -125,7 +122,7 @@ class Observer(eqx.Module):
             limits=AIRBORNE,  # a height that no sample corrects drifts, and ends no flight
         )
         rate = float(schedule.log_rate)
-        processes = processes_of(model.vehicle, strengths, rate)
+        processes = processes_of(model.vehicle, expected.strengths, rate)
         late = feed.offsets[: len(OFFSETS)] * OFFSET_UNIT
         return Observer(plant, processes, late, tuple(feed.widths), rate), state
 

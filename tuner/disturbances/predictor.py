@@ -17,7 +17,6 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -42,9 +41,8 @@ from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_from_jacobian, with_secants
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
-from tuner.objective.space import Tunable
 from tuner.recordings.flight import Flight
-from tuner.vehicle.model import with_terms_computed
+from tuner.vehicle.model import coefficients_in, with_terms_computed
 
 Array = NDArray[np.float64]
 
@@ -138,7 +136,7 @@ class Predictor:
             schedule=schedule,
             feed=Feed(
                 segments=replace(segments, inlet=inlet, measured={}),
-                offsets=jnp.asarray(offsets),
+                offsets=offsets,
                 samples={name: samples for name, (samples, _) in laid.items()},
                 conditions=objective.conditions,
             ),
@@ -272,10 +270,10 @@ class Predictor:
     def memory(self) -> int:
         """Bytes that gains take."""
         flights, wide = self.feed.offsets.shape[-1], sum(self.feed.widths.values())
-        return self.ticks * flights * wide * (NUMBERS + wide) * np.dtype(np.float32).itemsize
+        return int(self.ticks * flights * wide * (NUMBERS + wide) * np.dtype(np.float32).itemsize)
 
     def _fed(self, point: Point) -> Feed:
-        return replace(self.feed, offsets=jnp.asarray(point.offsets))
+        return replace(self.feed, offsets=np.asarray(point.offsets))
 
     def _expected(
         self, objective: Objective, point: Point, strengths: Array | None = None
@@ -288,8 +286,9 @@ class Predictor:
         noise = np.stack([np.broadcast_to(factors[name], shape) for name in widths])
         noise = noise.repeat(list(widths.values()), axis=0)
         model = with_terms_computed(objective.model, self.computed)
-        tunable = Tunable(model, objective.space)
-        return Expected(tunable, *map(jnp.asarray, (point.coefficients, strengths, noise)))
+        values = {**coefficients_in(model), **objective.space.values(point.coefficients)}
+        values = {name: np.asarray(value, float) for name, value in values.items()}
+        return Expected(model, values, strengths, noise)
 
     def among(self, flights: NDArray[np.intp]) -> Predictor:
         """Return the predictor of some flights alone."""
@@ -376,7 +375,7 @@ class Predictor:
         sample, flight = np.nonzero(rows >= 0)
         tick, rate = rows[sample, flight], float(self.schedule.log_rate)
         place[tick, flight] = 1.0 - tick + np.asarray(time)[sample, flight] * rate
-        return replace(laid, place=jnp.asarray(place))
+        return replace(laid, place=place)
 
     def jacobian(self, objective: Objective, point: Point, moved: Sequence[int]) -> Jacobian:
         """Return whitened innovations at a point, and derivatives by some of its P parameters.
@@ -388,6 +387,7 @@ class Predictor:
         count = len(point.coefficients)
         size = count + len(point.offsets)
         feed, expected = self._fed(point), self._expected(objective, point)
+        slopes = objective.space.slopes(point.coefficients)
         columns = {
             name: np.zeros((self.rows[name].shape[1], len(self.rows[name]), width, size))
             for name, width in feed.widths.items()
@@ -395,8 +395,12 @@ class Predictor:
         residuals: dict[str, Any] = {}
         for first in range(0, max(len(moved), 1), AT_ONCE):
             some = list(moved[first : first + AT_ONCE])
-            directions = np.eye(size)[some] if some else None
-            errors, laid = innovations(self.schedule, feed, self.found.gains, expected, directions)
+            along = np.eye(size)[some]
+            tangents = {name: along[:, :count] @ slope for name, slope in slopes.items()}
+            tangents["offsets"] = along[:, count:]
+            errors, laid = innovations(
+                self.schedule, feed, self.found.gains, expected, tangents if some else None
+            )
             residuals = gathered(errors, feed.widths, self.rows)
             if laid is not None:
                 for name, segment, part in taken_from(laid, feed.widths, self.rows):
@@ -404,7 +408,7 @@ class Predictor:
         return Jacobian(
             residuals,
             {name: np.moveaxis(part, (-1, 0), (0, -1)) for name, part in columns.items()},
-            jnp.full(self.feed.segments.count, jnp.inf),
+            np.full(self.feed.segments.count, np.inf),
         )
 
 
@@ -418,7 +422,7 @@ def likelihood_of(found: Filtered, ticks: int, segments: slice = slice(None)) ->
 
 def unscaled(criterion: Criterion) -> Criterion:
     """Return a criterion for residuals that are whitened already, a filter knowing the start."""
-    ones = {name: jnp.ones_like(scale) for name, scale in criterion.scale.items()}
+    ones = {name: np.ones_like(scale) for name, scale in criterion.scale.items()}
     return replace(criterion, scale=ones, states=None)
 
 

@@ -6,15 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import BodyRateInlet
 from sim_jax.schedule import Schedule
+from tuner.objective.criterion import Either
 from tuner.objective.noise import repeats
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured
 from tuner.recordings.flight import Flight
@@ -40,9 +39,9 @@ class Sampled(eqx.Module):
         (T, F) where between both ticks it was taken, 0..1, were its clock right.
     """
 
-    values: Float[Array, "T c F"]
-    weight: Float[Array, "T k F"]
-    place: Float[Array, "T F"]
+    values: Float[Either, "T c F"]
+    weight: Float[Either, "T k F"]
+    place: Float[Either, "T F"]
 
 
 def sampled(
@@ -86,7 +85,7 @@ def sampled(
         laid[1][filled, :, segment] = weight[sample, :, segment]
         place[filled, segment] = 1.0 - filled + time[sample, segment] * rate
         rows[sample, segment] = filled
-    return Sampled(*(jnp.asarray(part) for part in (*laid, place))), rows
+    return Sampled(*laid, place), rows
 
 
 def each_reading(commands: Measured) -> Measured:
@@ -98,7 +97,7 @@ def each_reading(commands: Measured) -> Measured:
     """
     values = np.asarray(commands.values)
     rests = np.stack([repeats(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
-    return replace(commands, weight=commands.weight * jnp.asarray(np.sqrt(rests)))
+    return replace(commands, weight=np.asarray(commands.weight) * np.sqrt(rests))
 
 
 def setpoints_on_ticks(
@@ -142,7 +141,7 @@ def setpoints_on_ticks(
     table = np.stack(laid, axis=-1)
     steps = np.arange(int(np.ceil(samples / schedule.log_rate * schedule.physics_rate)) + 2)
     tick_of = steps * schedule.position_control_rate // schedule.physics_rate
-    x, y, z, thrust = (jnp.asarray(row[tick_of]) for row in table)
+    x, y, z, thrust = table[:, tick_of]
     return BodyRateInlet(Vec3(x, y, z), thrust)
 
 

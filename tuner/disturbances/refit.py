@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +25,7 @@ from tuner.core.numerics import scaled_solve
 from tuner.disturbances.disturbances import LEAST, MOST, within
 from tuner.disturbances.predictor import Predictor, unscaled
 from tuner.disturbances.recorded import gathered
-from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
+from tuner.objective.criterion import OFFSET_SD, OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import gauss_newton, robust
 from tuner.objective.segments import CLOCKS
@@ -104,18 +103,10 @@ def with_least_innovations(
 def _loss(predictor: Predictor, objective: Objective, point: Point, criterion: Criterion) -> float:
     """Return the negative log-likelihood of the recordings, with that of the priors."""
     assert predictor.found is not None
-    count, segments = len(objective.space) + len(point.offsets), objective.segments.flight
-    nothing = SegmentSums(
-        loss=jnp.zeros(len(segments)),
-        gradient=jnp.zeros((count, len(segments))),
-        hessian=jnp.zeros((count, count, len(segments))),
-        squares={},
-        counts={},
-        crash_time=jnp.full(len(segments), jnp.inf),
-        states=None,
-    )
-    priors = normal_equations(objective.space, segments, point, criterion, nothing)[0]
-    return float(np.sum(predictor.found.loss) + priors)
+    own = criterion.prior * objective.space.prior_residuals(point.coefficients)
+    of_flights = np.asarray(point.offsets) / OFFSET_SD
+    priors = 0.5 * float(np.sum(own**2) + np.sum(of_flights**2))
+    return float(np.sum(predictor.found.loss)) + priors
 
 
 class _Equations(NamedTuple):
@@ -170,11 +161,11 @@ def _equations(
     jacobian = predictor.jacobian(objective, point, moved)
     segments, total = jacobian.crash_time.shape[0], size + len(slope)
     gradient, hessian = np.zeros((segments, total)), np.zeros((segments, total, total))
-    loss, huber = np.zeros(segments), float(criterion.huber)
+    loss, huber = np.zeros(segments), criterion.huber
     for name, more in by_strengths.items():
         errors = np.moveaxis(np.asarray(jacobian.residuals[name]), -1, 0)
         columns = [np.moveaxis(c, (0, -1), (-1, 0)) for c in (jacobian.columns.pop(name), more)]
-        scale = np.asarray(criterion.scale[name])
+        scale = criterion.scale[name]
         along, bend = gauss_newton(np.concatenate(columns, axis=-1), errors, scale, huber)
         gradient += along
         hessian += bend
@@ -246,4 +237,4 @@ def _moved(space: Space, point: Point, change: Array) -> Point:
     vector, moved = np.asarray(point.coefficients), change[: len(point.coefficients)] != 0.0
     after = np.where(moved, space.at_share(_share_after(space, point, change)), vector)
     offsets = change[len(vector) :].reshape(point.offsets.shape)
-    return Point(jnp.asarray(after), point.offsets + jnp.asarray(offsets))
+    return Point(after, np.asarray(point.offsets) + offsets)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import partial
 from itertools import pairwise
 from typing import Any, Protocol
 
@@ -12,14 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lanes import Argument, Program
+from lanes import Argument, Program, program_of
 from sim_jax.environment import Air
 from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.terms import total
 from sim_jax.terms.total import total_wrench
 from tuner.core.numerics import Array
 from tuner.equation_error.measured import Measured
-from tuner.objective.flown import CODE
+from tuner.objective.simulation import CODE
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model, with_coefficients
 
@@ -173,22 +173,12 @@ def _numbers(parameters: Sequence[Parameter], point: Array) -> tuple[dict[str, A
 def _program_for(given: Any) -> Program:
     model, numbers, steps = given
     arguments = (
-        jax.tree.map(lambda leaf: Argument(np.shape(leaf), leaf.dtype, lanes=False), model),
-        {name: Argument((), float, lanes=False, moves=True) for name in numbers},
-        jax.tree.map(lambda leaf: Argument(np.shape(leaf)[:-1], float, lanes=True), steps),
+        jax.tree.map(partial(Argument.of, lanes=False), model),
+        dict.fromkeys(numbers, Argument((), float, lanes=False, moves=True)),
+        jax.tree.map(partial(Argument.of, lanes=True), steps),
     )
-    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
-    return _program(tuple(leaves), structure)
-
-
-@lru_cache(maxsize=16)
-def _program(leaves: tuple[Argument, ...], structure: Any) -> Program:
-    return Program(
-        _accelerations,
-        jax.tree.unflatten(structure, leaves),
-        name="accelerations",
-        made_of=total.TERMS,
-        packages=CODE,
+    return program_of(
+        _accelerations, arguments, name="accelerations", made_of=total.TERMS, packages=CODE
     )
 
 

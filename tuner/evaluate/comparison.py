@@ -32,8 +32,6 @@ from tuner.evaluate.write import roll_pitch_yaw
 from tuner.findings.findings import one_line
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of
-from tuner.objective.flight import MOTION, SPEEDS, TURNED
-from tuner.objective.flown import Flown, fly
 from tuner.objective.initial_conditions import recent_command
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.noise import noise_of
@@ -46,11 +44,12 @@ from tuner.objective.segments import (
     segments_of,
     window_segments,
 )
+from tuner.objective.simulation import MOTION, SPEEDS, TURNED, Flown, fly
 from tuner.objective.space import Space
 from tuner.objective.windows import Window, windows_of
 from tuner.options import RecordingOptions
 from tuner.search.job_flights import Recording, as_logged, read_usable
-from tuner.search.least_squares import FAR
+from tuner.search.levenberg_marquardt import FAR
 from tuner.search.problem import limits_of
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import ControllerFile, VehicleFile, check_mixer, read_vehicle
@@ -75,7 +74,7 @@ class Comparison:
     Parameters
     ----------
     recordings
-        At least one. Their clock offsets are taken as known (`with_offsets` of
+        At least one. Their clock offsets are taken as known (`with_known` of
         `tuner.search.job_flights`); one that a fit would estimate counts as zero.
     window
         s, length of the windows of flights that are not simulated in a closed loop; None takes

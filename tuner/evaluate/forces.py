@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lanes import Argument, Program
+from lanes import Argument, program_of
 from sim_jax.constants import GRAVITY
 from sim_jax.environment import Air, Environment
 from sim_jax.geometry import Quaternion, Vec3
@@ -24,7 +24,7 @@ from sim_jax.terms import total
 from sim_jax.terms.total import wrench_of_each_term
 from sim_jax.vehicle import Vehicle
 from tuner.core.numerics import Array
-from tuner.objective.flown import CODE
+from tuner.objective.simulation import CODE
 
 COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
 """Force in N and moment in N m, about the centre of mass in body axes."""
@@ -88,21 +88,14 @@ def acting(
     calm = np.zeros(flights)
     air = [np.repeat(along, samples) for along in (*(wind or (calm, calm)), calm)]
     given = (jax.tree.map(np.asarray, vehicle), *rows, np.stack(air))
-    leaves, structure = jax.tree.flatten(given)
-    shapes = [
-        Argument(np.shape(leaf), np.result_type(leaf), lanes=False)
-        for leaf in jax.tree.leaves(given[0])
-    ]
-    by_lane = [Argument(np.shape(leaf)[:-1], float, lanes=True) for leaf in leaves[len(shapes) :]]
-    program = _program((*shapes, *by_lane), structure)
+    of_vehicle, *of_lanes = given
+    arguments = (
+        jax.tree.map(partial(Argument.of, lanes=False), of_vehicle),
+        *(Argument.of(rows, lanes=True) for rows in of_lanes),
+    )
+    program = program_of(_acting, arguments, name="forces", made_of=total.TERMS, packages=CODE)
     acted: dict[str, Array] = program(given, lanes=flights * samples).values
     return {name: values.reshape(flights, samples, 6) for name, values in acted.items()}
-
-
-@lru_cache(maxsize=16)
-def _program(arguments: tuple[Argument, ...], structure: Any) -> Program:
-    tree = jax.tree.unflatten(structure, arguments)
-    return Program(_acting, tree, name="forces", made_of=total.TERMS, packages=CODE)
 
 
 def _acting(given: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:

@@ -24,9 +24,9 @@ from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings.flight import Flight
 from tuner.search.fitted import Fitted
 from tuner.search.iteration import PointEstimate
-from tuner.search.job_flights import with_conditions, with_offsets
-from tuner.search.loop import loop_of
+from tuner.search.job_flights import with_known
 from tuner.search.problem import Job
+from tuner.search.progress import loop_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, VehicleFile, initial_values, with_values
 from tuner.vehicle.controller import PositionControl
 
@@ -111,8 +111,9 @@ def conditions_of(job: Job, fitted: Fitted) -> dict[str, dict[str, float]]:
 
 def comparison_of(job: Job, fitted: Fitted) -> Comparison:
     """Return the job's recordings laid out as the search ended: controller, clocks, air."""
-    recordings = with_offsets(job.recordings, offsets_of(job, fitted))
-    recordings = with_conditions(recordings, conditions_of(job, fitted))
+    recordings = with_known(
+        job.recordings, time_offset=offsets_of(job, fitted), conditions=conditions_of(job, fitted)
+    )
     window = job.settings.job.search.window
     return Comparison(recordings, controller_flown(job, fitted), window=window)
 

@@ -19,10 +19,9 @@ from tuner.config.job import InletName
 from tuner.core.numerics import Array
 from tuner.findings.sentences import PREDICTED
 from tuner.objective.battery import with_reference_voltage
-from tuner.objective.flight import MOTION
-from tuner.objective.flown import fly
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import Segments, window_segments
+from tuner.objective.simulation import MOTION, fly
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import States, states_at
 from tuner.vehicle import ControllerFile, VehicleFile

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import starmap
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +15,7 @@ import numpy as np
 from annotated_types import Interval
 from jax import lax
 
-from lanes import Argument, Program
+from lanes import Argument, program_of
 from sim_jax.constants import GRAVITY
 from sim_jax.environment import NOTHING_AROUND
 from sim_jax.geometry import Vec3
@@ -33,8 +32,7 @@ from tuner.core.shipped import find_config
 from tuner.core.yaml_section import Number, Section, build
 from tuner.engine import Here, Report, current
 from tuner.evaluate.forces import Forces, forces_of
-from tuner.objective.flight import MOTION, SETPOINTS, SPEEDS, TURNED, recorded_of
-from tuner.objective.flown import CODE
+from tuner.objective.simulation import CODE, MOTION, SETPOINTS, SPEEDS, TURNED, recorded_of
 from tuner.objective.trajectory import Published, at_speed, published
 from tuner.options import SimulationOptions
 from tuner.recordings.flight import Series
@@ -305,8 +303,15 @@ def _logged(
         jax.tree.map(lambda leaf: kind(leaf, lanes=False, table=True), shared[1]),
         jax.tree.map(lambda leaf: kind(leaf, lanes=False), shared[2]),
     )
-    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
-    program = _program(tuple(leaves), structure, schedule, precision)
+    program = program_of(
+        _flight,
+        arguments,
+        schedule,
+        precision,
+        name="simulated flight",
+        made_of=(schedule, precision, total.TERMS),
+        packages=CODE,
+    )
     lanes = len(next(iter(columns.values()))) if columns else 1
     rows_of, crash_time = program(given, lanes=lanes, turns=samples).values
     motion, setpoints = rows_of[MOTION], rows_of[SETPOINTS]
@@ -323,37 +328,27 @@ def _logged(
     return {name: np.asarray(rows, np.float64) for name, rows in logged.items()}, crash_time
 
 
-@lru_cache(maxsize=16)
-def _program(
-    leaves: tuple[Argument, ...], structure: Any, schedule: Schedule, precision: Precision
-) -> Program:
-    def fly(given: Any, lengths: Mapping[str, int]) -> tuple[dict[str, Any], Any]:
-        columns, model, inlet, start = given
-        flown = with_coefficients(model, columns)
-        plant, first = begun(
-            flown.vehicle,
-            flown.controller,
-            schedule,
-            inlet,
-            hover(flown.vehicle, start),
-            precision=precision,
-        )
-
-        def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
-            after, row = plant.sample(state, number)
-            channels = (SPEEDS, "command", MOTION, TURNED, SETPOINTS)
-            return after, recorded_of(row, flown, NOTHING_AROUND, {}, channels)
-
-        last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))
-        return logged, last.crash_time
-
-    return Program(
-        fly,
-        jax.tree.unflatten(structure, leaves),
-        name="simulated flight",
-        made_of=(schedule, precision, total.TERMS),
-        packages=CODE,
+def _flight(
+    schedule: Schedule, precision: Precision, given: Any, lengths: Mapping[str, int]
+) -> tuple[dict[str, Any], Any]:
+    columns, model, inlet, start = given
+    flown = with_coefficients(model, columns)
+    plant, first = begun(
+        flown.vehicle,
+        flown.controller,
+        schedule,
+        inlet,
+        hover(flown.vehicle, start),
+        precision=precision,
     )
+
+    def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
+        after, row = plant.sample(state, number)
+        channels = (SPEEDS, "command", MOTION, TURNED, SETPOINTS)
+        return after, recorded_of(row, flown, NOTHING_AROUND, {}, channels)
+
+    last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))
+    return logged, last.crash_time
 
 
 def _sent(reference: Published, clock: Array, control_rate: float) -> dict[str, Array]:

@@ -36,13 +36,10 @@ from tuner.search.estimation import stages_of
 from tuner.search.job_flights import (
     Recording,
     read_usable,
-    with_conditions,
-    with_inputs_late,
-    with_offsets,
+    with_known,
 )
-from tuner.search.optimiser import Free
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Progress, beginning
+from tuner.search.progress import Free, Progress, beginning
 from tuner.vehicle import (
     COEFFICIENTS,
     ControllerFile,
@@ -335,8 +332,8 @@ def _comparison(run: Run, recorded: Recorded, missing: Collection[str] = ()) -> 
         name: {n: value for n, value in flight.conditions.items() if n not in missing}
         for name, flight in ended.items()
     }
-    recordings = with_offsets(recordings, {name: f.time_offset for name, f in ended.items()})
-    recordings = with_conditions(recordings, acted)
+    offsets = {name: f.time_offset for name, f in ended.items()}
+    recordings = with_known(recordings, time_offset=offsets, conditions=acted)
     return Comparison(recordings, settings.controller, window=settings.job.search.window)
 
 
@@ -358,7 +355,7 @@ def recordings_of(run: Run) -> Recorded:
         if flight.sha256 != wanted[flight.name].sha256:
             raise InputError(flight.path, "is not the recording of the run", "fit it again")
     late = {name: flight.input_late for name, flight in wanted.items()}
-    return settings, with_inputs_late(recordings, late)
+    return settings, with_known(recordings, input_late=late)
 
 
 def _settings(run: Run) -> Settings:

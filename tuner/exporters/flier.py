@@ -26,9 +26,8 @@ from sim_jax.schedule import Schedule
 from sim_jax.sensing import packed, push, switched
 from sim_jax.state import Limits, State
 from tuner.core.numerics import Array
-from tuner.objective.flight import beginning_of, recorded_of
-from tuner.objective.flown import Flown
 from tuner.objective.segments import Segments
+from tuner.objective.simulation import Flown, beginning_of, recorded_of
 from tuner.vehicle.model import Model
 
 
@@ -50,7 +49,7 @@ class Body(Protocol):
 
 
 def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
-    """Return what flies segments as `tuner.objective.flown.fly` does, in another simulator.
+    """Return what flies segments as `tuner.objective.simulation.fly` does, in another simulator.
 
     Parameters
     ----------

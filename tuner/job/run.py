@@ -47,7 +47,7 @@ from tuner.job.results import (
 from tuner.report import render, write_search, write_traces
 from tuner.report.result_texts import export_sentence
 from tuner.result import BEST_FIT_FILE, Run, RunResult
-from tuner.search.estimation import OnProgress, parameters_of
+from tuner.search.estimation import OnProgress
 from tuner.search.explanation import Explanation
 from tuner.search.findings import inputs_late, turning_unexplained, voltage_taken
 from tuner.search.fitted import Fitted
@@ -381,7 +381,9 @@ def _keeping_best(folder: Path, listener: Listener) -> OnProgress:
 
     def on_progress(job: Job, progress: Progress) -> None:
         with suppress(ConfigError):  # on its way a search may cross what no rigid body can have
-            best = with_values(job.settings.vehicle, parameters_of(job, progress))
+            best = with_values(
+                job.settings.vehicle, job.space.numbers(progress.best_point.coefficients)
+            )
             write_vehicle(best, folder / BEST_FIT_FILE, header="Best so far of an unfinished run.")
         report(job, progress)
 

@@ -24,13 +24,13 @@ from tuner.objective.normal import Objective
 from tuner.options import ExaminationOptions
 from tuner.report import render
 from tuner.report.contents import About, Recording, write_traces
+from tuner.search.continuation import SWITCH_GAIN
 from tuner.search.findings import UNMATCHED, loop_findings
 from tuner.search.fitted import Fitted, by_flight
 from tuner.search.job_flights import as_logged, read_usable
-from tuner.search.loop import GAIN, loop_of, with_loop
 from tuner.search.normal_equations import misfit, root_mean_squares
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import beginning, plain_criterion
+from tuner.search.progress import beginning, loop_of, plain_criterion, with_loop
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.model_error import alternatives_of
@@ -51,7 +51,7 @@ def unfitted(job: Job) -> Fitted:
     loops = [configured, *map(configured.switched, job.undecided(job.objective))]
     matches = [_match(with_loop(job.objective, loop), vector) for loop in loops]
     match = min(matches, key=lambda match: match.loss)
-    if matches[0].loss <= GAIN * match.loss:
+    if matches[0].loss <= SWITCH_GAIN * match.loss:
         match = matches[0]
     names = [flight.name for flight in job.fitted]
     return Fitted(

@@ -74,11 +74,11 @@ def _evaluated(
     flown, reading = objective.fly(point, criterion), objective.reading(point, criterion)
     loss, squares = np.zeros(len(together)), {}
     for name, measured in objective.segments.measured.items():
-        scale = np.asarray(criterion.scale[name])[objective.flight]
+        scale = criterion.scale[name][objective.flight]
         by_axis = np.zeros((len(together), np.shape(measured.weight)[1]))
         for block in residuals(flown, objective.segments, name, reading):
             scaled = block.errors / scale[block.segments, None, None]
-            loss[block.segments] += 0.5 * robust(scaled, float(criterion.huber)).sum(axis=(1, 2))
+            loss[block.segments] += 0.5 * robust(scaled, criterion.huber).sum(axis=(1, 2))
             by_axis[block.segments] += np.einsum("fnk,fnk->fk", block.errors, block.errors)
         squares[name] = np.moveaxis(by_axis.reshape(count, segments, -1), -1, 1)
     return Batch(loss.reshape(count, segments), squares, flown.crash_time.reshape(count, segments))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.objective.segments import OFFSETS
@@ -46,8 +46,9 @@ class Point(eqx.Module):
     offsets: Float[Either, "offsets N"]
 
 
-class Criterion(eqx.Module):
-    """What changes from one stage of the search to the next, without compiling again.
+@dataclass(frozen=True)
+class Criterion:
+    """What changes from one stage of the search to the next.
 
     Attributes
     ----------
@@ -68,11 +69,11 @@ class Criterion(eqx.Module):
         deviations; None where starts are known.
     """
 
-    horizon: Int[Either, ""]
+    horizon: int
     scale: dict[str, Float[Either, " N"]]
     reference_offset: Float[Either, "clocks N"]
-    huber: Float[Either, ""]
-    prior: Float[Either, ""]
+    huber: float = np.inf
+    prior: float = 1.0
     states: Float[Either, "L F"] | None = None
 
 
@@ -102,6 +103,11 @@ class SegmentSums(eqx.Module):
     counts: dict[str, Float[Either, " F"]]
     crash_time: Float[Either, " F"]
     states: Float[Either, "L F"] | None
+
+    @property
+    def compared(self) -> Any:
+        """How many values were compared, in all segments together."""
+        return sum(np.sum(np.asarray(count), axis=-1) for count in self.counts.values())
 
 
 class Jacobian(eqx.Module):

@@ -283,8 +283,8 @@ def information_from_jacobian(
     """
     space, flight, segments = objective.space, objective.flight, objective.segments.count
     channels = tuple(jacobian.residuals)
-    scales = np.stack([np.asarray(criterion.scale[channel])[flight] for channel in channels])
-    seconds = float(criterion.horizon) / float(objective.schedule.log_rate)
+    scales = np.stack([criterion.scale[channel][flight] for channel in channels])
+    seconds = criterion.horizon / float(objective.schedule.log_rate)
     blocks = max(int(seconds / BLOCK), 1)
     states = 0 if criterion.states is None else len(criterion.states)
     size = len(space) + point.offsets.shape[0] + states
@@ -300,7 +300,7 @@ def information_from_jacobian(
         for segment, scale in enumerate(scales[number]):
             rows = np.moveaxis(columns[..., segment], 0, -1) / scale  # as it lies in memory
             error = residuals[..., segment] / scale
-            robust = huber_weights(error, float(criterion.huber))
+            robust = huber_weights(error, criterion.huber)
             stretch = np.minimum((time[:, segment] / BLOCK).astype(int), blocks - 1)
             for index in range(blocks):
                 inside = stretch == index
@@ -326,7 +326,7 @@ def information_from_jacobian(
         score=np.einsum("lap,clbp->clba", along, score * to_scaled),
         spread=spread,
         nuisance_prior=prior,
-        prior=np.diag(float(criterion.prior) ** 2 / space.prior_sd**2),
+        prior=np.diag(criterion.prior**2 / space.prior_sd**2),
         crashed=np.isfinite(np.asarray(jacobian.crash_time)),
         begins=objective.segments.begins,
         scale=scales,
@@ -336,7 +336,7 @@ def information_from_jacobian(
         },
         ground=None
         if space.joint_prior is None
-        else float(criterion.prior) ** 2 * space.joint_rows.T @ space.joint_rows,
+        else criterion.prior**2 * space.joint_rows.T @ space.joint_rows,
         pull=_pull(space, point, criterion),
         nuisance_pull=pull,
     )
@@ -381,10 +381,8 @@ def _along(
 
 def _pull(space: Space, point: Point, criterion: Criterion) -> Array:
     """Return the slope (K,) of the loss of the priors and of ground measurements."""
-    scaled = np.asarray(space.scaled(point.coefficients))
-    slope = (scaled - space.prior_mean) / space.prior_sd**2
-    slope = slope + space.joint_rows.T @ (space.joint_rows @ scaled + space.joint_offset)
-    return np.asarray(float(criterion.prior) ** 2 * slope)
+    slope = space.prior_rows.T @ space.prior_residuals(point.coefficients)
+    return np.asarray(criterion.prior**2 * slope)
 
 
 def _without_start(whole: Array, kept: int) -> Array:

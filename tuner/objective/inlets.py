@@ -122,6 +122,8 @@ class RecordedInlet(ABC):
     """Groups of terms that are free from the beginning where the job leaves the choice."""
     has_mixer: ClassVar[bool] = False
     """Whether the mixer, which is that of a quad X, is simulated."""
+    computed_at: ClassVar[str | None] = None
+    """The rate of a `Schedule` at which the flight controller computes the signal."""
     remedy: ClassVar[str] = "use inlet: auto"
     """What to do where a signal is missing."""
 
@@ -153,8 +155,7 @@ class RecordedInlet(ABC):
 
     def update_rate(self, schedule: Schedule) -> float | None:
         """Return the Hz at which the flight controller computes the signal; None if measured."""
-        del schedule
-        return None
+        return None if self.computed_at is None else float(getattr(schedule, self.computed_at))
 
     @abstractmethod
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> Inlet:
@@ -249,10 +250,7 @@ class RecordedBodyRate(RecordedInlet):
     starts_recorded = False
     window = 1.0
     has_mixer = True
-
-    def update_rate(self, schedule: Schedule) -> float:
-        """Return the rate of the position controller."""
-        return schedule.position_control_rate
+    computed_at = "position_control_rate"
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> BodyRateInlet:
         """Lay both set-points out step by step."""
@@ -271,10 +269,7 @@ class RecordedCommand(RecordedInlet):
     frees = STEADY_TORQUE
     terms = AIR
     ignores = ("rate_integral",)
-
-    def update_rate(self, schedule: Schedule) -> float:
-        """Return the rate of the rate controller."""
-        return schedule.rate_control_rate
+    computed_at = "rate_control_rate"
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
         """Lay the commands out step by step."""
@@ -317,10 +312,7 @@ class _RecordedThrust(RecordedInlet):
     feeds = ActuatorInlet
     needs = ("thrust_setpoint",)
     ignores = ()
-
-    def update_rate(self, schedule: Schedule) -> float:
-        """Return the rate of the position controller."""
-        return schedule.position_control_rate
+    computed_at = "position_control_rate"
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
         """Lay the set-points out step by step, for each of four rotors."""

@@ -1,6 +1,6 @@
 """Loss, gradient and Gauss-Newton Hessian of a fit, segment by segment, keeping no Jacobian.
 
-Flying is a kernel's (`tuner.objective.flown`); reading a simulation at the recorded stamps and
+Flying is a kernel's (`tuner.objective.simulation`); reading a simulation at the recorded stamps and
 summing up is linear, and NumPy's. While sums are made, segments come first in every array, columns
 of derivatives last.
 """
@@ -27,12 +27,12 @@ from tuner.objective.criterion import (
     SegmentSums,
     units_of,
 )
-from tuner.objective.flown import Flown, fly
 from tuner.objective.initial_conditions import eliminated
 from tuner.objective.residuals import Reading, gauss_newton, residuals, robust
 from tuner.objective.segments import OFFSETS, Segments
-from tuner.objective.space import Space, Tunable
-from tuner.vehicle.model import Model
+from tuner.objective.simulation import Flown, fly
+from tuner.objective.space import Space
+from tuner.vehicle.model import Model, with_coefficients
 
 Array = NDArray[np.float64]
 
@@ -90,10 +90,10 @@ class Objective(eqx.Module):
         """What was measured, in the order of jax's trees: sums do not depend on how it was laid."""
         return tuple(sorted(self.segments.measured))
 
-    @property
-    def tunable(self) -> Tunable:
-        """The model and what moves it."""
-        return Tunable(self.model, self.space)
+    def model_at(self, vector: ArrayLike) -> Model:
+        """Return the model with the coefficients of a search vector (K,)."""
+        values = self.space.values(np.asarray(vector))
+        return with_coefficients(self.model, {name: np.asarray(v) for name, v in values.items()})
 
     def start(self, vector: ArrayLike) -> Point:
         """Return a point with a search vector and no offset."""
@@ -127,10 +127,10 @@ class Objective(eqx.Module):
             self.model,
             self.segments,
             self.schedule,
-            samples=min(int(criterion.horizon), self.samples),
+            samples=min(criterion.horizon, self.samples),
             limits=self.limits,
             coefficients=self.space.values(point.coefficients),
-            states=None if criterion.states is None else np.asarray(criterion.states),
+            states=None if criterion.states is None else criterion.states,
             conditions={name: values[self.flight] for name, values in conditions.items()},
             tangents=self._directions(point, moving) or None,
         )
@@ -144,9 +144,9 @@ class Objective(eqx.Module):
         """Return how such a simulation is read to be compared; the arguments are those of `fly`."""
         return Reading(
             np.asarray(point.offsets)[: len(OFFSETS), self.flight] * OFFSET_UNIT,
-            np.asarray(criterion.reference_offset)[:, self.flight],
+            criterion.reference_offset[:, self.flight],
             float(self.schedule.log_rate),
-            int(criterion.horizon),
+            criterion.horizon,
             sum(moving.values()),
             moving.get("coefficients", 0) if "conditions" in moving else None,
             OFFSET_UNIT,
@@ -216,9 +216,7 @@ class Objective(eqx.Module):
     ) -> Iterator[tuple[slice, Objective, Criterion]]:
         """Return the segments in parts whose logged derivatives fit some bytes of memory."""
         measured = self.segments.measured.values()
-        logged = min(int(criterion.horizon), self.samples) * sum(
-            np.shape(m.values)[1] for m in measured
-        )
+        logged = min(criterion.horizon, self.samples) * sum(np.shape(m.values)[1] for m in measured)
         one = 8 * (sum(moving.values()) + 1) * logged
         size = max(int(memory // max(one, 1)), 1)
         for first in range(0, self.segments.count, size):
@@ -231,12 +229,12 @@ class Objective(eqx.Module):
     def _sums(self, point: Point, criterion: Criterion, moving: Mapping[str, int]) -> SegmentSums:
         """Return what all segments contribute at once."""
         flown, reading = self.fly(point, criterion, moving), self.reading(point, criterion, moving)
-        segments, total, huber = self.segments.count, reading.total, float(criterion.huber)
+        segments, total, huber = self.segments.count, reading.total, criterion.huber
         gradient, hessian = np.zeros((segments, total)), np.zeros((segments, total, total))
         loss, squares, counts, by_start = np.zeros(segments), {}, {}, {}
         starts = moving.get("states", 0)
         for name in self.channels:
-            scale = np.asarray(criterion.scale[name])[self.flight]
+            scale = criterion.scale[name][self.flight]
             square, count = np.zeros(segments), np.zeros(segments)
             slope, bend = np.zeros((segments, starts)), np.zeros((segments, starts, starts))
             for block in residuals(flown, self.segments, name, reading):
@@ -256,7 +254,7 @@ class Objective(eqx.Module):
             squares[name], counts[name], by_start[name] = square, count, (slope, bend)
         best = None
         if criterion.states is not None:
-            states = np.asarray(criterion.states)
+            states = criterion.states
             loss, gradient, hessian, best = eliminated(loss, gradient, hessian, states)
             change = (best - states).T
             for name, (slope, bend) in by_start.items():
@@ -309,7 +307,7 @@ def some_segments(
 ) -> tuple[Objective, Criterion]:
     """Return problem and criterion of some segments alone; flights keep their numbers."""
     kept: Segments = jax.tree.map(lambda leaf: np.asarray(leaf)[..., which], objective.segments)
-    states = None if criterion.states is None else np.asarray(criterion.states)[:, which]
+    states = None if criterion.states is None else criterion.states[:, which]
     return replace(objective, segments=kept), replace(criterion, states=states)
 
 

@@ -14,8 +14,8 @@ from lanes import Argument, Program, joined
 from sim_jax.geometry import Quaternion
 from sim_jax.numeric import Array as JaxArray
 from tuner.core.numerics import huber_weights
-from tuner.objective.flown import CODE, Flown
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Segments
+from tuner.objective.simulation import CODE, Flown
 
 RAMP = 0.25
 """Share of the time between two jumps of a zero-order hold that the ramp to the next takes."""

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
+from functools import partial
 
 import jax
 import numpy as np
 
-from lanes import Argument, Program
+from lanes import Argument, program_of
 from sim_jax.control.gains import Controller
 from sim_jax.control.geometric import (
     ReferencePoint,
@@ -28,8 +27,8 @@ from sim_jax.control.geometric import (
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Array as JaxArray
 from tuner.findings.findings import Code, Finding
-from tuner.objective.flown import CODE
 from tuner.objective.inlets import linear_interpolation, zero_order_hold
+from tuner.objective.simulation import CODE
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.model import controller_of
@@ -191,26 +190,13 @@ def _computed(flight: Flight, controller: ControllerFile, time: Array) -> Array:
         state[name] = held
     given = {name: values.T for name, values in state.items()}, controller_of(controller)
     arguments = (
-        {name: Argument(rows.shape[:-1], float, lanes=True) for name, rows in given[0].items()},
-        jax.tree.map(
-            lambda leaf: Argument(np.shape(leaf), np.result_type(leaf), lanes=False), given[1]
-        ),
+        {name: Argument.of(rows, lanes=True) for name, rows in given[0].items()},
+        jax.tree.map(partial(Argument.of, lanes=False), given[1]),
     )
-    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
-    rates: Array = _program(tuple(leaves), structure)(given, lanes=len(now)).values
+    name = "rate set-points of a controller file"
+    program = program_of(_rates, arguments, name=name, made_of=(), packages=CODE)
+    rates: Array = program(given, lanes=len(now)).values
     return rates.reshape(len(LATENCIES), len(time), 3)
-
-
-@lru_cache(maxsize=8)
-def _program(leaves: tuple[Argument, ...], structure: Any) -> Program:
-    arguments = jax.tree.unflatten(structure, leaves)
-    return Program(
-        _rates,
-        arguments,
-        name="rate set-points of a controller file",
-        made_of=(),
-        packages=CODE,
-    )
 
 
 def _rates(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int]) -> JaxArray:

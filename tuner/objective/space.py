@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +16,6 @@ from tuner.core.errors import ConfigError
 from tuner.vehicle import ControllerFile, VehicleFile, initial_values
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.joint_prior import JointPrior
-from tuner.vehicle.model import Model, coefficients_in, with_coefficients
 from tuner.vehicle.registry import COEFFICIENTS
 from tuner.vehicle.vehicle import Size, size_of, sized
 
@@ -50,6 +48,7 @@ class Space:
         self.joint_rows, self.joint_offset = np.zeros((0, len(self))), np.zeros(0)
         if joint_prior is not None:
             self.joint_rows, self.joint_offset = joint_prior.rows(self.parameters, self.fixed)
+        self.prior_rows = np.vstack([np.diag(1.0 / self.prior_sd), self.joint_rows])
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -75,6 +74,16 @@ class Space:
     def scaled(self, vector: ArrayLike) -> NDArray[np.float64]:
         """Return the scaled coordinates of search vectors (*S, K)."""
         return np.asarray(self.lower + self.width * self.share(vector))
+
+    def prior_residuals(self, vector: ArrayLike) -> NDArray[np.float64]:
+        """Return (*S, R) what half the square of is the priors' loss at search vectors (*S, K).
+
+        Of each parameter's own prior, then of the joint one. Their derivatives by the scaled
+        coordinates are ``prior_rows`` (R, K).
+        """
+        scaled = self.scaled(vector)
+        own = (scaled - self.prior_mean) / self.prior_sd
+        return np.concatenate([own, scaled @ self.joint_rows.T + self.joint_offset], axis=-1)
 
     def at(self, vector: Any) -> Any:
         """Return the parameters' values at search vectors (*S, K), which may be traced."""
@@ -269,31 +278,3 @@ def parameter_of(
         usual=row.prior_sd if row.scale == "linear" else 0.0,
         moved=moved,
     )
-
-
-class Tunable(eqx.Module):
-    """What a search vector moves: a model, in which the other coefficients stay."""
-
-    model: Model
-    space: Space = eqx.field(static=True)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Every coefficient: the model's, and what the vector brings in."""
-        return tuple({**coefficients_in(self.model), **dict.fromkeys(self.space.free)})
-
-    def values(self, vector: ArrayLike) -> dict[str, NDArray[np.float64]]:
-        """Return coefficient -> value at a search vector (K,), on the host."""
-        values = {**coefficients_in(self.model), **self.space.values(np.asarray(vector))}
-        return {name: np.asarray(value, float) for name, value in values.items()}
-
-    def slopes(self, vector: ArrayLike) -> dict[str, NDArray[np.float64]]:
-        """Return moved coefficient -> its derivatives (K,) at a search vector, on the host."""
-        return self.space.slopes(np.asarray(vector))
-
-    def at(self, vector: ArrayLike) -> Model:
-        """Return the model with the coefficients of a search vector (K,), which may be traced."""
-        if isinstance(vector, jax.core.Tracer):
-            return with_coefficients(self.model, self.space.values(vector))
-        moved = self.space.values(np.asarray(vector))
-        return with_coefficients(self.model, {name: np.asarray(v) for name, v in moved.items()})

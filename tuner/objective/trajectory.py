@@ -19,7 +19,7 @@ from sim_jax.numeric import Array, Scalar
 from sim_jax.trajectory import TICK_RATE, Shape, publish, shapes
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
-from tuner.objective.flown import CODE
+from tuner.objective.simulation import CODE
 from tuner.recordings.flight import Flight
 
 

@@ -82,11 +82,14 @@ def windows_of(
     """
     stretches = _stretches(flight, seconds, stride)
     usable = _usable(flight, stretches, fed)
-    windows = [
-        _window(flight, first, last, state, smoothed_widely=smoothed_widely)
-        for (first, last), state in zip(usable, _states(flight, usable), strict=True)
-        if _is_known(state)
-    ]
+    windows = []
+    if usable:
+        states = states_at(flight.series, flight.time[[first for first, _ in usable]])
+        windows = [
+            _window(flight, first, last, state, smoothed_widely=smoothed_widely)
+            for number, (first, last) in enumerate(usable)
+            if _is_known(state := states.at(number))
+        ]
     if not windows:
         if _usable(flight, stretches, ()):
             what = " and ".join(name.replace("_", " ") for name in fed)
@@ -139,32 +142,26 @@ def _stretches(flight: Flight, seconds: float, stride: float | None) -> list[tup
 def _usable(
     flight: Flight, stretches: Sequence[tuple[int, int]], fed: Collection[str]
 ) -> list[tuple[int, int]]:
-    """Return the stretches with poses, and with signals that are fed in known throughout."""
-    known, time = _Known(flight, fed), flight.time
-    return [(a, b) for a, b in stretches if known.throughout(float(time[a]), float(time[b]))]
+    """Return the stretches with poses, and with signals that are fed in never unknown for long."""
+    signals = [flight.series.get(name) for name in ("position", "attitude", *fed)]
+    series = [signal for signal in signals if signal is not None]
+    known = [s.time[np.isfinite(column)] for s in series[2:] for column in s.values.T]
+    if None in signals or any(len(time) < 2 for time in known):
+        return []
+    gaps = [(time, 2.0 * _period(time)) for time in known]
 
-
-class _Known:
-    """When the pose of a flight, and signals that are fed in, are known."""
-
-    def __init__(self, flight: Flight, fed: Collection[str]) -> None:
-        signals = [flight.series.get(name) for name in ("position", "attitude", *fed)]
-        series = [signal for signal in signals if signal is not None]
-        known = [s.time[np.isfinite(column)] for s in series[2:] for column in s.values.T]
-        lacks = None in signals or any(len(time) < 2 for time in known)
-        self._pose = np.empty(0) if lacks else series[0].time
-        self._fed = [] if lacks else [(time, _period(time)) for time in known]
-
-    def throughout(self, begin: float, end: float) -> bool:
-        """Return whether a stretch has poses, and its signals are never unknown for long."""
-        pose = _between(self._pose, begin, end)
+    def is_known(begin: float, end: float) -> bool:
+        pose = _between(series[0].time, begin, end)
         if len(pose) < FEWEST or np.diff(pose).max() > 0.5 * (end - begin):
             return False
         return all(
-            np.diff(_between(known, begin, end), prepend=begin, append=end).max()
-            <= max(UNFED * (end - begin), 2.0 * period)
-            for known, period in self._fed
+            np.diff(_between(time, begin, end), prepend=begin, append=end).max()
+            <= max(UNFED * (end - begin), gap)
+            for time, gap in gaps
         )
+
+    time = flight.time
+    return [(a, b) for a, b in stretches if is_known(float(time[a]), float(time[b]))]
 
 
 def _between(time: NDArray[np.float64], begin: float, end: float) -> NDArray[np.float64]:
@@ -179,33 +176,22 @@ def _period(time: NDArray[np.float64]) -> float:
     return usual if np.mean(np.abs(steps - usual) < 0.5 * usual) > STEADY else 0.0
 
 
-def _states(flight: Flight, stretches: Sequence[tuple[int, int]]) -> list[InitialState]:
-    """Return the recorded states at which some stretches begin."""
-    if not stretches:
-        return []
-    states = states_at(flight.series, flight.time[[first for first, _ in stretches]])
-    return [states.at(number) for number in range(len(stretches))]
-
-
 def _window(
     flight: Flight, first: int, last: int, recorded: InitialState, *, smoothed_widely: bool
 ) -> Window:
     begin, end = float(flight.time[first]), float(flight.time[last])
-    series = _around(flight.series, begin, end)
+    series, initial = _around(flight.series, begin, end), recorded
+    if smoothed_widely:  # but where a gap leaves too little
+        smoothed = initial_state(series)
+        initial = smoothed if _is_known(smoothed) else recorded
     stretch = replace(
         flight,
         time=flight.time[first : last + 1] - begin,
         signals={name: rows[first : last + 1] for name, rows in flight.signals.items()},
         series=series,
-        initial=_smoothed(series, recorded) if smoothed_widely else recorded,
+        initial=initial,
     )
     return Window(stretch, begin)
-
-
-def _smoothed(series: Mapping[str, Series], recorded: InitialState) -> InitialState:
-    """Return the state smoothed widely, or the recorded one where a gap leaves too little."""
-    smoothed = initial_state(series)
-    return smoothed if _is_known(smoothed) else recorded
 
 
 def _is_known(state: InitialState) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import jax
 import numpy as np
@@ -19,17 +20,24 @@ from tuner.objective.batch import sums_at
 from tuner.objective.criterion import OFFSET_UNIT, Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
-from tuner.search.evolution import CmaEs
+from tuner.search.evolution import evolve
 from tuner.search.iteration import Iteration
-from tuner.search.least_squares import LeastSquares, starts_asked_for
-from tuner.search.loop import FROM_START, GAIN, with_loop
+from tuner.search.levenberg_marquardt import descend, starts_asked_for
 from tuner.search.normal_equations import misfit, normal_equations, root_mean_squares, strays
-from tuner.search.optimiser import OPTIMISERS, Free, Iterate, StageProblem
-from tuner.search.progress import Progress, criterion_of, point_of
+from tuner.search.progress import (
+    Free,
+    Iterate,
+    Optimiser,
+    Progress,
+    StageProblem,
+    criterion_of,
+    point_of,
+    with_loop,
+)
 from tuner.search.stages import Stage
 
-__all__ = ["CmaEs", "LeastSquares", "grow"]  # the optimisers of every schedule
-
+OPTIMISERS: dict[str, Optimiser] = {"gradient": descend, "cma": evolve}
+"""What runs the stages that name it."""
 NO_OFFSET = np.array([0.0005, 0.0005, 0.002, 0.002, 0.002])
 """s: clocks that differ by less are taken to agree. A recording's clocks either share a source or
 differ by much more, and a tenth of a millisecond of freedom costs a percent of inertia. rad/s: a
@@ -39,6 +47,12 @@ MATERIAL = 0.01
 """Share of the loss by which it may rise, over all clocks that are set right."""
 RIDGE = 1e-12
 """Added to a Hessian of unit diagonal."""
+SWITCH_GAIN = 1.2
+"""The controller file's own choice is given up only for one that lowers the loss by this factor."""
+FROM_START = ("sees_markers",)
+"""Choices that the markers' coefficients take up while a hover is all that is seen: the other way
+is tried from where the search began. From markers that meet a hover as it did not fly, it flies
+worse than the wrong way, and no step leads out."""
 
 OnProgress = Callable[[Progress], None]
 
@@ -105,16 +119,13 @@ class _Search:
 
     def run(self, stage: Stage, progress: Progress, *, last: bool) -> Progress:
         """Run one stage to its end for every start at once."""
-        optimiser = OPTIMISERS[stage.optimiser]
         problem = _problem(self, stage, progress, last=last)
-        state = optimiser.init(problem)
-        converged = False
-        while progress.steps < stage.steps and not converged:
-            state, iterate = optimiser.step(problem, state)
+        for iterate in islice(OPTIMISERS[stage.optimiser](problem), stage.steps):
             progress = _advanced(problem, progress, iterate)
             self.on_progress(progress)
-            converged = optimiser.terminate(problem, state)
-        return replace(_finished(problem, progress), converged=converged)
+            if iterate.converged:
+                break
+        return _finished(problem, progress)
 
     def decided(
         self,
@@ -153,20 +164,22 @@ class _Search:
                 rival = other.run(one, rival, last=False)
             rival = other.run(stage, rival, last=last)
             evaluations += rival.evaluations - begin.evaluations
-            better = best if best.losses.min() <= GAIN * rival.losses.min() else rival
+            better = best if best.losses.min() <= SWITCH_GAIN * rival.losses.min() else rival
             best = replace(better, evaluations=evaluations)
         return best
 
 
 def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -> StageProblem:
     """Return what the stage's optimiser minimises, from where the search stands."""
-    (points, kept), free = _offsets_that_matter(stage, progress), search.free
-    best = int(np.argmin(progress.losses))
+    points, free, best = progress.points, search.free, int(np.argmin(progress.losses))
+    kept = np.ones(points.offsets.shape[1:], bool)
+    if stage.prunes:  # what surrounds a flight is no clock
+        offsets = np.asarray(points.offsets[best])[: len(NO_OFFSET)]
+        kept[: len(NO_OFFSET)] = np.abs(offsets) * OFFSET_UNIT >= NO_OFFSET[:, None]
+        points = Point(points.coefficients, points.offsets * kept)
     problem = StageProblem(
         objective=with_loop(search.objective, progress.loop),
-        criterion=criterion_of(
-            stage, progress.scales, np.asarray(points.offsets[best]), progress.states
-        ),
+        criterion=criterion_of(stage, progress.scales, points.offsets[best], progress.states),
         stage=stage,
         points=points,
         losses=progress.losses,
@@ -175,26 +188,16 @@ def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -
         damping=progress.damping,
         last=last,
     )
-    return _with_clocks_set_right(problem, best) if stage.prunes else problem
-
-
-def _with_clocks_set_right(problem: StageProblem, best: int) -> StageProblem:
-    """Return the problem with the clocks at zero that hardly matter."""
-    free, points = problem.free, problem.points
-    if not free.offsets[: len(CLOCKS)].any():
+    if not stage.prunes or not problem.free.offsets[: len(CLOCKS)].any():
         return problem
     sums = sums_at(problem.objective, points, problem.criterion)
     stay = _clocks_that_differ(problem, best, sums)
+    free = Free(problem.free.coefficients, problem.free.offsets & stay)
     if not np.any(points.offsets[:, ~stay]):  # nothing moves: the points are flown already
-        return replace(problem, free=Free(free.coefficients, free.offsets & stay), sums=sums)
+        return replace(problem, free=free, sums=sums)
     points = Point(points.coefficients, points.offsets * stay)
-    clocks = np.asarray(points.offsets[best])[: len(CLOCKS)] * OFFSET_UNIT
-    return replace(
-        problem,
-        points=points,
-        criterion=replace(problem.criterion, reference_offset=clocks),
-        free=Free(free.coefficients, free.offsets & stay),
-    )
+    criterion = criterion_of(stage, progress.scales, points.offsets[best], progress.states)
+    return replace(problem, points=points, criterion=criterion, free=free)
 
 
 def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> NDArray[np.bool_]:
@@ -237,18 +240,6 @@ def _rise(inverse: NDArray[np.float64], late: NDArray[np.float64], clocks: list[
     return float(0.5 * late[clocks] @ scaled_solve(square, late[clocks]))
 
 
-def _offsets_that_matter(stage: Stage, progress: Progress) -> tuple[Point, NDArray[np.bool_]]:
-    """Return the points with small clock offsets set to none for the polish, and which are kept."""
-    points = progress.points
-    if not stage.prunes:
-        return points, np.ones(points.offsets.shape[1:], bool)
-    best = int(np.argmin(progress.losses))
-    kept = np.ones(points.offsets.shape[1:], bool)  # what surrounds a flight is no clock
-    offsets = np.asarray(points.offsets[best])[: len(NO_OFFSET)]
-    kept[: len(NO_OFFSET)] = np.abs(offsets) * OFFSET_UNIT >= NO_OFFSET[:, None]
-    return Point(points.coefficients, points.offsets * kept), kept
-
-
 def _advanced(problem: StageProblem, progress: Progress, iterate: Iterate) -> Progress:
     """Return where the search stands after a step of the stage."""
     best = int(np.argmin(iterate.losses))
@@ -285,6 +276,7 @@ def _finished(problem: StageProblem, progress: Progress) -> Progress:
         steps=0,
         iterate=None,
         damping=damping,
+        converged=iterate.converged,
     )
     if iterate.sums is None:
         return progress

@@ -1,13 +1,18 @@
-"""The search of a job, with its checkpoint: started, interrupted, gone on with."""
+"""The search of a job, started or resumed from its checkpoint, and the same search repeated.
+
+It is repeated with something changed: the last stages from where it ended, or all of it.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +29,18 @@ from tuner.search.continuation import grow
 from tuner.search.findings import findings_at, unmatched
 from tuner.search.fitted import Fitted, by_flight
 from tuner.search.iteration import Iteration, Outcome
-from tuner.search.loop import Loop, with_loop
-from tuner.search.optimiser import Free
+from tuner.search.levenberg_marquardt import LEAST_DAMPING
 from tuner.search.problem import Job
-from tuner.search.progress import Progress, beginning, criterion_of, point_of
+from tuner.search.progress import (
+    Free,
+    Loop,
+    Progress,
+    beginning,
+    criterion_of,
+    loop_of,
+    point_of,
+    with_loop,
+)
 from tuner.search.stages import Stage, left, plan
 
 
@@ -110,6 +123,10 @@ AGREE = 0.01
 """Starts whose losses differ by less than this share have reached the same minimum."""
 INSIDE = 0.02
 """Share of its range by which a start keeps away from a bound."""
+LAST_TWO, LAST, ROUGHLY = slice(-2, None), slice(-1, None), slice(-2, -1)
+"""Stages: polish and polish again, the latter alone where the weights are known, or the former."""
+ROUGH = 1e-3
+"""Share of the loss that a rough fit leaves to a linear step: a tenth of a term's least gain."""
 
 OnProgress = Callable[[Job, Progress], None]
 
@@ -148,21 +165,17 @@ def search(
     InputError
         There is no checkpoint to resume from, or it belongs to another job.
     """
-    method = job.settings.job.search.method
-    first = _Attempt(
-        job,
-        folder / CHECKPOINT,
-        "gradient" if method == "auto" else method,
-        on_progress,
-        findings,
-        provisional,
+    attempt = partial(
+        _attempt, job, on_progress=on_progress, findings=findings, provisional=provisional
     )
-    fitted = first.run(resume=resume)
+    method = job.settings.job.search.method
+    first = "gradient" if method == "auto" else method
+    fitted = attempt(folder / CHECKPOINT, first, resume=resume)
     doubt = _doubt(job, fitted) if method == "auto" and fitted.polished else None
     if doubt is None:
         return fitted
-    second = replace(first, checkpoint=folder / SECOND_CHECKPOINT, method="hybrid")
-    rival = second.run(resume=resume and second.checkpoint.exists())
+    checkpoint = folder / SECOND_CHECKPOINT
+    rival = attempt(checkpoint, "hybrid", resume=resume and checkpoint.exists())
     better = rival if _misfit(rival) < _misfit(fitted) else fitted
     doubt = replace(doubt, numbers={**doubt.numbers, "changed": float(better is rival)})
     return replace(
@@ -198,68 +211,54 @@ def _misfit(fitted: Fitted) -> float:
     return float(np.mean([np.log(s) for scale in fitted.scales.values() for s in scale.values()]))
 
 
-@dataclass(frozen=True)
-class _Attempt:
-    """One method's search, with its own checkpoint."""
+def _attempt(
+    job: Job,
+    checkpoint: Path,
+    method: str,
+    *,
+    resume: bool,
+    on_progress: OnProgress,
+    findings: tuple[Finding, ...],
+    provisional: bool,
+) -> Fitted:
+    """Run one method from the starts, or from where its checkpoint stands."""
+    key, starts = fingerprint(job), starting_vectors(job)
+    stages = stages_of(job, job.objective, method)
+    if job.windows is not None:  # flights that windows prepare are flown whole at once
+        stages = tuple(stage for stage in stages if stage.horizon == job.objective.samples)
+    free = Free(np.ones(len(job.space), bool), free_offsets(job))
+    start, spent = beginning(job.objective, starts), 0.0
+    progress = start
+    if resume:
+        progress, spent = load(checkpoint, key, start)
+    began = time.perf_counter() - spent
 
-    job: Job
-    checkpoint: Path
-    method: str
-    on_progress: OnProgress
-    findings: tuple[Finding, ...]
-    provisional: bool
-
-    def run(self, *, resume: bool) -> Fitted:
-        """Run the method from the starts, or from where its checkpoint stands."""
-        job, key = self.job, fingerprint(self.job)
-        stages, starts = self._stages(), starting_vectors(job)
-        free = Free(np.ones(len(job.space), bool), free_offsets(job))
-        start, spent = beginning(job.objective, starts), 0.0
-        progress = start
-        if resume:
-            progress, spent = load(self.checkpoint, key, start)
-        began = time.perf_counter() - spent
-
-        def on_progress(progress: Progress) -> None:
-            seconds = time.perf_counter() - began
-            save(self.checkpoint, key, progress, seconds)
-            remaining = left(stages, progress.stage, progress.steps, seconds)
-            self.on_progress(job, replace(progress, left=remaining))
-
-        if job.windows is not None and not resume:
-            progress = beginning(job.objective, _through_windows(job, starts, free))
-        progress = grow(
-            job.objective,
-            stages,
-            progress,
-            free=free,
-            undecided=job.undecided(job.objective),
-            on_progress=on_progress,
-            seed=job.settings.job.search.seed,
-            worth_polishing=lambda progress: not (self.provisional and _is_far_off(progress)),
-            start=start,
-        )
+    def keep(progress: Progress) -> None:
         seconds = time.perf_counter() - began
-        save(self.checkpoint, key, progress, seconds)
-        fitted = self._fitted(stages[-1], progress, starts, seconds)
-        return replace(fitted, polished=progress.stage == len(stages))
+        save(checkpoint, key, progress, seconds)
+        remaining = left(stages, progress.stage, progress.steps, seconds)
+        on_progress(job, replace(progress, left=remaining))
 
-    def _stages(self) -> tuple[Stage, ...]:
-        """Return the method's stages; flights that windows prepare are flown whole at once."""
-        stages = stages_of(self.job, self.job.objective, self.method)
-        if self.job.windows is None:
-            return stages
-        return tuple(stage for stage in stages if stage.horizon == self.job.objective.samples)
-
-    def _fitted(
-        self, stage: Stage, progress: Progress, starts: NDArray[np.float64], seconds: float
-    ) -> Fitted:
-        job, best = self.job, int(np.argmin(progress.losses))
-        point = point_of(progress.points, best)
-        objective = with_loop(job.objective, progress.loop)
-        criterion = criterion_of(stage, progress.scales, np.asarray(point.offsets), progress.states)
-        ends = zip(starts, progress.points.coefficients, progress.losses, strict=True)
-        outcomes = tuple(
+    if job.windows is not None and not resume:
+        progress = beginning(job.objective, _through_windows(job, starts, free))
+    progress = grow(
+        job.objective,
+        stages,
+        progress,
+        free=free,
+        undecided=job.undecided(job.objective),
+        on_progress=keep,
+        seed=job.settings.job.search.seed,
+        worth_polishing=lambda progress: not (provisional and _is_far_off(progress)),
+        start=start,
+    )
+    seconds = time.perf_counter() - began
+    save(checkpoint, key, progress, seconds)
+    ends = zip(starts, progress.points.coefficients, progress.losses, strict=True)
+    fitted = Fitted(
+        **_end(job, job.objective, stages[-1], progress),
+        noise=job.noise,
+        outcomes=tuple(
             Outcome(
                 origin="random" if number else "vehicle file",
                 loss=float(loss),
@@ -267,22 +266,28 @@ class _Attempt:
                 end=job.space.numbers(end),
             )
             for number, (start, end, loss) in enumerate(ends)
-        )
-        fitted = Fitted(
-            objective=objective,
-            point=point,
-            criterion=criterion,
-            noise=job.noise,
-            scales=by_flight(progress.scales, job.fitted),
-            iterations=progress.iterations,
-            outcomes=outcomes,
-            method=self.method,
-            evaluations=progress.evaluations,
-            wall_time=seconds,
-            loss_best=float(progress.losses[best]),
-            converged=progress.converged,
-        )
-        return replace(fitted, findings=(*self.findings, *findings_at(job, fitted)))
+        ),
+        method=method,
+        wall_time=seconds,
+        polished=progress.stage == len(stages),
+    )
+    return replace(fitted, findings=(*findings, *findings_at(job, fitted)))
+
+
+def _end(job: Job, objective: Objective, stage: Stage, progress: Progress) -> dict[str, Any]:
+    """Return what a `Fitted` says of where a search ended in a last stage."""
+    best = int(np.argmin(progress.losses))
+    point = point_of(progress.points, best)
+    return {
+        "objective": with_loop(objective, progress.loop),
+        "point": point,
+        "criterion": criterion_of(stage, progress.scales, point.offsets, progress.states),
+        "scales": by_flight(progress.scales, job.fitted),
+        "iterations": progress.iterations,
+        "evaluations": progress.evaluations,
+        "loss_best": float(progress.losses[best]),
+        "converged": progress.converged,
+    }
 
 
 def stages_of(job: Job, objective: Objective, method: str = "gradient") -> tuple[Stage, ...]:
@@ -327,11 +332,6 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     return free
 
 
-def parameters_of(job: Job, progress: Progress) -> Mapping[str, float]:
-    """Return the best coefficients so far."""
-    return job.space.numbers(progress.best_point.coefficients)
-
-
 def starting_vectors(job: Job) -> NDArray[np.float64]:
     """Return S start vectors (S, K): the vehicle file's, then random ones around it.
 
@@ -347,3 +347,119 @@ def starting_vectors(job: Job) -> NDArray[np.float64]:
     drawn = generator.uniform(-1.0, 1.0, (settings.starts - 1, len(space)))
     shares = np.clip(centre + drawn * reach, INSIDE, 1.0 - INSIDE)
     return np.vstack([first, space.at_share(shares)])
+
+
+def polished(
+    job: Job,
+    fitted: Fitted,
+    *,
+    free: Free,
+    title: str,
+    on_progress: Callable[[Progress], None],
+    stages: slice = LAST_TWO,
+    left: float | None = None,
+) -> Fitted:
+    """Return a fit polished again, by the last stages from its point.
+
+    Parameters
+    ----------
+    job
+        Gives the settings and the flights' names.
+    fitted
+        Its objective, which need not be the job's, and the point to begin at.
+    free
+        What may move.
+    title
+        What stands before the stages' names in messages.
+    on_progress
+        Called after every iteration.
+    stages
+        Which of the stages: of the last two the first weighs what the second polishes.
+    left
+        Share of the loss that may be left to gain: a rough fit.
+    """
+    names, point = [flight.name for flight in job.fitted], fitted.point
+    last = fitted.iterations[-1].damping if fitted.iterations else None
+    progress = replace(
+        beginning(fitted.objective, point.coefficients[None]),
+        points=Point(point.coefficients[None], point.offsets[None]),
+        scales={
+            channel: np.array([fitted.scales[name][channel] for name in names])
+            for channel in fitted.objective.segments.measured
+        },
+        states=fitted.criterion.states,
+        losses=np.array([fitted.loss_best]),
+        iterations=fitted.iterations,
+        evaluations=fitted.evaluations,
+        damping=np.array([np.clip(last, LEAST_DAMPING, 1.0) if last else 1.0]),
+    )
+    return _grown(
+        job,
+        fitted,
+        progress,
+        [_rough(stage, left) for stage in stages_of(job, fitted.objective)[stages]],
+        free=free,
+        undecided=(),
+        title=title,
+        on_progress=on_progress,
+    )
+
+
+def searched_again(
+    job: Job,
+    fitted: Fitted,
+    vector: NDArray[np.float64],
+    *,
+    free: Free,
+    title: str,
+    on_progress: Callable[[Progress], None],
+) -> Fitted:
+    """Return a fit searched for again by all stages from a start vector (K,).
+
+    The other arguments are those of `polished`. What terms that were missing did to a fit, a
+    coefficient at its bound say, is forgotten that way; what is undecided of the loop, too, is
+    tried both ways again. The fit is rough: the last polish is left to one of what proves to be
+    needed.
+    """
+    progress = replace(
+        beginning(fitted.objective, vector[None]),
+        iterations=fitted.iterations,
+        evaluations=fitted.evaluations,
+        loop=loop_of(job.objective),
+    )
+    *stages, polish, _ = stages_of(job, fitted.objective)
+    return _grown(
+        job,
+        fitted,
+        progress,
+        (*stages, _rough(polish, ROUGH)),
+        free=free,
+        undecided=job.undecided(fitted.objective),
+        title=title,
+        on_progress=on_progress,
+    )
+
+
+def _rough(stage: Stage, left: float | None) -> Stage:
+    if left is None:
+        return stage
+    return replace(stage, tolerance=max(stage.tolerance, left), rough=True)
+
+
+def _grown(
+    job: Job,
+    fitted: Fitted,
+    progress: Progress,
+    stages: Sequence[Stage],
+    *,
+    free: Free,
+    undecided: Sequence[str],
+    title: str,
+    on_progress: Callable[[Progress], None],
+) -> Fitted:
+    """Return where some stages lead."""
+    stages = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in stages)
+    progress = grow(
+        fitted.objective, stages, progress, free=free, undecided=undecided, on_progress=on_progress
+    )
+    return replace(fitted, **_end(job, fitted.objective, stages[-1], progress), polished=True)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Iterator
+from warnings import catch_warnings
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuner.objective.batch import CHUNK, evaluate
-from tuner.objective.criterion import Criterion, Point
-from tuner.objective.normal import Objective
-from tuner.search.optimiser import Iterate, Optimiser, StageProblem
-from tuner.search.progress import point_of
+from tuner.objective.criterion import Point
+from tuner.search.normal_equations import position_rmse
+from tuner.search.progress import Iterate, StageProblem, point_of
 
 POPULATION = CHUNK
 """Vectors in one generation."""
@@ -25,114 +21,54 @@ WIDEST = 0.25
 FLAT = 1e-3
 """A stage ends when the best losses of the last generations differ by less than this share."""
 
-Array = NDArray[np.float64]
 
+def evolve(problem: StageProblem) -> Iterator[Iterate]:
+    """Minimise a stage's loss by pycma from the best start; the flights' offsets stay as they are.
 
-@dataclass(frozen=True)
-class Evolution:
-    """A population under way.
-
-    Attributes
-    ----------
-    strategy
-        cma's own state, which it changes in place.
-    loss
-        (n, K) vectors -> (n,) losses and position RMSE in m.
-    vector, least
-        The best vector (K,) so far, and its loss.
+    The population is as wide as the coefficients' priors. The best vector so far takes the place of
+    the start that it came from.
     """
+    import cma  # noqa: PLC0415 (takes its time)
 
-    strategy: Any
-    loss: Callable[[Array], tuple[Array, Array]]
-    vector: Array
-    least: float = np.inf
-
-
-class CmaEs(Optimiser):
-    """CMA-ES from the best start so far, by pycma; the flights' offsets stay where they are."""
-
-    name = "cma"
-
-    def init(self, problem: StageProblem) -> Evolution:
-        """Return a population around the best start, as wide as its coefficients' priors."""
-        import cma  # noqa: PLC0415 (takes its time)
-
-        point, space = point_of(problem.points, problem.best), problem.objective.space
-        centre, moves = np.asarray(point.coefficients), _moves(problem)
-        spread = SPREAD * (space.prior_sd / space.width)[moves]
-        options = {
-            "bounds": [0.0, 1.0],
-            "CMA_stds": np.minimum(spread, WIDEST),
-            "seed": problem.seed,
-            "popsize": POPULATION,
-            "maxiter": problem.stage.steps,
-            "tolfunrel": FLAT,
-            "verbose": -9,
-        }
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            strategy = cma.CMAEvolutionStrategy(space.share(centre)[moves], 1.0, options)
-        return Evolution(strategy, _loss(problem.objective, point, problem.criterion), centre)
-
-    def step(self, problem: StageProblem, state: Evolution) -> tuple[Evolution, Iterate]:
-        """Fly one generation; the best vector takes the place of the start that it came from."""
-        space, start = problem.objective.space, problem.best
-        centre = np.asarray(problem.points.coefficients[start])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            drawn = state.strategy.ask()
-            shares = np.repeat(space.share(centre)[None], len(drawn), axis=0)
-            shares[:, _moves(problem)] = drawn
+    space, start = problem.objective.space, problem.best
+    point = point_of(problem.points, start)
+    moves = np.flatnonzero(problem.free.coefficients)
+    sums = problem.objective.sums(point, problem.criterion, derivatives=False)
+    coefficients, losses = np.array(problem.points.coefficients), np.array(problem.losses)
+    losses[start] = np.inf
+    options = {
+        "bounds": [0.0, 1.0],
+        "CMA_stds": np.minimum(SPREAD * (space.prior_sd / space.width)[moves], WIDEST),
+        "seed": problem.seed,
+        "popsize": POPULATION,
+        "maxiter": problem.stage.steps,
+        "tolfunrel": FLAT,
+        "verbose": -9,
+    }
+    share = space.share(point.coefficients)
+    with catch_warnings(action="ignore"):
+        strategy = cma.CMAEvolutionStrategy(share[moves], 1.0, options)
+    while True:
+        with catch_warnings(action="ignore"):
+            drawn = strategy.ask()
+            shares = np.repeat(share[None], len(drawn), axis=0)
+            shares[:, moves] = drawn
             vectors = space.at_share(shares)
-            losses, position_rmse = state.loss(vectors)
-            state.strategy.tell(drawn, list(losses))
-        best = int(np.argmin(losses))
-        if losses[best] < state.least:
-            state = replace(state, vector=vectors[best], least=float(losses[best]))
-        coefficients = np.array(problem.points.coefficients)
-        coefficients[start] = state.vector
-        kept = np.array(problem.losses)
-        kept[start] = state.least
-        iterate = Iterate(
-            points=Point(np.asarray(coefficients), problem.points.offsets),
-            losses=kept,
-            accepted=np.ones(len(kept), bool),
-            position_rmse=float(position_rmse[best]),
+            batch = evaluate(problem.objective, vectors, point, problem.criterion)
+            pull = problem.criterion.prior * space.prior_residuals(vectors)
+            total = batch.loss.sum(axis=-1) + 0.5 * (pull**2).sum(axis=-1)
+            tried = np.nan_to_num(total / max(sums.compared, 1.0), nan=np.inf, posinf=np.inf)
+            strategy.tell(drawn, list(tried))
+            reasons = strategy.stop()
+        best = int(np.argmin(tried))
+        if tried[best] < losses[start]:
+            coefficients[start], losses[start] = vectors[best], tried[best]
+        yield Iterate(
+            points=Point(coefficients.copy(), problem.points.offsets),
+            losses=losses.copy(),
+            accepted=np.ones(len(losses), bool),
+            position_rmse=position_rmse(
+                problem.objective, {n: s[best] for n, s in batch.squares.items()}, sums.counts
+            ),
+            converged=bool(reasons) and "maxiter" not in reasons,
         )
-        return state, iterate
-
-    def terminate(self, problem: StageProblem, state: Evolution) -> bool:  # noqa: ARG002
-        """Return whether pycma has a reason to stop other than the number of generations."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            reasons = state.strategy.stop()
-        return bool(reasons) and "maxiter" not in reasons
-
-
-def _moves(problem: StageProblem) -> NDArray[np.intp]:
-    return np.flatnonzero(problem.free.coefficients)
-
-
-def _loss(
-    objective: Objective, point: Point, criterion: Criterion
-) -> Callable[[Array], tuple[Array, Array]]:
-    """Return (n, K) vectors -> (n,) losses as least squares counts them, and position RMSE in m."""
-    space = objective.space
-    counts = objective.sums(point, criterion).counts
-    compared = max(float(sum(np.sum(number) for number in counts.values())), 1.0)
-    position = objective.segments.measured.get("position")
-    sigma = np.nan if position is None else 1.0 / np.asarray(position.weight).max()
-
-    def loss(vectors: Array) -> tuple[Array, Array]:
-        batch = evaluate(objective, vectors, point, criterion)
-        scaled = space.scaled(vectors)
-        pull = (scaled - space.prior_mean) / space.prior_sd * float(criterion.prior)
-        total = np.asarray(batch.loss).sum(axis=-1) + 0.5 * (pull**2).sum(axis=-1)
-        joint_pull = (scaled @ space.joint_rows.T + space.joint_offset) * float(criterion.prior)
-        total = total + 0.5 * (joint_pull**2).sum(axis=-1)
-        squares = np.asarray(batch.squares.get("position", np.full((len(vectors), 1, 1), np.nan)))
-        placed = float(np.sum(counts.get("position", np.nan))) or np.nan
-        rmse = sigma * np.sqrt(3.0 * squares.sum(axis=(1, 2)) / placed)
-        return np.nan_to_num(total / compared, nan=np.inf, posinf=np.inf), rmse
-
-    return loss

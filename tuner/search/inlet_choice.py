@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -81,26 +81,12 @@ FED_BY: dict[InletName, Source] = {"actuator": "command", "rotor_speed": "rotor_
 """Inlet in which the simulated vehicle turns by what was recorded of its rotors -> that signal."""
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Where a flight enters the simulated loop.
-
-    Attributes
-    ----------
-    inlet
-        The place.
-    because
-        Why it is not the most upstream one whose signals were recorded; None if it is.
-    """
-
-    inlet: InletName
-    because: Finding | None = None
-
-
 def choose_inlet(
     flight: Flight, requested: str, vehicle: VehicleFile, controller: ControllerFile
-) -> Choice:
+) -> tuple[InletName, Finding | None]:
     """Return where a flight enters: as requested, or for ``auto`` as its recording can bear.
+
+    And why it is not the most upstream place whose signals were recorded; None if it is.
 
     Parameters
     ----------
@@ -117,40 +103,34 @@ def choose_inlet(
         The recording does not hold what the inlet needs.
     """
     first = inlet_for(flight, requested)
-    if requested == "auto" and first == "reference" and _is_px4s(flight):
-        with suppress(RecordingError):
-            below = choose_inlet(_without_reference(flight), "auto", vehicle, controller)
-            names = (below.inlet,)
-            return Choice(below.inlet, Finding(Code.PX4_LOOPS, "info", flight.name, names=names))
     if requested == "auto" and first == "reference":
+        if any(note.code is NoteCode.PX4_REFERENCE for note in flight.notes):
+            with suppress(RecordingError):
+                below, _ = choose_inlet(_without_reference(flight), "auto", vehicle, controller)
+                return below, Finding(Code.PX4_LOOPS, "info", flight.name, names=(below,))
         match = match_setpoints(flight, controller)
         if match is not None and not match.is_ours:
             (because,) = setpoint_findings(flight, controller)
-            below = choose_inlet(_without_reference(flight), "auto", vehicle, controller)
-            return Choice(below.inlet, because)
+            below, _ = choose_inlet(_without_reference(flight), "auto", vehicle, controller)
+            return below, because
     if requested != "auto" or first not in FED_BY:
-        return Choice(first)
+        return first, None
     doubt: Explained | None = None
     for name, source in FED_BY.items():
         if not INLETS[name].can_be_fed(flight):
             continue
         told = explained(flight, vehicle, source)
-        measured = source == "rotor_speed"
         if (
             told is None
             or told.tilting >= EXPLAINS
-            or (measured and predicts_turning(flight, vehicle))
+            or (source == "rotor_speed" and predicts_turning(flight, vehicle))
         ):
-            return Choice(name, None if doubt is None else _finding(flight, name, doubt, vehicle))
+            return name, None if doubt is None else _finding(flight, name, doubt, vehicle)
         doubt = doubt or told
     assert doubt is not None
     if not INLETS["attitude"].can_be_fed(flight):
-        return Choice(first)
-    return Choice("attitude", _finding(flight, "attitude", doubt, vehicle))
-
-
-def _is_px4s(flight: Flight) -> bool:
-    return any(note.code is NoteCode.PX4_REFERENCE for note in flight.notes)
+        return first, None
+    return "attitude", _finding(flight, "attitude", doubt, vehicle)
 
 
 def _without_reference(flight: Flight) -> Flight:

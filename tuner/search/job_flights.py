@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tuner.config import Settings, TrajectorySettings
 from tuner.config.job import InletName
@@ -166,7 +166,11 @@ def read_usable(
 
 def _chosen(flights: Sequence[Flight]) -> tuple[list[Flight], list[Finding]]:
     """Return the flights without the manoeuvres of long recordings that are not fitted."""
-    chosen = {flight.name for flight in flights if not _is_passed_over(flight)}
+    chosen = {
+        flight.name
+        for flight in flights
+        if not any(note.code is NoteCode.NOT_CHOSEN for note in flight.notes)
+    }
     findings = []
     for path in dict.fromkeys(f.path for f in flights if f.name not in chosen):
         of_path = [flight for flight in flights if flight.path == path]
@@ -175,10 +179,6 @@ def _chosen(flights: Sequence[Flight]) -> tuple[list[Flight], list[Finding]]:
         names = (of_path[0].name, *fitted)
         findings.append(Finding(Code.MANOEUVRES_CHOSEN, "info", of_path[0].name, numbers, names))
     return [flight for flight in flights if flight.name in chosen], findings
-
-
-def _is_passed_over(flight: Flight) -> bool:
-    return any(note.code is NoteCode.NOT_CHOSEN for note in flight.notes)
 
 
 def left_out_of(name: str, error: RecordingError) -> Finding:
@@ -210,25 +210,14 @@ def recordings_of(
     return tuple(_assigned(settings, flight, flight.name in held_out) for flight in flights)
 
 
-def with_offsets(
-    recordings: Sequence[Recording], offsets: Mapping[str, float]
+def with_known(
+    recordings: Sequence[Recording], **known: Mapping[str, Any]
 ) -> tuple[Recording, ...]:
-    """Return recordings whose clocks are late by known s: flight name -> s."""
-    return tuple(replace(r, time_offset=offsets[r.flight.name]) for r in recordings)
-
-
-def with_conditions(
-    recordings: Sequence[Recording], conditions: Mapping[str, Mapping[str, float]]
-) -> tuple[Recording, ...]:
-    """Return recordings with what is known of their surroundings: flight name -> name -> value."""
-    return tuple(replace(r, conditions=conditions[r.flight.name]) for r in recordings)
-
-
-def with_inputs_late(
-    recordings: Sequence[Recording], late: Mapping[str, float]
-) -> tuple[Recording, ...]:
-    """Return recordings whose inputs are stamped late by known s: flight name -> s."""
-    return tuple(replace(r, input_late=late[r.flight.name]) for r in recordings)
+    """Return recordings of which more is known: a `Recording`'s field = flight name -> value."""
+    return tuple(
+        replace(r, **{field: of_flight[r.flight.name] for field, of_flight in known.items()})
+        for r in recordings
+    )
 
 
 def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
@@ -253,15 +242,14 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
         )
     flight = flight_in_rotor_order(flight, settings.vehicle)
     flight = with_speeds_in_si(with_commands(flight, settings.vehicle), settings.vehicle)
-    choice = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
-    chosen = choice.inlet
+    chosen, because = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
     if not INLETS[chosen].closed_loop:
         seconds = window_seconds([chosen], job.search.window)
         require_windows(flight, seconds, INLETS[chosen].fed(flight))
     if INLETS[chosen].has_mixer:
         check_mixer(settings.vehicle)
     late = None if offset == "free" else float(offset)
-    return Recording(flight, chosen, late, holdout, because=choice.because)
+    return Recording(flight, chosen, late, holdout, because=because)
 
 
 def _as_fitted(

@@ -11,6 +11,7 @@ kinks, where controllers' and motors' steps pass each other, of which a parabola
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -21,7 +22,15 @@ from numpy.typing import ArrayLike, NDArray
 from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
-from tuner.search.normal_equations import NormalEquations, normal_equations
+from tuner.search.normal_equations import (
+    NEAR,
+    NormalEquations,
+    normal_equations,
+    position_rmse,
+    root_mean_squares,
+)
+from tuner.search.progress import Iterate, StageProblem
+from tuner.search.stages import WEIGHED
 
 Array = NDArray[np.float64]
 
@@ -37,6 +46,18 @@ CHEAP = 8
 much less than one with them that a point is judged by it first."""
 RIDGE = 1e-13
 """Added to the Hessian's diagonal, relative to its largest element: a singular one has a factor."""
+FAR = 5.0
+"""Standard deviations beyond which no start is believed to lie."""
+MOVED = 0.3
+"""Standard deviations by which a start may differ from the one about which it was linearised."""
+HANDED_ON = 0.01
+"""Share of the loss: where a stage's normal equations predict no more, their step is not tried in
+it, but in the next. With 0.05 instead, a flight of noise among good ones leads the search astray,
+`examples/search_trials.py`."""
+LEAST_DAMPING = 1e-6
+"""λ that no stage begins below, relative to the Hessian per compared value."""
+SETTLED = 0.5 * 0.1**2
+"""Promised rise of the log-likelihood at which the last stage ends: a tenth of a standard error."""
 
 
 class Step(NamedTuple):
@@ -237,3 +258,118 @@ def _unpacked(packed: Array, like: Point) -> Point:
     return replace(
         like, coefficients=packed[:count], offsets=packed[count:].reshape(like.offsets.shape)
     )
+
+
+def descend(problem: StageProblem) -> Iterator[Iterate]:
+    """Minimise a stage's loss, every start's; coefficients and flights' offsets move together.
+
+    Where segments' starts are free, each point is flown from those that the best one asks for. A
+    point that was linearised about others may have seemed better than it is: if none is found to be
+    better still, it is flown again.
+    """
+    free = np.concatenate([problem.free.coefficients, problem.free.offsets.ravel()])
+    # about which starts (L, F) the next point is linearised, and the best one was
+    states = best_about = problem.criterion.states
+    step, losses = begin(problem.points, problem.damping, problem.sums), list[Array]()
+    while True:
+        step = advance(problem.objective, step, replace(problem.criterion, states=states), free)
+        assert step.sums is not None, "what has stepped has sums"
+        assert step.best is not None, "and so has what it found"
+        best, worst = int(np.argmin(step.loss)), _worst_of_most(problem.objective, step.sums)
+        asked, here = starts_asked_for(step.best, best, states), _of(step.sums, best)
+        found = Iterate(
+            points=step.point,
+            losses=step.loss,
+            accepted=step.accepted,
+            position_rmse=position_rmse(problem.objective, here.squares, here.counts),
+            damping=float(step.damping[best]),
+            sums=step.best,
+            next_start=_next_stage_start(problem, step, worst),
+        )
+        if not step.accepted[best] and are_far(asked, best_about):
+            states, best_about, losses = asked, asked, []
+            step = begin(step.point, step.damping)
+            yield found
+            continue
+        if step.accepted[best]:
+            states, best_about = asked, states
+        losses.append(found.losses)
+        yield replace(found, converged=_has_converged(problem, step, worst, losses))
+
+
+def _has_converged(
+    problem: StageProblem, step: Step, worst: Array, losses: Sequence[Array]
+) -> bool:
+    """Return whether every start is good enough for the next stage, or gains no more.
+
+    `Step.still` ends a start whose nine leading digits no longer change. No recording has so many,
+    so that a stage's tolerance ends it sooner: as soon as the loss gains less than that, by the
+    last accepted step or by the last three tries; or before that step is tried, where the normal
+    equations predict no gain that matters.
+    """
+    assert step.sums is not None, "what has stepped has sums"
+    stage, predicted = problem.stage, step.predicted_reduction
+    # windows that a model meets far from noise have no minimum that can be told from its valley
+    vague = problem.objective.segments.windowed & (worst > NEAR)
+    least = np.where(vague, max(stage.tolerance, WEIGHED), stage.tolerance)
+    if stage.rough:
+        little = predicted <= stage.tolerance
+    elif not problem.last:
+        little = (predicted <= HANDED_ON) & step.accepted & (worst <= NEAR)
+    else:
+        little = predicted * step.loss * step.sums.compared <= SETTLED
+    ended = little | (step.loss <= stage.enough) | step.still
+    if len(losses) > 1:
+        ended |= step.accepted & (losses[-2] - losses[-1] <= least * np.abs(losses[-1]))
+    if len(losses) > 3:
+        ended |= losses[-4] - losses[-1] <= least * np.abs(losses[-1])
+    return bool(np.all(ended))
+
+
+def _worst_of_most(objective: Objective, sums: SegmentSums) -> Array:
+    """Return (S,) by how many σ the middle flight's worst channel is off."""
+    channels = list(root_mean_squares(objective, sums).values())
+    return np.asarray(np.median(np.nan_to_num(channels).max(axis=0), axis=-1))
+
+
+def _next_stage_start(problem: StageProblem, step: Step, worst: Array) -> tuple[Point, Array]:
+    """Return what a next stage begins with: the trust that was earned, if the fit is near.
+
+    That is where most flights are met so well that the normal equations can be trusted. A model
+    that lacks something is led astray by long steps: the damping that a stage begins with holds it
+    where the last one ended. If the stage saw all there is to see, weights alone differ then.
+    """
+    near = step.accepted & (worst <= NEAR)
+    untried = near & (step.predicted_reduction <= HANDED_ON)
+    points: Point = jax.tree.map(
+        lambda new, old: np.where(untried.reshape(-1, *[1] * (old.ndim - 1)), new, old),
+        step.tried,
+        step.point,
+    )
+    trusted = near | (problem.stage.horizon >= problem.objective.samples)
+    return points, np.where(trusted, np.clip(step.damping, LEAST_DAMPING, 1.0), 1.0)
+
+
+def starts_asked_for(sums: SegmentSums, best: int, before: Array | None) -> Array | None:
+    """Return the segments' starts (L, F) that one of S points asks for.
+
+    Parameters
+    ----------
+    sums
+        At the points.
+    best
+        Number of the point.
+    before
+        (L, F) starts about which was linearised; None where they are known.
+    """
+    if before is None:
+        return None
+    asked = np.asarray(sums.states)[best]
+    return np.clip(np.where(np.isfinite(asked), asked, before), -FAR, FAR)
+
+
+def are_far(starts: Array | None, others: Array | None) -> bool:
+    """Return whether a linear model about some starts (L, F) is not to be trusted at others."""
+    if starts is None or others is None:
+        return False
+    return bool(np.abs(starts - others).max(initial=0.0) > MOVED)

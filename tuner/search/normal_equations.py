@@ -8,6 +8,7 @@ each channel of each flight weighs follows from what the model leaves unexplaine
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -53,29 +54,22 @@ def normal_equations(
         Where, in which terms, and what the segments contribute there.
     """
     vector, offsets = np.asarray(point.coefficients), np.asarray(point.offsets)
-    count, (kinds, flights), prior = len(space), offsets.shape, float(criterion.prior)
-    compared = max(sum(float(np.sum(n)) for n in sums.counts.values()), 1.0)
-    slope = space.slope(vector)
-    pull = (space.scaled(vector) - space.prior_mean) / space.prior_sd * prior
-    pulled = slope / space.prior_sd * prior
-    offset_pull = offsets / OFFSET_SD
+    count, (kinds, flights), prior = len(space), offsets.shape, criterion.prior
+    compared = max(float(sums.compared), 1.0)
+    rows = prior * space.prior_rows * space.slope(vector)
+    pull, offset_pull = prior * space.prior_residuals(vector), offsets / OFFSET_SD
     loss = float(np.sum(sums.loss)) + 0.5 * float(np.sum(pull**2) + np.sum(offset_pull**2))
     owner = np.eye(flights)[np.asarray(flight)]  # (F, N)
     by_segment = np.asarray(sums.gradient)
     gradient = np.concatenate(
         [
-            by_segment[:count].sum(axis=-1) + pulled * pull,
+            by_segment[:count].sum(axis=-1) + rows.T @ pull,
             (by_segment[count:] @ owner + offset_pull / OFFSET_SD).ravel(),
         ]
     )
     hessian = np.zeros((count + kinds * flights,) * 2)
     curved = np.asarray(sums.hessian)
-    hessian[:count, :count] = curved[:count, :count].sum(axis=-1) + np.diag(pulled**2)
-    joint_pull = (space.joint_rows @ space.scaled(vector) + space.joint_offset) * prior
-    joint_slope = space.joint_rows * slope * prior
-    loss += 0.5 * float(np.sum(joint_pull**2))
-    gradient[:count] += joint_slope.T @ joint_pull
-    hessian[:count, :count] += joint_slope.T @ joint_slope
+    hessian[:count, :count] = curved[:count, :count].sum(axis=-1) + rows.T @ rows
     across = (curved[:count, count:] @ owner).reshape(count, -1)
     hessian[:count, count:], hessian[count:, :count] = across, across.T
     # a flight's offsets meet only each other
@@ -104,6 +98,17 @@ def root_mean_squares(objective: Objective, sums: SegmentSums) -> dict[str, NDAr
         mean = np.asarray(squares) @ owner / np.maximum(counts, 1.0)
         residual[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
     return residual
+
+
+def position_rmse(
+    objective: Objective, squares: Mapping[str, Array], counts: Mapping[str, Array]
+) -> float:
+    """Return the position RMSE in m, of channel -> squares in σ and counts; NaN without any."""
+    if "position" not in counts:
+        return float("nan")
+    sigma = 1.0 / np.asarray(objective.segments.measured["position"].weight).max(initial=1e-30)
+    compared = float(np.sum(counts["position"])) or np.nan
+    return float(sigma * np.sqrt(3.0 * float(np.sum(squares["position"])) / compared))
 
 
 def strays(

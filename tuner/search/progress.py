@@ -1,23 +1,169 @@
-"""Where a search stands: all that is needed to go on, and what the solver needs to know of it."""
+"""Where a search stands, what it may move, and what an optimiser is asked and answers.
+
+An optimiser runs one stage of the search: a function that yields an `Iterate` after each step, at
+least one, until the stage has had enough of them. `tuner.search.continuation.OPTIMISERS` names it.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
+import equinox as eqx
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
+from sim_jax.control.gains import Controller
+from sim_jax.numeric import Scalar
+from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.search.iteration import Iteration
-from tuner.search.loop import USUAL, Loop, loop_of
-from tuner.search.optimiser import Iterate
 from tuner.search.stages import Stage
 
 HUBER = 4.0
 """Standard deviations beyond which a residual counts linearly, in the polish."""
+
+
+class Loop(NamedTuple):
+    """How the loop flies where set-ups differ and controller files are often wrong, 1 or 0 each.
+
+    By default as PX4 does, with an estimator that knows where the markers sit. The names are those
+    of the controller's leaves.
+
+    Attributes
+    ----------
+    saturation_feedback
+        Whether the mixer desaturates and the rate integrator stops where rotors are clipped, as in
+        PX4. A saturated yaw step shows it.
+    sees_markers
+        Whether position and attitude control see the motion capture's frame. A hover shows it: who
+        sees a frame that is tilted keeps away from where it was sent.
+    """
+
+    saturation_feedback: float = 1.0
+    sees_markers: float = 0.0
+
+    def switched(self, choice: str) -> Loop:
+        """Return the loop with one choice the other way."""
+        return self._replace(**{choice: 1.0 - getattr(self, choice)})
+
+
+def loop_of(objective: Objective) -> Loop:
+    """Return how an objective's loop flies."""
+    return Loop(*map(float, _leaves(objective.model.controller)))
+
+
+def with_loop(objective: Objective, loop: Loop) -> Objective:
+    """Return the objective whose loop flies so."""
+    changed: Objective = eqx.tree_at(
+        lambda o: _leaves(o.model.controller), objective, [np.asarray(choice) for choice in loop]
+    )
+    return changed
+
+
+def _leaves(controller: Controller) -> list[Scalar]:
+    return [controller.rate.saturation_feedback, controller.sees_markers]
+
+
+@dataclass(frozen=True)
+class Free:
+    """What a search may move.
+
+    Attributes
+    ----------
+    coefficients
+        (K,) of the search vector.
+    offsets
+        (offsets, N) of the flights.
+    """
+
+    coefficients: NDArray[np.bool_]
+    offsets: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class StageProblem:
+    """What an optimiser minimises in one stage.
+
+    Attributes
+    ----------
+    objective, criterion
+        The loss as a function of a point.
+    stage
+        How far to look, and when enough is gained.
+    points
+        The S points to start from.
+    losses
+        (S,) of the last stage; infinite before the first.
+    free
+        What may move in this stage.
+    seed
+        For an optimiser that draws at random; differs from stage to stage.
+    damping
+        (S,) λ to begin with, for an optimiser that damps its steps.
+    last
+        Whether no stage follows, so that what is found has to stand.
+    sums
+        The segments' at the points, where these were flown already.
+    """
+
+    objective: Objective
+    criterion: Criterion
+    stage: Stage
+    points: Point
+    losses: NDArray[np.float64]
+    free: Free
+    seed: int
+    damping: NDArray[np.float64]
+    last: bool
+    sums: SegmentSums | None = None
+
+    @property
+    def best(self) -> int:
+        """The number of the start with the least loss."""
+        return int(np.argmin(self.losses))
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """Where an optimiser stands after a step.
+
+    Attributes
+    ----------
+    points
+        The best S points so far, each that of its start.
+    losses
+        (S,) there: half the mean squared residual in (scaled) standard deviations, priors included.
+    accepted
+        (S,) whether the step found a better point.
+    position_rmse
+        m, over all flights up to the horizon, at the point tried by the best start.
+    damping
+        λ of the best start's next step; NaN for an optimiser without.
+    converged
+        Whether another step would gain nothing.
+    sums
+        The segments' sums at the best points, S first; None where they were not computed. The next
+        stage's weights and starts follow from those of the last step.
+    next_start
+        What the next stage begins with, if there is one: S points, of which one predicted to differ
+        by little has not been tried, and (S,) λ. None for ``points`` and a damping of 1.
+    """
+
+    points: Point
+    losses: NDArray[np.float64]
+    accepted: NDArray[np.bool_]
+    position_rmse: float
+    damping: float = float("nan")
+    converged: bool = False
+    sums: SegmentSums | None = None
+    next_start: tuple[Point, NDArray[np.float64]] | None = None
+
+
+Optimiser: TypeAlias = Callable[[StageProblem], Iterator[Iterate]]
 
 
 @dataclass(frozen=True)
@@ -60,8 +206,8 @@ class Progress:
     iterations: tuple[Iteration, ...]
     evaluations: int
     damping: NDArray[np.float64]
+    loop: Loop
     converged: bool = False
-    loop: Loop = USUAL
     left: float = float("nan")
     steps: int = 0
     iterate: Iterate | None = None
@@ -109,12 +255,11 @@ def criterion_of(
         (L, F) starts around which is linearised.
     """
     return Criterion(
-        horizon=np.asarray(stage.horizon),
-        scale={name: np.asarray(stage.noise_inflation * scale) for name, scale in scales.items()},
-        reference_offset=np.asarray(offsets[: len(CLOCKS)] * OFFSET_UNIT),
-        huber=np.asarray(HUBER if stage.robust else np.inf),
-        prior=np.asarray(1.0),
-        states=None if states is None else np.asarray(states),
+        horizon=stage.horizon,
+        scale={name: stage.noise_inflation * scale for name, scale in scales.items()},
+        reference_offset=np.asarray(offsets[: len(CLOCKS)]) * OFFSET_UNIT,
+        huber=HUBER if stage.robust else np.inf,
+        states=states,
     )
 
 
@@ -125,10 +270,9 @@ def plain_criterion(
 
     Residuals count in multiples of the noise, or of ``scales`` times the noise, as in a `Progress`.
     """
-    stage = Stage("plain", horizon, 1.0, False, False, 1, 1.0, False, False)
     start = beginning(objective, objective.space.initial[None])
     return criterion_of(
-        stage, scales or start.scales, np.asarray(start.points.offsets[0]), start.states
+        Stage("plain", horizon), scales or start.scales, start.points.offsets[0], start.states
     )
 
 

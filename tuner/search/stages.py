@@ -77,13 +77,13 @@ class Stage:
 
     name: str
     horizon: int
-    noise_inflation: float
-    robust: bool
-    offsets: bool
-    steps: int
-    tolerance: float
-    weighs: bool
-    prunes: bool
+    noise_inflation: float = 1.0
+    robust: bool = False
+    offsets: bool = False
+    steps: int = 1
+    tolerance: float = 1.0
+    weighs: bool = False
+    prunes: bool = False
     optimiser: str = "gradient"
     coefficients: bool = True
     enough: float = 0.0
@@ -102,12 +102,9 @@ def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple
                     name=f"first {seconds:g} s",
                     horizon=horizon,
                     noise_inflation=noise_inflation,
-                    robust=False,
                     offsets=seconds >= OFFSETS_FROM,
                     steps=min(16 if seconds < GENTLE else 8, steps),
                     tolerance=0.005 if seconds < GENTLE else 0.02,
-                    weighs=False,
-                    prunes=False,
                     enough=ENOUGH if seconds < GENTLE else 0.0,
                     decides=seconds == DECIDES_AT,
                 )
@@ -122,12 +119,10 @@ def window_schedule(samples: int, rate: float, *, robust: bool, steps: int) -> t
             name=f"first {samples * share / rate:.2g} s of every window",
             horizon=round(samples * share),
             noise_inflation=noise_inflation,
-            robust=False,
             offsets=offsets,
             steps=min(12, steps),
             tolerance=0.01,
             weighs=True,
-            prunes=False,
         )
         for share, noise_inflation, offsets in WINDOWS
     ]
@@ -136,7 +131,7 @@ def window_schedule(samples: int, rate: float, *, robust: bool, steps: int) -> t
 
 
 def _whole_stages(samples: int, *, robust: bool, steps: int) -> tuple[Stage, Stage, Stage]:
-    whole = Stage(WHOLE, samples, 1.0, False, True, min(10, steps), 1e-3, True, False)
+    whole = Stage(WHOLE, samples, offsets=True, steps=min(10, steps), tolerance=1e-3, weighs=True)
     polish = replace(whole, robust=robust, tolerance=1e-5, prunes=True, steps=min(15, steps))
     return (
         whole,

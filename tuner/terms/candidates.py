@@ -15,8 +15,8 @@ from tuner.objective.normal import Objective, with_conditions
 from tuner.objective.space import Space, extended
 from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
-from tuner.search.loop import loop_of, with_loop
 from tuner.search.problem import Job
+from tuner.search.progress import loop_of, with_loop
 from tuner.terms.score import EARNING
 from tuner.vehicle import COEFFICIENTS, conditions, term_groups, values_of
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow

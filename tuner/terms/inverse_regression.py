@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from types import MappingProxyType
 
 import equinox as eqx
@@ -49,19 +50,20 @@ from tuner.core.numerics import huber_weights, robust_sd, scaled_solve
 from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Point, SegmentSums
-from tuner.objective.flown import fly
 from tuner.objective.normal import Objective, some_segments
-from tuner.objective.space import Tunable
+from tuner.objective.simulation import fly
+from tuner.objective.space import Space
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import states_at
 from tuner.search.fitted import Fitted
-from tuner.search.least_squares import LeastSquares
+from tuner.search.levenberg_marquardt import descend
 from tuner.search.normal_equations import normal_equations
-from tuner.search.optimiser import Free, StageProblem
 from tuner.search.problem import Job
+from tuner.search.progress import Free, StageProblem
 from tuner.search.stages import Stage
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.model_error import alternatives_of
+from tuner.vehicle.model import Model, with_coefficients
 
 STRETCH = 0.2
 """s that the equations are weighed over: noise beyond some 5 Hz is averaged out."""
@@ -89,13 +91,13 @@ class Balance(eqx.Module):
     slope: Float[Array, "S n"]
 
     @eqx.filter_jit
-    def residuals(self, tunable: Tunable, vector: ArrayLike) -> Float[Array, "6 S F"]:
+    def residuals(self, model: Model, space: Space, vector: ArrayLike) -> Float[Array, "6 S F"]:
         """Return what forces and moments lack, in squares of rotor speeds.
 
         Forces along the body's axes in the middle of each stretch, then moments about them; those
         about x and y stand for squares at an arm of a metre.
         """
-        vehicle = tunable.at(jnp.asarray(vector)).vehicle
+        vehicle = with_coefficients(model, space.values(jnp.asarray(vector))).vehicle
         air = Air.around(vehicle, self.motion, rotor_acceleration=self.rotor_acceleration)
         acting = total_wrench(vehicle, self.motion, self.rotor_speed, air)
         force = self._force_lacking(vehicle, acting.force)
@@ -108,9 +110,9 @@ class Balance(eqx.Module):
         )
 
     @eqx.filter_jit
-    def jacobian(self, tunable: Tunable, vector: ArrayLike) -> Float[Array, "6 S F K"]:
+    def jacobian(self, model: Model, space: Space, vector: ArrayLike) -> Float[Array, "6 S F K"]:
         """Return the residuals' derivatives by the search vector."""
-        moved: Array = jax.jacfwd(lambda v: self.residuals(tunable, v))(jnp.asarray(vector))
+        moved: Array = jax.jacfwd(lambda v: self.residuals(model, space, v))(jnp.asarray(vector))
         return moved
 
     def _force_lacking(self, vehicle: Vehicle, acting: Vec3) -> Array:
@@ -167,7 +169,7 @@ def balance_of(objective: Objective, point: Point, flights: Sequence[Flight]) ->
     position, velocity, attitude, body_rate = (
         jnp.moveaxis(jnp.asarray(table), 1, 0) for table in columns.values()
     )
-    model = objective.tunable.at(jnp.asarray(point.coefficients))
+    model = objective.model_at(point.coefficients)
     logged = fly(
         model,
         segments,
@@ -215,7 +217,7 @@ TURNS = ("inertia_xx", "inertia_yy", "inertia_zz", "moment_constant")
 TOLERATED = 0.2
 """Share by which the loss of what was left out may be larger, a tenth in its residuals: least
 squares gains so much from flights that are like each other, and loses it on others."""
-LEFT_OUT = Stage("left out", 0, 1.0, True, False, 8, 1e-3, False, False)
+LEFT_OUT = Stage("left out", 0, robust=True, steps=8, tolerance=1e-3)
 """From the fit to all, a fit to the others is a few steps away, or with other inertia."""
 REPORT_ABOVE = 0.1
 """Share by which an inertia changes from which it is said."""
@@ -235,13 +237,13 @@ class _Settling:
         """
         objective, fitted = self.fitted.objective, self.fitted
         vector = np.array(begin, float)
-        tunable = objective.tunable
-        residuals = np.asarray(self.balance.residuals(tunable, vector))
+        model, space = objective.model, objective.space
+        residuals = np.asarray(self.balance.residuals(model, space, vector))
         inside = inside & np.isfinite(residuals).all(axis=(0, 1))
         held = np.isin(objective.space.names, list(set(fitted.held.values())))
         for _ in range(STEPS):
-            residuals = np.asarray(self.balance.residuals(tunable, vector))
-            columns = np.asarray(self.balance.jacobian(tunable, vector))
+            residuals = np.asarray(self.balance.residuals(model, space, vector))
+            columns = np.asarray(self.balance.jacobian(model, space, vector))
             moves = (columns[:, :, inside] != 0.0).any(axis=(0, 1, 2)) & ~held
             gradient, hessian = self._normal_equations(vector, residuals, columns, inside)
             free = np.flatnonzero(moves)
@@ -331,7 +333,7 @@ def with_inputs_balanced(
     """
     objective = fitted.objective
     segments = objective.segments
-    model = objective.tunable.at(np.asarray(fitted.point.coefficients))
+    model = objective.model_at(fitted.point.coefficients)
     frames = markers_of(model.vehicle), gyro_of(model.vehicle)
     if (
         objective.conditions
@@ -422,11 +424,8 @@ def _fitted_to(
         damping=np.ones(1),
         last=True,
     )
-    search = LeastSquares()
-    state = search.init(problem)
-    for _ in range(LEFT_OUT.steps):
-        state, iterate = search.step(problem, state)
-        if search.terminate(problem, state):
+    for iterate in islice(descend(problem), LEFT_OUT.steps):
+        if iterate.converged:
             break
     return np.asarray(iterate.points.coefficients[0])
 

@@ -412,9 +412,9 @@ def linear_of(
 
 def _loss_of(objective: Objective, criterion: Criterion, jacobian: Jacobian) -> float:
     """Return half the robust sum of squares, as the search counts it."""
-    limit = float(criterion.huber)
+    limit = criterion.huber
     return sum(
-        0.5 * float(robust(of / np.asarray(criterion.scale[name])[objective.flight], limit).sum())
+        0.5 * float(robust(of / criterion.scale[name][objective.flight], limit).sum())
         for name, of in jacobian.residuals.items()
     )
 

@@ -23,14 +23,19 @@ from tuner.core.phrases import listed
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.information import begun
 from tuner.objective.normal import Objective, with_conditions
-from tuner.search.estimation import OnProgress, free_offsets
+from tuner.search.estimation import (
+    LAST,
+    ROUGH,
+    ROUGHLY,
+    OnProgress,
+    free_offsets,
+    polished,
+    searched_again,
+)
 from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
-from tuner.search.loop import loop_of, with_loop
-from tuner.search.optimiser import Free
-from tuner.search.polish import LAST, ROUGH, ROUGHLY, polished, searched_again
 from tuner.search.problem import Job
-from tuner.search.progress import Progress
+from tuner.search.progress import Free, Progress, loop_of, with_loop
 from tuner.terms.candidates import (
     Selected,
     coefficients_in,

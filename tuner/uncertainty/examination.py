@@ -252,7 +252,7 @@ def whiteness(
 ) -> tuple[Residual, ...]:
     """Return the autocorrelation of the residuals of every channel of every flight."""
     results = []
-    seconds = float(criterion.horizon) / float(objective.schedule.log_rate)
+    seconds = criterion.horizon / float(objective.schedule.log_rate)
     segment_flight = objective.flight
     for number, name in enumerate(flights):
         segments = np.flatnonzero(segment_flight == number)  # windows follow each other

@@ -22,13 +22,11 @@ from numpy.typing import NDArray
 from tuner.core.numerics import scaled_solve
 from tuner.core.phrases import listed
 from tuner.objective.criterion import Point
-from tuner.search.estimation import free_offsets
+from tuner.search.estimation import LAST, LAST_TWO, free_offsets, polished
 from tuner.search.fitted import Fitted
 from tuner.search.normal_equations import normal_equations
-from tuner.search.optimiser import Free
-from tuner.search.polish import LAST, LAST_TWO, polished
 from tuner.search.problem import Job
-from tuner.search.progress import Progress
+from tuner.search.progress import Free, Progress
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.model_error import alternatives_of, lack_of

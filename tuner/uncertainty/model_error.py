@@ -34,10 +34,9 @@ from tuner.equation_error.unexplained import Law, Pair, unexplained
 from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import log_voltage_of, read_again
 from tuner.objective.criterion import Point
-from tuner.objective.flight import MOTION, SETPOINTS, SPEEDS, TURNED, environment_of
-from tuner.objective.flown import Flown, fly
 from tuner.objective.inlets import zero_order_hold
 from tuner.objective.normal import Objective
+from tuner.objective.simulation import MOTION, SETPOINTS, SPEEDS, TURNED, Flown, environment_of, fly
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
 from tuner.search.fitted import Fitted
@@ -114,7 +113,7 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
     if segments.windowed or not isinstance(segments.inlet, ReferenceInlet):
         return None
     vector = np.asarray(point.coefficients)
-    model = objective.tunable.at(jnp.asarray(vector))
+    model = objective.model_at(vector)
     conditions = objective.conditions_at(point)
     environment = environment_of(model, segments, conditions)
     driven = [not flight.tells_speeds for flight in flights]
@@ -140,7 +139,7 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         schedule,
         samples=objective.samples,
         limits=objective.limits,
-        coefficients=objective.tunable.values(vector),
+        coefficients=objective.space.values(vector),
         conditions=conditions,
         channels=(*_CHANNELS, MOTION, TURNED, SETPOINTS),
     )
@@ -199,7 +198,7 @@ def _read_again(
 ) -> dict[str, Objective]:
     """Return the problem with other readings of the voltmeters, if they matter to a fit."""
     segments = objective.segments
-    vehicle = objective.tunable.at(np.asarray(point.coefficients)).vehicle
+    vehicle = objective.model_at(point.coefficients).vehicle
     matters = bool(float(vehicle.effects.get("battery_exponent", 0.0)))
     if not flights or segments.log_voltage is None or not matters:
         return {}

@@ -90,14 +90,13 @@ def _refitted(
     count = len(objective.space)
     free = np.concatenate([np.ones(count), (offsets != 0.0).astype(float).ravel()])
     free[index] = 0.0
-    weak_priors = replace(criterion, prior=np.asarray(1.0 / WIDE))
+    weak_priors = replace(criterion, prior=1.0 / WIDE)
     points = Point(starts, np.repeat(offsets[None], len(starts), axis=0))
     step, previous = begin(points), np.full(len(starts), np.inf)
     for _ in range(MAX_ITERATIONS):
         step = advance(objective, step, weak_priors, free)
         assert step.sums is not None
-        compared = sum(np.asarray(n)[0].sum() for n in step.sums.counts.values())
-        chi = 2.0 * np.asarray(step.loss) * compared
+        chi = 2.0 * np.asarray(step.loss) * step.sums.compared[0]
         if np.all(previous - chi < TOLERANCE):
             break
         previous = chi

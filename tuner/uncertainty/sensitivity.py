@@ -183,7 +183,7 @@ def _over_time(
         for m in measured.values()
     )
     for channel, recorded in measured.items():
-        scale = np.asarray(criterion.scale[channel])[flight]
+        scale = criterion.scale[channel][flight]
         for segment in segments:
             time = np.asarray(recorded.time)[:, segment] + begins[segment]
             stretch = np.clip((time / end * BINS).astype(int), 0, BINS - 1)

@@ -19,7 +19,6 @@ from tuner.design.proposals import (
     proposals_in_words,
 )
 from tuner.design.ranking import CLEARANCE, Arena, candidates, rank_next_flights
-from tuner.objective import flown
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.examination import Examination, examine
@@ -43,9 +42,7 @@ def fitted() -> Fitted:
     swing = only(noisy, 0)
     exact_fit = making.fitted_of(swing, making.truth(swing))
     rough = {name: 200.0 * scale[:1] for name, scale in exact_fit.criterion.scale.items()}
-    criterion = eqx.tree_at(
-        lambda s: (s.scale, s.reference_offset), exact_fit.criterion, (rough, np.zeros((2, 1)))
-    )
+    criterion = replace(exact_fit.criterion, scale=rough, reference_offset=np.zeros((2, 1)))
     scales = {"swing": exact_fit.scales[making.FLIGHTS[0]]}
     return replace(exact_fit, criterion=criterion, scales=scales)
 
@@ -78,7 +75,7 @@ def test_candidates_are_flown_by_the_program_of_the_examination(
     def build(*_: object) -> None:
         raise AssertionError("a program was built for the candidates")
 
-    monkeypatch.setattr(flown, "Program", build)
+    monkeypatch.setattr("lanes.program.Program", build)
     assert ranked(examination, fitted).flights
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -13,19 +14,18 @@ import numpy as np
 import pytest
 
 from lanes import keep_code_in
+from lanes.program import _program_of
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import BodyRateInlet
 from sim_jax.state import hover
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
-from tuner.config import JobFile
 from tuner.core.disk import cache_folder
 from tuner.disturbances import extended_kalman_filter as ekf
 from tuner.disturbances.disturbances import COUNT, USUAL
 from tuner.disturbances.observer import Expected, Feed, first_errors
 from tuner.disturbances.recorded import Sampled
 from tuner.objective.segments import Segments
-from tuner.objective.space import Tunable, space_of
-from tuner.vehicle.model import model_of, schedule_of
+from tuner.vehicle.model import coefficients_in, model_of, schedule_of
 
 TICKS = 6
 ROOT = Path(__file__).parents[3]
@@ -50,7 +50,6 @@ print(*(float(np.sum(each)).hex() for each in test.told(*test.hovering())))
 def hovering() -> tuple[ekf.Schedule, Feed, Expected]:
     """Return a hover whose samples, at some of the ticks, scatter by their noise."""
     vehicle, controller = vehicle_file(), controller_file()
-    space = space_of(vehicle, controller, JobFile(free=("inertia_xx", "motor_constant")))
     model, schedule = model_of(vehicle, controller), schedule_of(controller)
     at = Vec3(*(jnp.full(1, number) for number in (0.1, -0.2, 1.0)))
     start = jax.tree.map(
@@ -77,7 +76,7 @@ def hovering() -> tuple[ekf.Schedule, Feed, Expected]:
     return (
         schedule,
         feed,
-        Expected(Tunable(model, space), space.initial, USUAL[:, None] + 1.0, np.ones((wide, 1))),
+        Expected(model, coefficients_in(model), USUAL[:, None] + 1.0, np.ones((wide, 1))),
     )
 
 
@@ -85,8 +84,9 @@ def told(schedule: ekf.Schedule, feed: Feed, expected: Expected) -> tuple[np.nda
     """Return whitened innovations of the filter, its loss, and derivatives with its gains."""
     found = ekf.filtered(schedule, feed, expected)
     assert found.gains is not None
-    directions = np.eye(2 + len(feed.offsets))[:2]
-    _, moved = ekf.innovations(schedule, feed, found.gains, expected, directions)
+    tangents = {"inertia_xx": np.array([1e-2, 0.0]), "motor_constant": np.array([0.0, 1e-6])}
+    tangents["offsets"] = np.zeros((2, len(feed.offsets)))
+    _, moved = ekf.innovations(schedule, feed, found.gains, expected, tangents)
     return found.white, found.loss, moved
 
 
@@ -95,9 +95,9 @@ def folder(tmp_path_factory):
     """An empty folder of kernels."""
     path = tmp_path_factory.mktemp("kernels")
     keep_code_in(path)
-    ekf._program.cache_clear()
+    _program_of.cache_clear()
     yield path
-    ekf._program.cache_clear()
+    _program_of.cache_clear()
     keep_code_in(cache_folder() / "kernels_of_tests")
 
 
@@ -106,14 +106,11 @@ def test_innovations_are_those_of_a_filter_in_matrices() -> None:
     schedule, feed, expected = hovering()
     white = told(schedule, feed, expected)[0][..., 0]
     short, in_flight = ekf._shortly_delayed(ekf._undelayed(schedule), expected)
-    static = ekf._Static("filter", short, (), in_flight, moves=False)
     given = ekf._given(feed, expected)
-    one = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf[..., 0]),
-        given._replace(order=None, model=None, coefficients={}),
-    )
-    one = one._replace(model=given.model, coefficients=given.coefficients)
-    observer, state = ekf._observer(one, static)
+    of_lanes = given.feed, given.expected.strengths, given.expected.noise
+    one, strengths, noise = jax.tree.map(lambda leaf: jnp.asarray(leaf[..., 0]), of_lanes)
+    taken = replace(given.expected, strengths=strengths, noise=noise)
+    observer, state = ekf.Observer.of(short, one, taken)
     size = len(first_errors(state, in_flight)) + COUNT
 
     def errors(change, state, number):

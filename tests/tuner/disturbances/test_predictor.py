@@ -38,9 +38,9 @@ from tuner.disturbances.predictor import (
 )
 from tuner.disturbances.refit import _equations, with_least_innovations
 from tuner.objective.criterion import Point
-from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.information import information_at, information_from_jacobian
 from tuner.objective.normal import Objective
+from tuner.objective.simulation import beginning_of, recorded_of
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.estimates import STEP
@@ -329,8 +329,7 @@ def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> 
     """A simulation would end there: the state frozen, and all samples that follow lost."""
     problem, predictor, point = fitted
     expected = predictor._expected(problem, point)
-    model = expected.tunable.at(expected.coefficients)
-    observer, state = Observer.of(predictor.schedule, predictor.feed, model, expected.strengths)
+    observer, state = Observer.of(predictor.schedule, predictor.feed, expected)
     height = state.motion.position.z
     state = eqx.tree_at(lambda s: s.motion.position.z, state, height - 2.0 * jnp.max(height) - 5.0)
     after = observer.next(state, jnp.zeros((COUNT, 2)), jnp.asarray(0))
@@ -383,7 +382,8 @@ def test_one_outlier_is_not_believed_and_many_in_a_row_are(fitted) -> None:
     ticks = np.flatnonzero(np.asarray(sampled.weight)[:, 0, 0])
 
     def sizes(moved: np.ndarray) -> np.ndarray:
-        values = sampled.values.at[moved, 1, 0].add(1.0)
+        values = np.array(sampled.values)
+        values[moved, 1, 0] += 1.0
         feed = eqx.tree_at(lambda f: f.samples["position"].values, predictor.feed, values)
         found = replace(predictor, feed=feed).at(problem, point).found
         return np.abs(np.asarray(found.white)[ticks, 1, 0])

@@ -4,13 +4,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from lanes.program import _program_of
 from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Wrench
 from sim_jax.terms import total
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
-from tuner.evaluate import simulate as module
 from tuner.evaluate.simulate import simulate
 from tuner.objective.trajectory import at_speed, published
 from tuner.recordings.flight import SIGNALS
@@ -94,7 +94,7 @@ def test_a_grid_flies_each_vehicle_as_it_flies_alone(vehicle):
 
 
 def test_a_large_grid_takes_turns(vehicle, monkeypatch):
-    monkeypatch.setattr(module, "CHUNK", 2)
+    monkeypatch.setattr("tuner.evaluate.simulate.CHUNK", 2)
     constants = [1.3e-5, 1.4e-5, 1.5e-5]
     grid = {"motor_constant": np.array(constants), "inertia_xx": np.array([0.025] * 3)}
     in_turns = fly(vehicle, "hover", grid=grid)
@@ -171,8 +171,8 @@ def test_a_force_that_is_defined_elsewhere_is_never_taken_from_what_is_kept(vehi
     east = []
     for newton in (0.0, 1.0):
         monkeypatch.setitem(PUSH, "newton", newton)
-        module._program.cache_clear()  # as in another process
+        _program_of.cache_clear()  # as in another process
         (hover,) = fly(vehicle, "hover")
         east.append(hover.signals["position"][-1, 0])
-    module._program.cache_clear()
+    _program_of.cache_clear()
     assert east[1] - east[0] > 0.01

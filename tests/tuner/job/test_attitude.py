@@ -74,14 +74,14 @@ def settings_of(vehicle, bag, **job):
 
 
 def test_auto_follows_the_attitude_where_commands_explain_no_turn(sparse, updated):
-    choice = choose_inlet(sparse, "auto", updated, ControllerFile())
-    assert choice.inlet == "attitude"
-    assert choice.because.code is Code.INLET_CHOSEN
-    line = one_line(choice.because)
+    inlet, because = choose_inlet(sparse, "auto", updated, ControllerFile())
+    assert inlet == "attitude"
+    assert because.code is Code.INLET_CHOSEN
+    line = one_line(because)
     assert "command, logged at 45 Hz, does not explain how the vehicle turned" in line
     assert "its recorded attitude is followed" in line
     assert line.endswith("Log the command as often as its loop runs.")
-    assert choose_inlet(sparse, "actuator", updated, ControllerFile()).inlet == "actuator"
+    assert choose_inlet(sparse, "actuator", updated, ControllerFile()) == ("actuator", None)
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +95,7 @@ def dense(full_flight):
 
 
 def test_auto_keeps_commands_that_explain_the_turns(dense, updated):
-    assert choose_inlet(dense, "auto", updated, ControllerFile()).because is None
-    assert choose_inlet(dense, "auto", updated, ControllerFile()).inlet == "actuator"
+    assert choose_inlet(dense, "auto", updated, ControllerFile()) == ("actuator", None)
 
 
 def test_commands_of_motors_in_another_order_need_not_be_logged_faster(dense, updated, monkeypatch):
@@ -104,14 +103,14 @@ def test_commands_of_motors_in_another_order_need_not_be_logged_faster(dense, up
     monkeypatch.setattr("tuner.search.inlet_choice.motor_order", lambda *_: seen)
     command = dense.series["command"]
     turned = Series(command.time, command.values[:, [1, 0, 3, 2]])
-    choice = choose_inlet(
+    inlet, because = choose_inlet(
         replace(dense, series={**dense.series, "command": turned}),
         "auto",
         updated,
         ControllerFile(),
     )
-    assert choice.inlet == "attitude"
-    line = one_line(choice.because)
+    assert inlet == "attitude"
+    line = one_line(because)
     assert "turned in the order in which it is read (correlation" in line
     assert "Log the" not in line
 

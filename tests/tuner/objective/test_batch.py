@@ -1,6 +1,7 @@
 """Many vectors at once against one after the other."""
 
-import equinox as eqx
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ def fit():
 
 
 def test_each_vector_gives_what_it_gives_alone(fit):
-    criterion = eqx.tree_at(lambda s: s.huber, criterion_of(fit), jnp.asarray(2.0))
+    criterion = replace(criterion_of(fit), huber=2.0)
     steps = np.random.default_rng(1).normal(0.0, 0.2, (CHUNK + 1, len(FREE)))
     vectors = np.asarray(fit.space.initial) + steps
     late = jnp.full((5, 2), 0.1)

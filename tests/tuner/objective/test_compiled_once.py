@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from lanes.digest import digest_of
+from lanes.program import _program_of
 from sim_jax.terms import total
 from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.config import Options, settle
-from tuner.objective import flown
+from tuner.objective import simulation
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
@@ -20,9 +21,9 @@ from tuner.search.problem import job_of
 
 def built(objective):
     """Return how many programs a Jacobian of a problem has built."""
-    before = flown._program.cache_info().misses
+    before = _program_of.cache_info().misses
     objective.sums(objective.start(objective.space.initial), criterion_of(objective))
-    return flown._program.cache_info().misses - before
+    return _program_of.cache_info().misses - before
 
 
 def shortened(flight, seconds):
@@ -59,7 +60,7 @@ def test_a_flight_of_another_length_is_the_same_program(flight, updated):
 
 
 def test_what_flies_is_kept_for_other_processes():
-    assert digest_of((flown._Static, total.TERMS), flown.CODE)
+    assert digest_of((simulation._Static, total.TERMS), simulation.CODE)
 
 
 def test_columns_do_not_depend_on_what_else_is_free():

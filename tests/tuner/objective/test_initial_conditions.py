@@ -20,7 +20,6 @@ from tests.tuner.uncertainty.making import (
     with_data,
 )
 from tuner.disturbances.predictor import unscaled
-from tuner.objective.flight import beginning_of
 from tuner.objective.initial_conditions import (
     ROWS,
     eliminated,
@@ -30,6 +29,7 @@ from tuner.objective.initial_conditions import (
     whole,
 )
 from tuner.objective.segments import segments_of
+from tuner.objective.simulation import beginning_of
 from tuner.recordings.loader import load_flight
 from tuner.vehicle.model import model_of
 
@@ -118,7 +118,7 @@ SPIN = np.array([0.0, 2.0])
 
 
 def test_a_filter_knows_the_start_that_a_fit_leaves_open():
-    free = replace(criterion_of(problem(("inertia_zz",))), states=jnp.zeros((1, 2)))
+    free = replace(criterion_of(problem(("inertia_zz",))), states=np.zeros((1, 2)))
     assert unscaled(free).states is None
 
 

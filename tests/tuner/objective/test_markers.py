@@ -11,8 +11,8 @@ from tests.tuner.uncertainty.making import (
     with_data,
 )
 from tuner.objective.criterion import Point
-from tuner.search.loop import Loop, with_loop
 from tuner.search.normal_equations import normal_equations
+from tuner.search.progress import Loop, with_loop
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import NotCarried
 

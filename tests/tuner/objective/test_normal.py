@@ -1,5 +1,7 @@
 """Gradient and Hessian against finite differences, on two short simulated flights."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -66,7 +68,7 @@ def test_hessian_is_symmetric_and_positive(fit):
 
 def test_a_horizon_cuts_what_is_compared(fit):
     criterion = criterion_of(fit)
-    short = eqx.tree_at(lambda s: s.horizon, criterion, jnp.asarray(400))
+    short = replace(criterion, horizon=400)
     point = Point(jnp.asarray(fit.space.initial + 0.2), jnp.zeros((5, 2)))
     whole = fit.sums(point, criterion, derivatives=True)
     part = fit.sums(point, short, derivatives=True)
@@ -78,7 +80,7 @@ def test_a_horizon_cuts_what_is_compared(fit):
 
 def test_huber_counts_large_residuals_linearly(fit):
     criterion = criterion_of(fit)
-    robust = eqx.tree_at(lambda s: s.huber, criterion, jnp.asarray(2.0))
+    robust = replace(criterion, huber=2.0)
     point = Point(jnp.asarray(fit.space.initial + 0.5), jnp.zeros((5, 2)))
     plain = fit.sums(point, criterion, derivatives=True)
     bounded = fit.sums(point, robust, derivatives=True)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from tuner.objective.flown import Flown
 from tuner.objective.residuals import Reading, at_stamps, residuals
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, Segments
+from tuner.objective.simulation import Flown
 
 RATE, TICKS = 400.0, 2000
 HALF = 0.5 / RATE

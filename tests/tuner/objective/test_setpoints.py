@@ -30,7 +30,7 @@ def test_the_controller_that_flew_is_recognised(flight):
         assert axis.correlation > 0.98
         assert abs(axis.bias) < 0.01
     assert setpoint_findings(flight, OURS) == ()
-    assert choose_inlet(flight, "auto", None, OURS).inlet == "reference"
+    assert choose_inlet(flight, "auto", None, OURS) == ("reference", None)
 
 
 def test_a_flight_is_matched_within_a_blink(flight):
@@ -76,10 +76,10 @@ def test_set_points_that_answer_an_old_state_are_said_to(flight):
 
 def test_set_points_of_another_controller_enter_below_the_reference(flight):
     foreign = with_setpoints(flight, lambda values: values[::-1] * [1.0, -1.0, 1.0])
-    choice = choose_inlet(foreign, "auto", None, OURS)
-    assert choice.inlet == "body_rate"
-    assert choice.because.code is Code.SETPOINTS_FOREIGN
-    assert choose_inlet(foreign, "reference", None, OURS).inlet == "reference"
+    inlet, because = choose_inlet(foreign, "auto", None, OURS)
+    assert inlet == "body_rate"
+    assert because.code is Code.SETPOINTS_FOREIGN
+    assert choose_inlet(foreign, "reference", None, OURS) == ("reference", None)
 
 
 def test_a_heading_flown_by_hand_is_recognised(flight):

@@ -9,7 +9,7 @@ import pytest
 from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
 from tuner.search import continuation
-from tuner.search.optimiser import Free
+from tuner.search.progress import Free
 
 FLIGHTS, POSE = 3, 0
 KNOWN, ALONE = 1e4, 10.0

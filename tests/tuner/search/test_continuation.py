@@ -14,8 +14,7 @@ from tuner.objective.segments import OFFSETS
 from tuner.search import continuation, levenberg_marquardt
 from tuner.search.continuation import _clocks_that_differ, grow
 from tuner.search.normal_equations import normal_equations
-from tuner.search.optimiser import Free
-from tuner.search.progress import beginning, criterion_of, point_of
+from tuner.search.progress import Free, beginning, criterion_of, point_of
 from tuner.search.stages import schedule_of
 
 FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input_scaling")

@@ -15,7 +15,7 @@ from tuner.search import estimation as module
 from tuner.search.estimation import starting_vectors
 from tuner.search.findings import end_findings, unmatched, voltage_taken
 from tuner.search.iteration import Outcome
-from tuner.search.loop import USUAL
+from tuner.search.progress import Loop
 from tuner.search.stages import left, plan
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.vehicle import ControllerFile
@@ -88,10 +88,10 @@ def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
     )
     one_stray = {"a": {"position": 1.0}, "b": {"position": 1.2}, "c": {"position": 90.0}}
     assert set(unmatched(one_stray)) == {"c"}
-    (finding,) = end_findings(job, USUAL, one_stray)
+    (finding,) = end_findings(job, Loop(), one_stray)
     assert (finding.code, finding.subject) == (Code.FLIGHT_UNMATCHED, "c")
     all_far = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}
-    (finding,) = end_findings(job, USUAL, all_far)
+    (finding,) = end_findings(job, Loop(), all_far)
     assert finding.code is Code.MODEL_UNMATCHED
     assert finding.numbers == {"unmatched": 3, "flights": 3, "noise_multiple": 35.0}
 

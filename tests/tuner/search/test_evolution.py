@@ -6,8 +6,7 @@ import pytest
 from tests.tuner.uncertainty.making import problem
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
-from tuner.search.optimiser import Free
-from tuner.search.progress import beginning
+from tuner.search.progress import Free, beginning
 from tuner.search.stages import Stage, plan
 
 FREE = ("inertia_zz", "motor_constant", "moment_constant")

@@ -12,7 +12,7 @@ from tuner.search.job_flights import (
     Recording,
     read_usable,
     recordings_of,
-    with_offsets,
+    with_known,
 )
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
@@ -55,7 +55,8 @@ def test_what_is_set_for_a_flight_wins_over_what_is_set_for_all(settings, flight
 
 
 def test_offsets_that_were_estimated_take_the_place_of_those_unknown(settings, flights):
-    late = with_offsets(recordings_of(settings, flights), {SPIN: 0.02, CIRCLE: -0.01})
+    offsets = {SPIN: 0.02, CIRCLE: -0.01}
+    late = with_known(recordings_of(settings, flights), time_offset=offsets)
     assert [recording.time_offset for recording in late] == [0.02, -0.01]
 
 

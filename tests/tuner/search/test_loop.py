@@ -10,9 +10,7 @@ from tests.tuner.uncertainty.making import problem, with_data
 from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
-from tuner.search.loop import Loop, loop_of, with_loop
-from tuner.search.optimiser import Free
-from tuner.search.progress import beginning
+from tuner.search.progress import Free, Loop, beginning, loop_of, with_loop
 from tuner.search.stages import schedule_of
 
 FRAME = {"marker_tilt_x": 0.0105, "marker_tilt_y": -0.0157, "motor_constant": 1.5e-5}

@@ -1,4 +1,4 @@
-"""An optimiser is added by one class: a stage names it, and so does a search's method."""
+"""An optimiser is added by one function: a stage names it, and so does a search's method."""
 
 import importlib
 import sys
@@ -8,9 +8,8 @@ import pytest
 
 from tests.tuner.uncertainty.making import problem
 from tuner.objective.segments import OFFSETS
-from tuner.search.continuation import grow
-from tuner.search.optimiser import OPTIMISERS, Free
-from tuner.search.progress import beginning
+from tuner.search.continuation import OPTIMISERS, grow
+from tuner.search.progress import Free, beginning
 from tuner.search.stages import WHOLE, plan
 
 FREE = ("inertia_zz", "motor_constant", "moment_constant")
@@ -19,36 +18,30 @@ import numpy as np
 
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Point
-from tuner.search.optimiser import Iterate, Optimiser
-from tuner.search.progress import point_of
+from tuner.search.continuation import OPTIMISERS
+from tuner.search.progress import Iterate, point_of
 
 
-class CoordinateSearch(Optimiser):
-    """Tries each coefficient a little higher and lower, and halves the step when none helps."""
-
-    name = "coordinate_search"
-
-    def init(self, problem):
-        return 0.2, np.inf, np.asarray(problem.points.coefficients[problem.best])
-
-    def step(self, problem, state):
-        width, least, vector = state
+def coordinate_search(problem):
+    """Try each coefficient a little higher and lower; halve the step when none helps."""
+    width, vector = 0.2, np.asarray(problem.points.coefficients[problem.best])
+    while True:
         reach = width * np.eye(len(vector))[problem.free.coefficients]
         tried = np.concatenate([vector[None], vector + reach, vector - reach])
         point = point_of(problem.points, problem.best)
         losses = np.asarray(evaluate(problem.objective, tried, point, problem.criterion).loss)
         best = int(np.argmin(losses.sum(axis=-1)))
-        state = width if best else 0.5 * width, float(losses[best].sum()), tried[best]
-        iterate = Iterate(
-            points=Point(tried[best][None], problem.points.offsets),
-            losses=np.array([state[1]]),
+        width, vector = width if best else 0.5 * width, tried[best]
+        yield Iterate(
+            points=Point(vector[None], problem.points.offsets),
+            losses=np.array([float(losses[best].sum())]),
             accepted=np.array([best > 0]),
             position_rmse=float("nan"),
+            converged=width < 1e-3,
         )
-        return state, iterate
 
-    def terminate(self, problem, state):
-        return state[0] < 1e-3
+
+OPTIMISERS["coordinate_search"] = coordinate_search
 '''
 
 

@@ -8,10 +8,8 @@ import pytest
 
 from tests.tuner.uncertainty.making import FLIGHTS, NOISE, fitted_of, problem, truth
 from tuner.config import JobFile
-from tuner.search import polish
-from tuner.search.loop import Loop, loop_of, with_loop
-from tuner.search.optimiser import Free
-from tuner.search.progress import beginning
+from tuner.search import estimation
+from tuner.search.progress import Free, Loop, beginning, loop_of, with_loop
 
 PLAIN = ("motor_constant", "inertia_xx", "inertia_yy")
 
@@ -37,13 +35,13 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
         loop = own.switched(choice)
         return replace(progress, loop=loop, scales=scales, losses=np.ones(1))
 
-    monkeypatch.setattr(polish, "grow", grown)
+    monkeypatch.setattr(estimation, "grow", grown)
     free = Free(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
     said = {"free": free, "title": "again", "on_progress": lambda _: None}
-    again = polish.searched_again(job, fitted, objective.space.initial, **said)
+    again = estimation.searched_again(job, fitted, objective.space.initial, **said)
     assert asked == {"undecided": (choice,), "loop": own}
     assert loop_of(again.objective) == own.switched(choice)
-    polish.polished(job, again, **said)
+    estimation.polished(job, again, **said)
     assert asked == {"undecided": (), "loop": own.switched(choice)}
 
 
@@ -59,13 +57,13 @@ def test_a_rough_fit_ends_where_a_linear_step_is_left(left, steps):
         fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
     )
     free = Free(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
-    again = polish.polished(
+    again = estimation.polished(
         job,
         fitted,
         free=free,
         title="again",
         on_progress=lambda _: None,
-        stages=polish.ROUGHLY,
+        stages=estimation.ROUGHLY,
         left=left,
     )
     made = again.iterations[len(fitted.iterations) :]

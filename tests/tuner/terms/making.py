@@ -24,16 +24,14 @@ from tests.tuner.uncertainty.making import (
 )
 from tuner.config import JobFile
 from tuner.objective.criterion import Point, units_of
-from tuner.objective.flight import SETPOINTS
-from tuner.objective.flown import fly
 from tuner.objective.normal import Objective, with_conditions
+from tuner.objective.simulation import SETPOINTS, fly
 from tuner.objective.space import space_of
 from tuner.recordings.flight import InitialState
-from tuner.search.estimation import free_offsets
+from tuner.search.estimation import free_offsets, polished
 from tuner.search.fitted import Fitted
-from tuner.search.optimiser import Free
-from tuner.search.polish import polished
 from tuner.search.problem import Job
+from tuner.search.progress import Free
 
 BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
 

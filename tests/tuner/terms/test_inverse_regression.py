@@ -95,18 +95,18 @@ def test_true_speeds_balance_at_the_truth(full_flight, full_bag, updated):
     vector = job.space.vector_of(values_of(updated))
     point = Point(jnp.asarray(vector), objective.start(vector).offsets)
     balance = balance_of(objective, point, job.fitted)
-    tunable = objective.tunable
-    lacking = np.asarray(balance.residuals(tunable, vector))
-    wrong = np.asarray(balance.residuals(tunable, job.space.initial))
+    model, space = objective.model, objective.space
+    lacking = np.asarray(balance.residuals(model, space, vector))
+    wrong = np.asarray(balance.residuals(model, space, job.space.initial))
     assert lacking.shape[0] == 6
     assert lacking.shape[-1] == objective.segments.count
     assert (np.abs(lacking).mean(axis=(1, 2)) < 0.2 * np.abs(wrong).mean(axis=(1, 2)))[2:].all()
-    columns = np.asarray(balance.jacobian(tunable, vector))
+    columns = np.asarray(balance.jacobian(model, space, vector))
     for number in range(len(FREE)):
         step = 1e-5 * np.eye(len(FREE))[number]
         slope = (
-            np.asarray(balance.residuals(tunable, vector + step))
-            - np.asarray(balance.residuals(tunable, vector - step))
+            np.asarray(balance.residuals(model, space, vector + step))
+            - np.asarray(balance.residuals(model, space, vector - step))
         ) / 2e-5
         np.testing.assert_allclose(columns[..., number], slope, rtol=1e-5, atol=1e-3)
 

@@ -139,11 +139,10 @@ def _turned(quaternion: np.ndarray, half: np.ndarray) -> np.ndarray:
 def criterion_of(objective: Objective, *, prior: float = 1.0) -> Criterion:
     segments = objective.segments.count
     return Criterion(
-        horizon=jnp.asarray(objective.samples),
-        scale={channel: jnp.ones(segments) for channel in objective.segments.measured},
-        reference_offset=jnp.zeros((2, segments)),
-        huber=jnp.asarray(jnp.inf),
-        prior=jnp.asarray(prior),
+        horizon=objective.samples,
+        scale={channel: np.ones(segments) for channel in objective.segments.measured},
+        reference_offset=np.zeros((2, segments)),
+        prior=prior,
     )
 
 

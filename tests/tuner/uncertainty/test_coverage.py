@@ -6,8 +6,7 @@ import pytest
 from tests.tuner.uncertainty.making import fitted_of, problem, truth, with_data
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
-from tuner.search.optimiser import Free
-from tuner.search.progress import beginning, point_of
+from tuner.search.progress import Free, beginning, point_of
 from tuner.search.stages import plan
 from tuner.uncertainty.estimates import uncertainty_of
 

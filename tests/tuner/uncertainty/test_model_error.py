@@ -23,9 +23,9 @@ from tuner.config import JobFile
 from tuner.equation_error.rate_controller import Answer
 from tuner.equation_error.unexplained import _likeliest
 from tuner.findings.findings import Code
-from tuner.objective.flight import SETPOINTS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
+from tuner.objective.simulation import SETPOINTS
 from tuner.objective.space import space_of
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.uncertainty.examination import examine

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import equinox as eqx
 import pytest
 
 from tests.tuner.uncertainty import making
@@ -73,7 +73,7 @@ def test_what_is_not_identifiable_has_an_open_profile(
     tmp_path: Path,
 ) -> None:
     rough = {name: 30.0 * scale for name, scale in fitted.criterion.scale.items()}
-    criterion = eqx.tree_at(lambda s: s.scale, fitted.criterion, rough)
+    criterion = replace(fitted.criterion, scale=rough)
     rolling = profile_likelihood(full_problem, uncertainty, criterion, "rolling_moment_coefficient")
     assert rolling.interval == (None, None)
     Profiles(profiles=[known, rolling]).write(tmp_path)

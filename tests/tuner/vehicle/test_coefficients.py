@@ -11,7 +11,7 @@ from tuner.config import JobFile
 from tuner.config.job import CoefficientSettings
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import find_config
-from tuner.objective.space import Tunable, space_of
+from tuner.objective.space import space_of
 from tuner.vehicle import (
     COEFFICIENTS,
     REGISTRY,
@@ -137,7 +137,7 @@ def test_a_freed_effect_starts_at_its_neutral_value_and_appears_in_the_model(veh
     assert float(space.numbers(space.initial)["fuselage_drag"]) == 0.0
     model = model_of(vehicle, ControllerFile())
     assert "fuselage_drag" not in coefficients_in(model)
-    moved = Tunable(model, space).at(space.initial + 1.0)
+    moved = with_coefficients(model, space.values(space.initial + 1.0))
     assert float(coefficients_in(moved)["fuselage_drag"]) == pytest.approx(0.02, rel=0.01)
 
 

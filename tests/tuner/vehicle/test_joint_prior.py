@@ -80,11 +80,9 @@ def equations(fit, vector):
         states=None,
     )
     criterion = Criterion(
-        horizon=np.asarray(1),
+        horizon=1,
         scale={"position": np.ones(1)},
         reference_offset=np.zeros((2, 1)),
-        huber=np.asarray(np.inf),
-        prior=np.asarray(1.0),
     )
     point = Point(vector, np.zeros((offsets, 1)))
     return normal_equations(fit, np.zeros(1, int), point, criterion, sums)

@@ -1,15 +1,15 @@
-"""Segments flown by a kernel, and the derivatives of what they are compared by.
+"""Segments simulated by a kernel: how they begin, what is fed in, what a recording would hold.
 
-The function below flies one segment; `lanes` flies many side by side. A program belongs to what is
-simulated (inlet, rates, terms, what is compared), not to how many segments there are, how long they
-last or which coefficients are free.
+The function `_flight` flies one segment; `lanes` flies many side by side. A program belongs to what
+is simulated (inlet, rates, terms, what is compared), not to how many segments there are, how long
+they last or which coefficients are free.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -18,24 +18,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jaxtyping import Float
 from numpy.typing import NDArray
 
-from lanes import Argument, Program
-from sim_jax.environment import Environment
+from lanes import Argument, program_of
+from sim_jax.environment import Air, Environment
+from sim_jax.frames import gyro_of, markers_of
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import Inlet, ReferenceInlet
+from sim_jax.numeric import Array as JaxArray
+from sim_jax.plant import Sample
+from sim_jax.rigid_body import Motion
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from sim_jax.state import Limits, Start, State
 from sim_jax.terms import total
-from tuner.objective.flight import (
-    MOTION,
-    SETPOINTS,
-    SPEEDS,
-    TURNED,
-    beginning_of,
-    recorded_of,
-)
-from tuner.objective.initial_conditions import SPIN
+from sim_jax.terms.total import total_wrench
+from sim_jax.trim import in_trim
+from sim_jax.vehicle import PerRotor, Vehicle
+from tuner.objective.battery import relative_log_voltage
+from tuner.objective.initial_conditions import ROWS, SPIN, moved, spun_up, trimmed, whole
 from tuner.objective.segments import Segments
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import (
@@ -47,6 +49,10 @@ from tuner.vehicle.model import (
 
 Array = NDArray[np.float64]
 
+MOTION, TURNED, SPEEDS, SETPOINTS = "motion", "turned", "speeds", "setpoints"
+"""What no recording holds: the centre of mass's position, velocity and body rate; the body's
+attitude; the rotors' speeds; and the set-points of rate and thrust."""
+
 LOGGED = (
     *("position", "attitude", "body_rate", "rotor_speed", "command"),
     *(MOTION, TURNED, SPEEDS, SETPOINTS),
@@ -55,8 +61,6 @@ LOGGED = (
 AT_ONCE = 2
 """Columns of derivatives in one pass over a block of segments: with more, code leaves the
 instruction cache and takes longer to build."""
-
-
 EFFECTS = tuple(name for name, row in COEFFICIENTS.items() if row.is_effect)
 TERMS = tuple(name for name in EFFECTS if COEFFICIENTS[name].group)
 """Coefficients beyond the base model, and those of them that a fit may add."""
@@ -167,9 +171,16 @@ def fly(
             }
         )
     arguments = _arguments(given, own_coefficients=own, moves=moves)
-    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda leaf: isinstance(leaf, Argument))
     static = _Static(schedule, limits, logged, moves)
-    program = _program(tuple(leaves), structure, static)
+    program = program_of(
+        _flight,
+        arguments,
+        static,
+        at_once=AT_ONCE,
+        name="flight of a segment",
+        made_of=(static, total.TERMS),
+        packages=CODE,
+    )
     run = program(
         given,
         None if tangents is None else _directions(given, tangents),
@@ -208,22 +219,15 @@ def flown_part(segments: Segments) -> Segments:
 
 def _arguments(given: _Given, *, own_coefficients: bool, moves: bool) -> _Given:
     """Return how each leaf is laid out: segments along the last axis but for what they share."""
-
-    def shared(leaf: Any) -> Argument:
-        return Argument(np.shape(leaf), np.result_type(leaf), lanes=False)
-
-    def moving(leaf: Any, *, lanes: bool) -> Argument:
-        shape = np.shape(leaf)[:-1] if lanes else np.shape(leaf)
-        return Argument(shape, np.result_type(leaf), lanes=lanes, moves=moves)
-
+    each = partial(Argument.of, lanes=True, moves=moves)
     return _Given(
-        model=jax.tree.map(shared, given.model),
+        model=jax.tree.map(partial(Argument.of, lanes=False), given.model),
         coefficients=jax.tree.map(
-            lambda leaf: moving(leaf, lanes=own_coefficients), given.coefficients
+            partial(Argument.of, lanes=own_coefficients, moves=moves), given.coefficients
         ),
         segments=laid_out(given.segments),
-        states=jax.tree.map(lambda leaf: moving(leaf, lanes=True), given.states),
-        conditions=jax.tree.map(lambda leaf: moving(leaf, lanes=True), given.conditions),
+        states=jax.tree.map(each, given.states),
+        conditions=jax.tree.map(each, given.conditions),
     )
 
 
@@ -271,24 +275,9 @@ def _directions(given: _Given, tangents: Mapping[str, Array]) -> list[Array]:
     return [*moved, *(tangents.get(name, still) for name in sorted(given.conditions))]
 
 
-@lru_cache(maxsize=64)
-def _program(leaves: tuple[Argument, ...], structure: Any, static: _Static) -> Program:
-    arguments = jax.tree.unflatten(structure, leaves)
-
-    def flight(given: _Given, lengths: Mapping[str, int]) -> tuple[dict[str, Any], Any]:
-        return _flight(given, static, lengths["turns"])
-
-    return Program(
-        flight,
-        arguments,
-        at_once=AT_ONCE,
-        name="flight of a segment",
-        made_of=(static, total.TERMS),
-        packages=CODE,
-    )
-
-
-def _flight(given: _Given, static: _Static, samples: int) -> tuple[dict[str, Any], Any]:
+def _flight(
+    static: _Static, given: _Given, lengths: Mapping[str, int]
+) -> tuple[dict[str, Any], Any]:
     """Fly one segment: channel -> (samples, c), and the time of a crash."""
     model = with_coefficients(given.model, given.coefficients)
     parts: tuple[Start, Inlet, Environment] = beginning_of(
@@ -313,5 +302,135 @@ def _flight(given: _Given, static: _Static, samples: int) -> tuple[dict[str, Any
         after, row = plant.sample(state, number)
         return after, recorded_of(row, model, environment, given.conditions, static.channels)
 
-    last, channels = lax.scan(sample, first, jnp.arange(samples))
+    last, channels = lax.scan(sample, first, jnp.arange(lengths["turns"]))
     return channels, last.crash_time
+
+
+def recorded_of(
+    log: Sample,
+    model: Model,
+    environment: Environment,
+    conditions: Mapping[str, Float[JaxArray, " *F"]],
+    channels: Collection[str],
+) -> dict[str, JaxArray]:
+    """Return channel -> what a recording of logged samples would hold, columns after the samples.
+
+    Parameters
+    ----------
+    log
+        Leaves (*samples, *F), or those of one sample.
+    model, environment, conditions
+        As they were flown.
+    channels
+        Which are asked for.
+    """
+    motion = log.motion
+    position, attitude = markers_of(model.vehicle).recorded(motion)
+    rate = gyro_of(model.vehicle).reading(motion.body_rate)
+    logged = {
+        "position": (position.x, position.y, position.z),
+        "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
+        "body_rate": _parts(rate),
+        "rotor_speed": log.rotor_speed if log.read_speed is None else log.read_speed,
+        "command": log.command,
+        MOTION: (*_parts(motion.position), *_parts(motion.velocity), *_parts(motion.body_rate)),
+        SPEEDS: log.rotor_speed,
+        TURNED: tuple(getattr(motion.attitude, axis) for axis in "wxyz"),
+        SETPOINTS: (*_parts(log.setpoints.rate), log.setpoints.thrust),
+    }
+    if "acceleration" in channels:
+        logged["acceleration"] = accelerometer(
+            model.vehicle, motion, log.rotor_speed, environment, conditions
+        )
+    axis = min(jnp.ndim(position.x), 1)
+    return {name: jnp.stack(logged[name], axis=axis) for name in channels}
+
+
+def _parts(vector: Vec3) -> tuple[JaxArray, JaxArray, JaxArray]:
+    return vector.x, vector.y, vector.z
+
+
+def beginning_of(
+    model: Model,
+    segments: Segments,
+    schedule: Schedule,
+    *,
+    states: Float[JaxArray, "L F"] | None = None,
+    conditions: Mapping[str, Float[JaxArray, " F"]] = MappingProxyType({}),
+) -> tuple[Start, Inlet, Environment]:
+    """Return what segments start from, what is fed in and what surrounds them.
+
+    Parameters
+    ----------
+    model, segments, schedule
+        What flies.
+    states
+        How far the starts lie from the recorded ones, in the segments' standard deviations.
+    conditions
+        Name, of `tuner.vehicle.conditions` -> what surrounds each segment, in its unit.
+    """
+    start, inlet = segments.start, segments.inlet
+    true = gyro_of(model.vehicle).body_rate(start.motion.body_rate)
+    start = replace(start, motion=replace(start.motion, body_rate=true))
+    start = markers_of(model.vehicle).start(start, segments.resting, model.controller.sees_markers)
+    environment = environment_of(model, segments, conditions)
+    exponent = model.vehicle.effects.get("battery_exponent")
+    factor = environment.speed_factor(exponent, jnp.asarray(0), schedule)
+    if segments.resting is not None:
+        start = in_trim(
+            model.vehicle, model.controller, start, segments.resting, speed_factor=factor
+        )
+    if segments.wander is not None:
+        start = moved(start, segments.wander)
+    if segments.turning is not None:
+        start = spun_up(start, model.vehicle, segments.turning, speed_factor=factor)
+    if states is not None and segments.freedom is not None:
+        change = whole(states * segments.freedom, segments.freed)
+        start = moved(start, change)
+        if ROWS["trim"].start in segments.freed:
+            inlet = trimmed(inlet, model.vehicle, change)
+    return start, inlet, environment
+
+
+def accelerometer(
+    vehicle: Vehicle,
+    motion: Motion,
+    rotor_speed: PerRotor,
+    environment: Environment,
+    biases: Mapping[str, Float[JaxArray, " F"]],
+) -> tuple[JaxArray, JaxArray, JaxArray]:
+    """Return what an accelerometer at the centre of mass reads, m/s² along the body's axes.
+
+    That is the specific force: all that acts but gravity, over the mass; plus its bias.
+    """
+    air = Air.around(vehicle, motion, environment, tuple(jnp.zeros_like(w) for w in rotor_speed))
+    pull = total_wrench(vehicle, motion, rotor_speed, air).force * (1.0 / vehicle.body.mass)
+    x, y, z = (getattr(pull, axis) + biases.get(f"accelerometer_{axis}", 0.0) for axis in "xyz")
+    return x, y, z
+
+
+def environment_of(
+    model: Model, segments: Segments, conditions: Mapping[str, Float[JaxArray, " F"]]
+) -> Environment:
+    """Return what surrounds the segments, as far as it acts on a model."""
+    log_voltage = None
+    volts, reference = segments.log_voltage, model.reference_voltage
+    acts = "battery_exponent" in model.vehicle.effects
+    if acts and volts is not None and reference is not None:
+        log_voltage = relative_log_voltage(volts, reference)
+    decline = conditions.get("battery_decline")
+    return Environment(
+        wind=_wind(conditions),
+        log_voltage=log_voltage,
+        battery_decline=decline,
+        begin=None if decline is None else segments.begin,
+        disturbance=segments.disturbance,
+    )
+
+
+def _wind(conditions: Mapping[str, Float[JaxArray, " F"]]) -> Vec3 | None:
+    known = [conditions[name] for name in ("wind_x", "wind_y") if name in conditions]
+    if not known:
+        return None
+    calm = jnp.zeros_like(known[0])
+    return Vec3(conditions.get("wind_x", calm), conditions.get("wind_y", calm), calm)

@@ -16,12 +16,12 @@ from sim_jax.state import AIRBORNE, hover
 from tests.sim_jax.support import controller, vec
 from tests.sim_jax.test_rotor_counts import SCHEDULE, STEPS, round_airframe
 from tuner.config import Options, settle
-from tuner.objective import flown
-from tuner.objective.flight import beginning_of, recorded_of
+from tuner.objective import simulation
 from tuner.objective.segments import Segments
+from tuner.objective.simulation import beginning_of, recorded_of
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
-from tuner.vehicle.model import Model, with_coefficients
+from tuner.vehicle.model import Model, coefficients_in, with_coefficients
 
 MOVING = ("inertia_xx", "time_constant_up", "rotor_drag_coefficient", "estimate_latency")
 SAMPLES = 120
@@ -37,14 +37,14 @@ def objective(request, flight, full_flight, updated):
 
 
 def test_a_kernel_flies_as_jax_does_and_so_do_its_derivatives(objective):
-    model = objective.tunable.at(jnp.asarray(objective.space.initial))
+    model = objective.model_at(objective.space.initial)
     segments, schedule = objective.segments, objective.schedule
     states = None
     if segments.freedom is not None:
         states = np.random.default_rng(0).normal(0.0, 0.3, segments.freedom.shape)
-    values = objective.tunable.values(np.asarray(objective.space.initial))
+    values = {**coefficients_in(model), **objective.space.values(objective.space.initial)}
     tangents = {name: np.eye(len(MOVING))[i] for i, name in enumerate(MOVING)}
-    got = flown.fly(
+    got = simulation.fly(
         jax.tree.map(np.asarray, model),
         segments,
         schedule,
@@ -91,7 +91,7 @@ def test_six_rotors_fly_from_where_they_were_recorded(effects):
     one = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], hover(craft, vec(0.0, 0.0, 1.0)))
     commands = tuple(np.tile(command, (STEPS + 2, 1)) for command in one.command)
     segments = Segments(ActuatorInlet(commands), one, {}, np.zeros(1, int))
-    found = flown.fly(
+    found = simulation.fly(
         model, segments, SCHEDULE, samples=STEPS, limits=AIRBORNE, channels=("position",)
     )
     place = found.channels["position"][0]
@@ -107,13 +107,13 @@ def test_channels_in_another_order_are_no_other_program(monkeypatch, tangents):
     segments = Segments(ActuatorInlet(commands), one, {}, np.zeros(1, int))
     asked = []
 
-    def program(*key):
-        asked.append(key)
-        return lambda *_, **__: Run(({name: name for name in key[2].channels}, None), None)
+    def program(_, arguments, static, **options):
+        asked.append((jax.tree.flatten(arguments), static, options))
+        return lambda *_, **__: Run(({name: name for name in static.channels}, None), None)
 
-    monkeypatch.setattr(flown, "_program", program)
+    monkeypatch.setattr(simulation, "program_of", program)
     for names in (("position", "attitude"), ("attitude", "position")):
-        found = flown.fly(
+        found = simulation.fly(
             Model(craft, controller()),
             segments,
             SCHEDULE,
