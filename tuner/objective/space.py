@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit
 
 from tuner.config import JobFile
+from tuner.config.job import CoefficientSettings
 from tuner.core.errors import ConfigError
 from tuner.vehicle import ControllerFile, VehicleFile, initial_values
 from tuner.vehicle.coefficient import Parameter
@@ -231,16 +232,17 @@ def parameter_of(
 ) -> Parameter:
     """Return the coordinate of a coefficient and of those tied to it, as a job has it."""
     name = names[0]
-    row, given, start = sized(COEFFICIENTS[name], size), job.coefficients.get(name), values[name]
-    scale = given.scale if given is not None and given.scale is not None else row.scale
-    bounded = given is not None and given.lower is not None and given.upper is not None
+    row, start = sized(COEFFICIENTS[name], size), values[name]
+    given = job.coefficients.get(name, CoefficientSettings())
+    scale = given.scale or row.scale
+    bounded = given.lower is not None and given.upper is not None
     if row.scale == "log" and start <= 0 and not (scale == "linear" and bounded):
         raise ConfigError(
             name, f"starts at {start:g}, which has no logarithm", "give bounds and scale: linear"
         )
     lower, upper = row.limits(start)
-    lower = given.lower if given is not None and given.lower is not None else lower
-    upper = given.upper if given is not None and given.upper is not None else upper
+    lower = lower if given.lower is None else given.lower
+    upper = upper if given.upper is None else given.upper
     if scale == "log" and lower <= 0:
         raise ConfigError(name, f"lower bound {lower:g} has no logarithm", "use scale: linear")
     if lower >= upper:
@@ -249,21 +251,19 @@ def parameter_of(
         )
 
     def scaled(value: float) -> float:
-        return float(np.log(value)) if scale == "log" else value
+        return float(np.log(max(value, 1e-300))) if scale == "log" else value
 
-    moved, initial = None, start
-    margin = OFF_BOUND * (scaled(upper) - scaled(lower))
-    nearest = scaled(max(start, 1e-300))
-    inner = float(np.clip(nearest, scaled(lower) + margin, scaled(upper) - margin))
-    if not lower * (1 + 1e-9) < start < upper * (1 - 1e-9):
+    least, width = scaled(lower), scaled(upper) - scaled(lower)
+    moved, initial, share = None, start, (scaled(start) - least) / width
+    if not 1e-9 < share < 1.0 - 1e-9:
+        inner = least + width * float(np.clip(share, OFF_BOUND, 1.0 - OFF_BOUND))
         moved, initial = start, float(np.exp(inner)) if scale == "log" else inner
-    mean, sd, prior_given = scaled(initial), row.prior_sd, False
-    if scale != row.scale:
-        sd = row.prior_sd * (1.0 / abs(initial) if scale == "log" else abs(initial))
-    if given is not None and given.prior is not None:
+    mean, sd, quarter = scaled(initial), row.prior_sd, 0.25 * (upper - lower)
+    if scale != row.scale:  # a start of zero has no share of itself
+        sd *= 1.0 / initial if scale == "log" else abs(initial) or quarter
+    if given.prior is not None:
         mean = scaled(given.prior.mean)
         sd = given.prior.sd / given.prior.mean if scale == "log" else given.prior.sd
-        prior_given = True
     return Parameter(
         name=name,
         ratios={other: values[other] / start if start else 1.0 for other in names},
@@ -273,8 +273,8 @@ def parameter_of(
         scale=scale,
         prior_mean=mean,
         prior_sd=sd,
-        prior_given=prior_given,
-        unit_step=row.step if scale == row.scale else (upper - lower) / 4,
+        prior_given=given.prior is not None,
+        unit_step=row.step if scale == row.scale else quarter,
         usual=row.prior_sd if row.scale == "linear" else 0.0,
         moved=moved,
     )

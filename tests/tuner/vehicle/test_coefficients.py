@@ -137,7 +137,8 @@ def test_a_freed_effect_starts_at_its_neutral_value_and_appears_in_the_model(veh
     assert float(space.numbers(space.initial)["fuselage_drag"]) == 0.0
     model = model_of(vehicle, ControllerFile())
     assert "fuselage_drag" not in coefficients_in(model)
-    moved = with_coefficients(model, space.values(space.initial + 1.0))
+    values = {n: np.asarray(v) for n, v in space.values(space.initial + 1.0).items()}
+    moved = with_coefficients(model, values)
     assert float(coefficients_in(moved)["fuselage_drag"]) == pytest.approx(0.02, rel=0.01)
 
 
@@ -155,8 +156,22 @@ def test_a_coefficient_that_is_zero_is_fitted_linearly_between_given_bounds(vehi
         space_of(off, ControllerFile(), JobFile(free=free))
     settings = CoefficientSettings(lower=-50.0, upper=200.0, scale="linear")
     job = JobFile(free=free, coefficients={"zero_position_armed": settings})
-    (parameter,) = space_of(off, ControllerFile(), job).parameters
+    space = space_of(off, ControllerFile(), job)
+    (parameter,) = space.parameters
     assert parameter.initial == 0.0
+    assert parameter.prior_sd > 0.0
+    assert np.isfinite(space.prior_residuals(space.initial)).all()
+
+
+@pytest.mark.parametrize("start", [-0.02, -0.03])
+def test_a_negative_start_on_or_beyond_its_bound_is_moved_just_inside(vehicle, start):
+    name = "center_of_mass_x"
+    job = JobFile(free=(name,), coefficients={name: CoefficientSettings(lower=-0.02, upper=0.05)})
+    space = space_of(with_values(vehicle, {name: start}), ControllerFile(), job)
+    (parameter,) = space.parameters
+    assert parameter.moved == start
+    assert parameter.initial == pytest.approx(-0.0165)
+    assert space.numbers(space.initial)[name] == pytest.approx(-0.0165)
 
 
 def test_every_row_is_complete():
