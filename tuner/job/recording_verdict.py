@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 from tuner.config import Options, Settings, settle
 from tuner.core.phrases import listed
-from tuner.recordings.cache import cached, digest, recalled
+from tuner.recordings.cache import cached, digest, recalled, source_version
 from tuner.recordings.inspection import Inspection
 from tuner.recordings.topics import read_sidecar
 from tuner.recordings.ulog import Advice, advice_of, parameters_of, settings_in_words
@@ -81,7 +79,7 @@ def _decided(path: Path, settings: Settings) -> Verdict:
     job = settings.job
     inputs = settings.vehicle, settings.controller, job, read_sidecar(path)
     maps = [digest(file) for file in (job.topics,) if file is not None and file.exists()]
-    key = (digest(path), path.name, _version(), *map(repr, (*inputs, *maps)))
+    key = (digest(path), path.name, source_version(), *map(repr, (*inputs, *maps)))
 
     def found() -> Verdict:
         from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
@@ -92,23 +90,6 @@ def _decided(path: Path, settings: Settings) -> Verdict:
         return decide(path, settings)
 
     return replace(recalled(Verdict, cached("verdict", *key), found), path=str(path))
-
-
-@cache
-def _version() -> str:
-    """Return a digest of the source that decides: any change decides anew."""
-    tuner, total = Path(__file__).resolve().parents[1], hashlib.sha256()
-    for folder in ("objective", "inertial", "config", "vehicle"):
-        for file in sorted((tuner / folder).glob("*.py")):
-            total.update(file.read_bytes())
-    for name in (
-        "job/recording_decision.py",
-        "job/recording_verdict.py",
-        "search/inlet_choice.py",
-        "search/job_flights.py",
-    ):
-        total.update((tuner / name).read_bytes())
-    return total.hexdigest()
 
 
 def in_words(verdict: Verdict) -> list[str]:

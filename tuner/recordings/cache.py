@@ -72,21 +72,24 @@ def _digest(path: Path, files: Iterable[Path]) -> str:
 
 
 @functools.cache
-def readers_version() -> str:
-    """Return a digest of the readers' source and the shipped topic maps: any change reads anew."""
-    here = Path(__file__).resolve().parent
-    package = here.parent
+def source_version(folder: str = "") -> str:
+    """Return a digest of the source in a folder of this package and of the shipped topic maps.
+
+    Parameters
+    ----------
+    folder
+        Its path inside the package; the whole package where empty.
+    """
+    package = Path(__file__).resolve().parents[1]
     maps = package / "configs" if (package / "configs").is_dir() else package.parent / "configs"
-    total = hashlib.sha256()
-    for file in sorted([*here.rglob("*.py"), *(maps / "topics").glob("*.yaml")]):
-        total.update(file.read_bytes())
-    return total.hexdigest()
+    source = [*(package / folder).rglob("*.py"), *(maps / "topics").glob("*.yaml")]
+    return _digest(package.parent, sorted(source))
 
 
 def cached(kind: str, *key: str) -> Path:
     """Return the file in which something with this key is kept."""
-    name = hashlib.sha256("\0".join((readers_version(), kind, *key)).encode()).hexdigest()
-    return own_folder() / kind / f"{name[:40]}"
+    parts = source_version("recordings"), kind, *key
+    return own_folder() / kind / hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
 
 
 def load(path: Path) -> bytes | None:

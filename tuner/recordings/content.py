@@ -171,9 +171,6 @@ def read_signals(options: ReadOptions) -> Signals:
             f"'{given.format}'",
             "give a map for this format",
         )
-    if not candidates:
-        what = f"is read as '{recording.format}', for which no topic map ships"
-        raise RecordingError(path, what, "give one with --topics")
     chosen = choose_map(recording, candidates)
     taken: tuple[Note, ...] = ()
     if given is None:

@@ -276,8 +276,17 @@ class Place:
 
 
 def choose_map(recording: Recording, candidates: Iterable[TopicMap]) -> TopicMap:
-    """Return the map that finds a pose and most signals, then the one of higher priority."""
+    """Return the map that finds a pose and most signals, then the one of higher priority.
+
+    Raises
+    ------
+    RecordingError
+        None is for its format.
+    """
     suited = [topic_map for topic_map in candidates if topic_map.format == recording.format]
+    if not suited:
+        what = f"is read as '{recording.format}', for which no topic map ships"
+        raise RecordingError(recording.path, what, "give one with --topics")
 
     def signals_found(topic_map: TopicMap) -> tuple[int, int, int]:
         places = locate(recording, topic_map)[0]

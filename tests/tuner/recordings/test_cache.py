@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.recordings import making
+from tuner.recordings import cache
 from tuner.recordings import loader as loading
 from tuner.recordings.cache import digest, own_folder
 from tuner.recordings.content import ReadOptions
@@ -120,3 +121,17 @@ def test_folder_digest_sees_names_and_contents(tmp_path: Path) -> None:
     assert digest(folder) == before
     (folder / "metadata.yaml").rename(folder / "other.yaml")
     assert digest(folder) != before
+
+
+def test_the_version_is_of_all_source_in_the_folder(tmp_path: Path, monkeypatch) -> None:
+    for name in ("recordings/cache.py", "recordings/ros/a.py", "equation_error/b.py"):
+        (tmp_path / "tuner" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "tuner" / name).touch()
+    monkeypatch.setattr(cache, "__file__", str(tmp_path / "tuner" / "recordings" / "cache.py"))
+    version = cache.source_version.__wrapped__
+    before = version("recordings"), version()
+    (tmp_path / "tuner" / "equation_error" / "b.py").write_text("1")
+    assert version("recordings") == before[0]
+    assert version() != before[1]
+    (tmp_path / "tuner" / "recordings" / "ros" / "a.py").write_text("1")
+    assert version("recordings") != before[0]
