@@ -28,7 +28,7 @@ from tuner.core.errors import InputError
 from tuner.core.numerics import Array, log_determinant, scaled_inverse
 from tuner.design.proposals import Proposal, Proposals
 from tuner.objective.criterion import Criterion
-from tuner.objective.information import information_from_jacobian
+from tuner.objective.information import information_at
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.trajectory import Published, at_speed, published
@@ -272,7 +272,7 @@ def rank_next_flights(
         }
         weights = plain_criterion(objective, objective.samples, scales)
         jacobian = objective.jacobian(point, weights)
-        information = information_from_jacobian(
+        information = information_at(
             objective, point, weights, jacobian, offsets_fitted=offsets_fitted
         )
         inside = _inside(objective, jacobian.residuals, arena)

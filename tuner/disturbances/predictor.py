@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 from lanes import joined
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.schedule import Schedule
-from tuner.core.numerics import robust_sd
-from tuner.disturbances.disturbances import COMMAND_NOISE, MOST, STRENGTHS, USUAL
+from tuner.core.numerics import Array, robust_sd, scaled_solve
+from tuner.disturbances.disturbances import COMMAND_NOISE, LEAST, MOST, STRENGTHS, USUAL
 from tuner.disturbances.extended_kalman_filter import GATE, Filtered, filtered, innovations
-from tuner.disturbances.information import hidden
 from tuner.disturbances.observer import CHANNELS, Expected, Feed
 from tuner.disturbances.recorded import (
     FLIGHT_CONTROLLER,
@@ -38,13 +37,12 @@ from tuner.disturbances.recorded import (
     taken_from,
 )
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
-from tuner.objective.information import FisherInformation, information_from_jacobian, with_secants
+from tuner.objective.information import FisherInformation, information_at, with_secants
+from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.recordings.flight import Flight
 from tuner.vehicle.model import coefficients_in, with_terms_computed
-
-Array = NDArray[np.float64]
 
 AT_ONCE = 16
 """Parameters by which is differentiated at a time."""
@@ -62,6 +60,9 @@ STRETCH, SURE = 2.0, 1.5
 gain: half as many as those by which the coefficient that gains it differs from neutral."""
 NOISIER = 1.05
 """Innovations of a channel over what they are assumed to be, from which it is noisier than that."""
+USUALLY = 1.5
+"""Standard deviation a priori of a strength's logarithm about what it is learnt to be: what says
+nothing of a strength says nothing against a coefficient."""
 
 
 @dataclass(frozen=True)
@@ -341,9 +342,7 @@ class Predictor:
                     channel: residuals + moves[channel][number]
                     for channel, residuals in jacobian.residuals.items()
                 }
-        return information_from_jacobian(
-            objective, own, unscaled(criterion), jacobian, otherwise=changed
-        )
+        return information_at(objective, own, unscaled(criterion), jacobian, otherwise=changed)
 
     def _stepped(self, other: Objective) -> Predictor:
         """Return the predictor of another problem: finer steps, pushed along, other readings."""
@@ -492,3 +491,72 @@ def slopes_of(here: Likelihood, beside: Iterable[Likelihood], steps: Array) -> S
         slope[number] = (there.loss - here.loss) / step - 0.5 * step * bend  # where it begins
     flat = (part.reshape(len(steps), -1) for part in (moves, spreads))
     return Slopes(slope, sum(part @ part.T for part in flat), moves)
+
+
+def hidden(names: Sequence[str]) -> NDArray[np.bool_]:
+    """Return (K,) which coefficients recorded set-points hide: what lies upstream of them.
+
+    And how high the markers sit: a loop holds its height to the millimetre, whereas a filter
+    begins at the height of the first sample.
+    """
+    return np.isin(names, [*INLETS["body_rate"].bypasses, "marker_offset_z"])
+
+
+def with_hidden(
+    predicted: FisherInformation, looped: FisherInformation, names: Sequence[str], fitted: int
+) -> FisherInformation:
+    """Return what innovations say, and of what set-points hide what least squares said of it.
+
+    That is what it said while all others were estimated too: given what the filter says of these,
+    gusts would scatter it more (no noise model knows them there).
+
+    Parameters
+    ----------
+    predicted, looped
+        Of innovations, and of the closed loop's simulation, in the same channels.
+    names, fitted
+        Of the K coefficients, of which the first were fitted.
+    """
+    upstream = hidden(names)
+    others = np.flatnonzero(~upstream[:fitted])
+    upper = looped.total[np.ix_(others, np.flatnonzero(upstream))]
+    clear = np.eye(len(names))
+    clear[np.ix_(np.flatnonzero(upstream), others)] = -scaled_solve(
+        looped.total[np.ix_(others, others)], upper
+    ).T
+    blocks = clear @ looped.blocks @ clear.T
+    return replace(
+        predicted,
+        blocks=predicted.blocks + np.where(np.outer(upstream, upstream), blocks, 0.0),
+        score=predicted.score + np.where(upstream, looped.score @ clear.T, 0.0),
+        changes={
+            name: change + np.where(upstream, looped.changes[name] @ clear.T, 0.0)
+            for name, change in predicted.changes.items()
+        },
+    )
+
+
+def with_strengths(
+    information: FisherInformation, of_strengths: Array, strengths: Array
+) -> FisherInformation:
+    """Return what innovations say of coefficients while the disturbances' strengths are learnt too.
+
+    With the strengths as they are innovations would know some coefficients better than they do: how
+    quickly a vehicle turns against how strongly turbulence turns it, above all. Eliminated like all
+    that is estimated beside them, the strengths take A B⁻¹ Aᵀ from the information of all flights,
+    A what innovations say of both together and B what they say of the strengths.
+
+    Parameters
+    ----------
+    information
+        With the strengths among its changes.
+    of_strengths
+        (7, 7) B, the innovations' covariance included.
+    strengths
+        (7,) logarithms: one at its limit is not learnt.
+    """
+    learnt = np.flatnonzero((strengths > LEAST) & (strengths < MOST))
+    changes = dict(information.changes)
+    across = np.array([changes.pop(name).sum(axis=0) for name in STRENGTHS])[learnt]
+    own = of_strengths[np.ix_(learnt, learnt)] + np.eye(len(learnt)) / USUALLY**2
+    return replace(information, lost=across.T @ scaled_solve(own, across), changes=changes)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import BodyRateInlet
 from sim_jax.schedule import Schedule
+from tuner.core.numerics import Array
 from tuner.objective.criterion import Either
 from tuner.objective.noise import repeats
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured
@@ -45,7 +46,7 @@ class Sampled(eqx.Module):
 
 
 def sampled(
-    channel: str, measured: Measured, late: NDArray[np.float64], ticks: int, rate: float
+    channel: str, measured: Measured, late: Array, ticks: int, rate: float
 ) -> tuple[Sampled, NDArray[np.intp]]:
     """Lay a channel's samples out on ticks.
 
@@ -146,8 +147,8 @@ def setpoints_on_ticks(
 
 
 def gathered(
-    table: NDArray[np.float64], widths: Mapping[str, int], rows: Mapping[str, NDArray[np.intp]]
-) -> dict[str, NDArray[np.float64]]:
+    table: Array, widths: Mapping[str, int], rows: Mapping[str, NDArray[np.intp]]
+) -> dict[str, Array]:
     """Return channel -> (\\*leading, n, k, F) of a table (\\*leading, T, m, F) on ticks.
 
     Parameters

@@ -21,19 +21,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.numerics import scaled_solve
+from tuner.core.numerics import Array, scaled_solve
 from tuner.disturbances.disturbances import LEAST, MOST, within
 from tuner.disturbances.predictor import Predictor, unscaled
 from tuner.disturbances.recorded import gathered
 from tuner.objective.criterion import OFFSET_SD, OFFSET_UNIT, Criterion, Point, SegmentSums
-from tuner.objective.normal import Objective
+from tuner.objective.normal import Objective, normal_equations
 from tuner.objective.residuals import gauss_newton, robust
 from tuner.objective.segments import CLOCKS
 from tuner.objective.space import Space
 from tuner.recordings.flight import Flight
-from tuner.search.normal_equations import normal_equations
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 STEPS = 16
@@ -180,7 +178,7 @@ def _equations(
         crash_time=jacobian.crash_time,
         states=None,
     )
-    _, own, among = map(np.asarray, normal_equations(space, flight, point, criterion, sums))
+    _, own, among = map(np.asarray, normal_equations(objective, point, criterion, sums))
     across = np.asarray(hessian[:size, size:])
     owner = flight[:, None] == np.arange(flights)
     of_flights = np.moveaxis(across[count:] @ owner, -1, 1).reshape(kinds * flights, -1)

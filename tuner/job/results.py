@@ -30,6 +30,7 @@ from tuner.evaluate.records import RMSE_UNITS
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.inlets import INLETS, window_seconds
+from tuner.objective.normal import normal_equations
 from tuner.objective.segments import OFFSETS
 from tuner.recordings.flight import Flight
 from tuner.result import (
@@ -45,7 +46,6 @@ from tuner.result import (
 )
 from tuner.search.fitted import Fitted
 from tuner.search.job_flights import Recording
-from tuner.search.normal_equations import normal_equations
 from tuner.search.problem import SPIN_CHANNELS, Job
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, knowledge_of
@@ -126,9 +126,8 @@ def _loss_at_start(job: Job, fitted: Fitted) -> float:
     """Return the loss with the initial coefficients, as the fit's last stage counts it."""
     objective, criterion = fitted.objective, fitted.criterion
     start = objective.start(job.space.initial)
-    flight = objective.flight
     sums = objective.sums(start, criterion, derivatives=False)
-    loss, _, _ = normal_equations(objective.space, flight, start, criterion, sums)
+    loss, _, _ = normal_equations(objective, start, criterion, sums)
     return float(loss)
 
 

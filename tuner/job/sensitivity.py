@@ -18,9 +18,8 @@ from tuner.design.ranking import Arena
 from tuner.evaluate.held_out import comparison_of
 from tuner.findings.findings import Code, Finding
 from tuner.job.results import write_knowledge, write_next_flight
-from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Criterion, Point
-from tuner.objective.normal import Objective
+from tuner.objective.normal import Objective, misfit, root_mean_squares, sums_at
 from tuner.options import ExaminationOptions
 from tuner.report import render
 from tuner.report.contents import About, Recording, write_traces
@@ -28,7 +27,6 @@ from tuner.search.continuation import SWITCH_GAIN
 from tuner.search.findings import UNMATCHED, loop_findings
 from tuner.search.fitted import Fitted, by_flight
 from tuner.search.job_flights import as_logged, read_usable
-from tuner.search.normal_equations import misfit, root_mean_squares
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import beginning, loop_of, plain_criterion, with_loop
 from tuner.uncertainty.estimates import Uncertainty

@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.objective.segments import OFFSETS
 from tuner.vehicle import REGISTRY, recording_offsets
 
@@ -23,7 +23,7 @@ OFFSET_UNIT = 0.01
 """Prior standard deviation of what each flight has of its own, in the search's coordinates."""
 
 
-def units_of(names: Sequence[str]) -> NDArray[np.float64]:
+def units_of(names: Sequence[str]) -> Array:
     """Return how much of each quantity of a flight is one in the search's coordinate."""
     return np.array(
         [OFFSET_UNIT if name in OFFSETS else REGISTRY[name].prior_sd / OFFSET_SD for name in names]

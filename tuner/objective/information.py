@@ -15,13 +15,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tuner.core.numerics import Inverse, huber_weights
+from tuner.core.numerics import Array, Inverse, huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
 from tuner.objective.space import Space
 from tuner.vehicle import COEFFICIENTS
-
-Array = NDArray[np.float64]
 
 NEAR = 1e-3
 """Steps from its neutral value within which a coefficient is at it."""
@@ -250,37 +248,25 @@ def information_at(
     objective: Objective,
     point: Point,
     criterion: Criterion,
+    jacobian: Jacobian | None = None,
     *,
     offsets_fitted: NDArray[np.bool_] | None = None,
+    otherwise: Mapping[str, Mapping[str, Array]] = MappingProxyType({}),
 ) -> FisherInformation:
-    """Return the information at a point, where the Jacobian is evaluated.
+    """Return the information at a point.
 
     Parameters
     ----------
     objective, point, criterion
         The problem, and where it is examined.
+    jacobian
+        There; it is evaluated by default.
     offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
+    otherwise
+        What might be simulated differently -> channel -> (n, k, F) residuals then.
     """
-    jacobian = objective.jacobian(point, criterion)
-    return information_from_jacobian(
-        objective, point, criterion, jacobian, offsets_fitted=offsets_fitted
-    )
-
-
-def information_from_jacobian(
-    objective: Objective,
-    point: Point,
-    criterion: Criterion,
-    jacobian: Jacobian,
-    *,
-    offsets_fitted: NDArray[np.bool_] | None = None,
-    otherwise: Mapping[str, Mapping[str, Array]] = MappingProxyType({}),
-) -> FisherInformation:
-    """Return the information of a Jacobian; see `information_at`.
-
-    ``otherwise``: what might be simulated differently -> channel -> (n, k, F) residuals then.
-    """
+    jacobian = objective.jacobian(point, criterion) if jacobian is None else jacobian
     space, flight, segments = objective.space, objective.flight, objective.segments.count
     channels = tuple(jacobian.residuals)
     scales = np.stack([criterion.scale[channel][flight] for channel in channels])

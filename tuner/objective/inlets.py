@@ -29,7 +29,8 @@ from sim_jax.inlet import (
 )
 from sim_jax.schedule import Schedule
 from tuner.config.job import InletName
-from tuner.recordings.flight import SIGNALS, Array, Flight, Series
+from tuner.core.numerics import Array
+from tuner.recordings.flight import SIGNALS, Flight, Series
 from tuner.recordings.interpolation import body_rate_from, without_gaps
 from tuner.vehicle import COEFFICIENTS, term_groups
 from tuner.vehicle.coefficient import LoopPart

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuner.config import CHANNELS
-from tuner.core.numerics import robust_sd
+from tuner.core.numerics import Array, robust_sd
 from tuner.recordings.flight import Flight, Series
 
 #: Smallest believable standard deviation, in the channel's unit (attitude: rad).
@@ -22,7 +21,7 @@ FLOOR = {
 }
 
 
-def white_noise(series: Series) -> NDArray[np.float64]:
+def white_noise(series: Series) -> Array:
     """Return each column's standard deviation of the noise between neighbouring samples.
 
     Every sample is compared with the parabola through its neighbours at their own times, which a
@@ -48,9 +47,7 @@ def white_noise(series: Series) -> NDArray[np.float64]:
     return spread
 
 
-def _third_difference(
-    time: NDArray[np.float64], values: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _third_difference(time: Array, values: Array) -> Array:
     """Return divided third differences, scaled so that white noise keeps its variance."""
     stamps = np.stack([time[i : len(time) - 3 + i] for i in range(4)])
     samples = np.stack([values[i : len(values) - 3 + i] for i in range(4)])
@@ -88,7 +85,7 @@ def channel_noise(flights: Sequence[Flight], channel: str) -> float:
     return max(float(np.median(known)) if known else 0.0, FLOOR[channel])
 
 
-def repeats(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def repeats(values: Array) -> Array:
     """Return how many samples in a row hold the same value as each of some (n, k), 1 for most.
 
     What was rounded is off by the same in all of them as long as it rests: they are one reading.

@@ -2,14 +2,17 @@
 
 Flying is a kernel's (`tuner.objective.simulation`); reading a simulation at the recorded stamps and
 summing up is linear, and NumPy's. While sums are made, segments come first in every array, columns
-of derivatives last.
+of derivatives last. Each of F segments contributes a loss, a gradient and a Hessian from which its
+own start has been eliminated; the normal equations add them up, with the priors. How much each
+channel of each flight weighs follows from what the model leaves unexplained of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,7 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from sim_jax.schedule import Schedule
 from sim_jax.state import Limits
+from tuner.core.numerics import Array
+from tuner.engine import Report, current
 from tuner.objective.criterion import (
+    OFFSET_SD,
     OFFSET_UNIT,
     Criterion,
     Jacobian,
@@ -28,18 +34,22 @@ from tuner.objective.criterion import (
     units_of,
 )
 from tuner.objective.initial_conditions import eliminated
-from tuner.objective.residuals import Reading, gauss_newton, residuals, robust
+from tuner.objective.residuals import Block, Reading, gauss_newton, residuals, robust
 from tuner.objective.segments import OFFSETS, Segments
 from tuner.objective.simulation import Flown, fly
 from tuner.objective.space import Space
 from tuner.vehicle.model import Model, with_coefficients
 
-Array = NDArray[np.float64]
-
 MEMORY = 2**30
 """bytes that derivatives take at most by default while they are computed."""
 LOGGED = 8
 """Share of them, one in so many, that is logged at a time where residuals are kept."""
+CHUNK = 16
+"""Vectors simulated side by side: enough to fill the processor, few enough for its memory."""
+NEAR = 3.0
+"""Multiple of the noise up to which a flight counts as met, by its worst channel."""
+STRAY = 3.0
+"""A flight that is met this many times worse than the median one counts less."""
 
 
 class Objective(eqx.Module):
@@ -135,22 +145,32 @@ class Objective(eqx.Module):
             tangents=self._directions(point, moving) or None,
         )
 
-    def reading(
+    def compare(
         self,
         point: Point,
         criterion: Criterion,
         moving: Mapping[str, int] = MappingProxyType({}),
-    ) -> Reading:
-        """Return how such a simulation is read to be compared; the arguments are those of `fly`."""
-        return Reading(
+    ) -> tuple[Array, Iterator[tuple[str, Block]]]:
+        """Fly the segments; return (F,) times of crashes, and channels with blocks of residuals.
+
+        The arguments are those of `fly`. Where conditions move, so do all that flights have of
+        their own.
+        """
+        flown = self.fly(point, criterion, moving)
+        reading = Reading(
             np.asarray(point.offsets)[: len(OFFSETS), self.flight] * OFFSET_UNIT,
             criterion.reference_offset[:, self.flight],
             float(self.schedule.log_rate),
             criterion.horizon,
             sum(moving.values()),
             moving.get("coefficients", 0) if "conditions" in moving else None,
-            OFFSET_UNIT,
         )
+        blocks = (
+            (name, block)
+            for name in self.channels
+            for block in residuals(flown, self.segments, name, reading)
+        )
+        return flown.crash_time, blocks
 
     def sums(
         self, point: Point, criterion: Criterion, *, derivatives: bool = True, still: bool = False
@@ -228,39 +248,34 @@ class Objective(eqx.Module):
 
     def _sums(self, point: Point, criterion: Criterion, moving: Mapping[str, int]) -> SegmentSums:
         """Return what all segments contribute at once."""
-        flown, reading = self.fly(point, criterion, moving), self.reading(point, criterion, moving)
-        segments, total, huber = self.segments.count, reading.total, criterion.huber
-        gradient, hessian = np.zeros((segments, total)), np.zeros((segments, total, total))
-        loss, squares, counts, by_start = np.zeros(segments), {}, {}, {}
-        starts = moving.get("states", 0)
-        for name in self.channels:
-            scale = criterion.scale[name][self.flight]
-            square, count = np.zeros(segments), np.zeros(segments)
-            slope, bend = np.zeros((segments, starts)), np.zeros((segments, starts, starts))
-            for block in residuals(flown, self.segments, name, reading):
-                some = block.segments
-                square[some] += np.einsum("fnk,fnk->f", block.errors, block.errors)
-                count[some] += block.counts.sum(axis=(1, 2))
-                scaled = block.errors / scale[some, None, None]
-                loss[some] += 0.5 * robust(scaled, huber).sum(axis=(1, 2))
-                if total:
-                    along, across = gauss_newton(block.columns, scaled, scale[some], huber)
-                    gradient[some] += along
-                    hessian[some] += across
-                if starts:
-                    own = block.columns[..., -starts:]
-                    slope[some] += np.einsum("fnk,fnkl->fl", block.errors, own)
-                    bend[some] += np.einsum("fnkl,fnkm->flm", own, own)
-            squares[name], counts[name], by_start[name] = square, count, (slope, bend)
+        crash_time, blocks = self.compare(point, criterion, moving)
+        segments, total, huber = self.segments.count, _columns(moving), criterion.huber
+        loss, gradient = np.zeros(segments), np.zeros((segments, total))
+        hessian, starts = np.zeros((segments, total, total)), moving.get("states", 0)
+        squares, counts = ({n: np.zeros(segments) for n in self.channels} for _ in range(2))
+        slope = {name: np.zeros((segments, starts)) for name in self.channels}
+        bend = {name: np.zeros((segments, starts, starts)) for name in self.channels}
+        for name, block in blocks:
+            some, scale = block.segments, criterion.scale[name][self.flight[block.segments]]
+            squares[name][some] += np.einsum("fnk,fnk->f", block.errors, block.errors)
+            counts[name][some] += block.counts.sum(axis=(1, 2))
+            scaled = block.errors / scale[:, None, None]
+            loss[some] += 0.5 * robust(scaled, huber).sum(axis=(1, 2))
+            if total:
+                along, across = gauss_newton(block.columns, scaled, scale, huber)
+                gradient[some] += along
+                hessian[some] += across
+            if starts:
+                own = block.columns[..., -starts:]
+                slope[name][some] += np.einsum("fnk,fnkl->fl", block.errors, own)
+                bend[name][some] += np.einsum("fnkl,fnkm->flm", own, own)
         best = None
         if criterion.states is not None:
-            states = criterion.states
-            loss, gradient, hessian, best = eliminated(loss, gradient, hessian, states)
-            change = (best - states).T
-            for name, (slope, bend) in by_start.items():
-                squares[name] = squares[name] + np.einsum(
-                    "fl,fl->f", change, 2.0 * slope + np.einsum("flm,fm->fl", bend, change)
-                )
+            loss, gradient, hessian, best = eliminated(loss, gradient, hessian, criterion.states)
+            change = (best - criterion.states).T
+            for name in self.channels:
+                pull = 2.0 * slope[name] + np.einsum("flm,fm->fl", bend[name], change)
+                squares[name] += np.einsum("fl,fl->f", change, pull)
         if "conditions" not in moving:
             size = len(self.space) + len(self.of_flight)
             gradient, hessian = np.zeros((segments, size)), np.zeros((segments, size, size))
@@ -270,7 +285,7 @@ class Objective(eqx.Module):
             np.moveaxis(hessian, 0, -1),
             squares,
             counts,
-            flown.crash_time,
+            crash_time,
             best,
         )
 
@@ -281,25 +296,27 @@ class Objective(eqx.Module):
 
         Segments are flown in turn, so that what is logged takes less than what is laid out.
         """
-        total = self.reading(point, criterion, moving).total
         errors, columns, crash_time = {}, {}, np.zeros(self.segments.count)
         for name in self.channels:
             n, k, segments = np.shape(self.segments.measured[name].weight)
             errors[name] = np.zeros((segments, n, k))
-            columns[name] = np.zeros((segments, n, k, total))
+            columns[name] = np.zeros((segments, n, k, _columns(moving)))
         for some, part, of_part in self._in_turn(criterion, moving, self.memory // LOGGED):
-            flown, reading = part.fly(point, of_part, moving), part.reading(point, of_part, moving)
-            crash_time[some] = flown.crash_time
-            for name in self.channels:
-                for block in residuals(flown, part.segments, name, reading):
-                    place = np.arange(part.segments.count)[block.segments, None], block.stamps
-                    errors[name][some][place] = block.errors
-                    columns[name][some][place] = block.columns
+            crash_time[some], blocks = part.compare(point, of_part, moving)
+            for name, block in blocks:
+                place = np.arange(part.segments.count)[block.segments, None], block.stamps
+                errors[name][some][place] = block.errors
+                columns[name][some][place] = block.columns
         return (
             {name: np.moveaxis(error, 0, -1) for name, error in errors.items()},
             {name: np.moveaxis(column, (-1, 0), (0, -1)) for name, column in columns.items()},
             crash_time,
         )
+
+
+def _columns(moving: Mapping[str, int]) -> int:
+    """Return how many columns residuals have where so much moves."""
+    return sum(moving.values()) + len(OFFSETS) * ("conditions" in moving)
 
 
 def some_segments(
@@ -369,3 +386,192 @@ def with_conditions(
     wider = replace(objective, conditions=(*objective.conditions, *added))
     nothing = np.zeros((len(added), objective.flights))
     return wider, Point(point.coefficients, np.concatenate([point.offsets, nothing]))
+
+
+class NormalEquations(NamedTuple):
+    """Loss c, gradient (P,) and Hessian (P, P) of a fit at a point, per compared value.
+
+    The parameters are the coefficients, then the flights' offsets, one kind after the other.
+    """
+
+    loss: float
+    gradient: Array
+    hessian: Array
+
+
+def normal_equations(
+    objective: Objective, point: Point, criterion: Criterion, sums: SegmentSums
+) -> NormalEquations:
+    """Return loss, gradient and Hessian over all segments, priors included.
+
+    Everything is divided by the number of compared values, so that damping means the same at every
+    horizon.
+
+    Parameters
+    ----------
+    objective
+        Gives the priors, and which flight each segment belongs to.
+    point, criterion, sums
+        Where, in which terms, and what the segments contribute there.
+    """
+    space, vector, offsets = objective.space, *map(np.asarray, (point.coefficients, point.offsets))
+    count, (kinds, flights), prior = len(space), offsets.shape, criterion.prior
+    compared = max(float(sums.compared), 1.0)
+    rows = prior * space.prior_rows * space.slope(vector)
+    pull, offset_pull = prior * space.prior_residuals(vector), offsets / OFFSET_SD
+    loss = float(np.sum(sums.loss)) + 0.5 * float(np.sum(pull**2) + np.sum(offset_pull**2))
+    owner = np.eye(flights)[np.asarray(objective.flight)]  # (F, N)
+    by_segment = np.asarray(sums.gradient)
+    gradient = np.concatenate(
+        [
+            by_segment[:count].sum(axis=-1) + rows.T @ pull,
+            (by_segment[count:] @ owner + offset_pull / OFFSET_SD).ravel(),
+        ]
+    )
+    hessian = np.zeros((count + kinds * flights,) * 2)
+    curved = np.asarray(sums.hessian)
+    hessian[:count, :count] = curved[:count, :count].sum(axis=-1) + rows.T @ rows
+    across = (curved[:count, count:] @ owner).reshape(count, -1)
+    hessian[:count, count:], hessian[count:, :count] = across, across.T
+    # a flight's offsets meet only each other
+    own = hessian[count:, count:].reshape(kinds, flights, kinds, flights)
+    each = np.arange(flights)
+    own[:, each, :, each] = np.moveaxis(curved[count:, count:] @ owner, -1, 0)
+    own_diagonal = np.arange(count, len(hessian))
+    hessian[own_diagonal, own_diagonal] += 1.0 / OFFSET_SD**2
+    return NormalEquations(loss / compared, gradient / compared, hessian / compared)
+
+
+def root_mean_squares(objective: Objective, sums: SegmentSums) -> dict[str, Array]:
+    """Return channel -> (S, N) root mean square residual in σ of each flight, NaN without any.
+
+    ``objective`` says which segment belongs to which flight; the segments' sums have S first.
+    """
+    owner, residual = np.eye(objective.flights)[objective.flight], {}
+    for name, squares in sums.squares.items():
+        counts = np.asarray(sums.counts[name]) @ owner
+        mean = np.asarray(squares) @ owner / np.maximum(counts, 1.0)
+        residual[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
+    return residual
+
+
+def position_rmse(
+    objective: Objective, squares: Mapping[str, Array], counts: Mapping[str, Array]
+) -> float:
+    """Return the position RMSE in m, of channel -> squares in σ and counts; NaN without any."""
+    if "position" not in counts:
+        return float("nan")
+    sigma = 1.0 / np.asarray(objective.segments.measured["position"].weight).max(initial=1e-30)
+    compared = float(np.sum(counts["position"])) or np.nan
+    return float(sigma * np.sqrt(3.0 * float(np.sum(squares["position"])) / compared))
+
+
+def strays(residual: dict[str, Array], noise_inflation: float) -> dict[str, Array]:
+    """Weigh a flight down that is met far worse than the others, so that it cannot poison them."""
+    table = np.stack(list(residual.values())) / noise_inflation
+    with np.errstate(all="ignore"):
+        per_flight = np.nan_to_num(np.nanmedian(table, axis=0), nan=1.0)
+    typical = max(float(np.median(per_flight)), 1.0)
+    stray = per_flight > STRAY * typical
+    return {
+        name: np.where(stray & np.isfinite(values), np.maximum(values / noise_inflation, 1.0), 1.0)
+        for name, values in residual.items()
+    }
+
+
+def misfit(residual: dict[str, Array]) -> dict[str, Array]:
+    """Return how much larger than noise each channel's residuals are on each flight, at least 1."""
+    return {
+        name: np.maximum(np.nan_to_num(values, nan=1.0), 1.0) for name, values in residual.items()
+    }
+
+
+class Batch(eqx.Module):
+    """What S vectors give.
+
+    Attributes
+    ----------
+    loss
+        (S, F) half the robust sum of squares.
+    squares
+        Channel -> (S, k, F) plain sum of squares in unscaled standard deviations.
+    crash_time
+        (S, F) s, infinite for a segment that flew.
+    """
+
+    loss: Float[Array, "S F"]
+    squares: dict[str, Float[Array, "S k F"]]
+    crash_time: Float[Array, "S F"]
+
+
+def evaluate(objective: Objective, vectors: Array, point: Point, criterion: Criterion) -> Batch:
+    """Fly all segments with every vector, in chunks that fit the memory.
+
+    The engine in force computes them.
+
+    Parameters
+    ----------
+    objective, criterion
+        The problem.
+    vectors
+        (S, K) search vectors.
+    point
+        Its clock offsets hold for all.
+    """
+    engine = current()
+    problem = engine.share((objective, point, criterion))
+    chunks = [vectors[first : first + CHUNK] for first in range(0, len(vectors), CHUNK)]
+    parts = engine.map(_evaluated, [(problem, chunk) for chunk in chunks])
+    joined: Batch = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return joined
+
+
+def _evaluated(
+    task: tuple[Callable[[], tuple[Objective, Point, Criterion]], Array],
+    _report: Report,
+) -> Batch:
+    """Return what some vectors give: all segments of all vectors fly side by side."""
+    (objective, point, criterion), vectors = task[0](), task[1]
+    count, segments = len(vectors), objective.segments.count
+    together = np.tile(np.arange(segments), count)
+    objective, criterion = some_segments(objective, criterion, together)
+    point = Point(np.repeat(vectors, segments, axis=0), point.offsets)
+    crash_time, blocks = objective.compare(point, criterion)
+    loss, squares = np.zeros(len(together)), {}
+    for name, measured in objective.segments.measured.items():
+        squares[name] = np.zeros((len(together), np.shape(measured.weight)[1]))
+    for name, block in blocks:
+        scale = criterion.scale[name][objective.flight[block.segments]]
+        scaled = block.errors / scale[:, None, None]
+        loss[block.segments] += 0.5 * robust(scaled, criterion.huber).sum(axis=(1, 2))
+        squares[name][block.segments] += np.einsum("fnk,fnk->fk", block.errors, block.errors)
+    by_axis = {n: np.moveaxis(s.reshape(count, segments, -1), -1, 1) for n, s in squares.items()}
+    return Batch(loss.reshape(count, segments), by_axis, crash_time.reshape(count, segments))
+
+
+def sums_at(
+    objective: Objective, points: Point, criterion: Criterion, *, derivatives: bool = True
+) -> SegmentSums:
+    """Return every segment's contribution at S points; all leaves have S first.
+
+    The engine in force computes them, a task each; one alone stays here.
+    """
+    alone = [
+        Point(coefficients, offsets)
+        for coefficients, offsets in zip(points.coefficients, points.offsets, strict=True)
+    ]
+    if len(alone) == 1:
+        parts = [objective.sums(alone[0], criterion, derivatives=derivatives)]
+    else:
+        engine = current()
+        problem = engine.share((objective, criterion, derivatives))
+        parts = engine.map(_sums, [(problem, point) for point in alone])
+    joined: SegmentSums = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+    return joined
+
+
+def _sums(
+    task: tuple[Callable[[], tuple[Objective, Criterion, bool]], Point], _report: Report
+) -> SegmentSums:
+    (objective, criterion, derivatives), point = task[0](), task[1]
+    return objective.sums(point, criterion, derivatives=derivatives)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from lanes import Argument, Program, joined
 from sim_jax.geometry import Quaternion
 from sim_jax.numeric import Array as JaxArray
-from tuner.core.numerics import huber_weights
+from tuner.core.numerics import Array, huber_weights
+from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Segments
 from tuner.objective.simulation import CODE, Flown
 
@@ -47,8 +48,8 @@ class Block(NamedTuple):
     segments: slice
     stamps: NDArray[np.intp]
     counts: NDArray[np.bool_]
-    errors: NDArray[np.float64]
-    columns: NDArray[np.float64]
+    errors: Array
+    columns: Array
 
 
 @dataclass(frozen=True)
@@ -70,18 +71,16 @@ class Reading:
     columns
         How many columns the simulation's derivatives have.
     coefficients
-        How many of them stand before those by the offsets; None for no columns of offsets.
-    offset_unit
-        s, or rad/s, in which the columns of offsets count.
+        How many of them stand before those by the offsets, in units of `OFFSET_UNIT`; None for no
+        columns of offsets.
     """
 
-    offsets: NDArray[np.float64]
-    reference_offset: NDArray[np.float64]
+    offsets: Array
+    reference_offset: Array
     rate: float
     horizon: int
     columns: int = 0
     coefficients: int | None = None
-    offset_unit: float = 1.0
 
     @property
     def total(self) -> int:
@@ -124,8 +123,8 @@ def _compared(
     log: _Series,
     columns: _Series | None,
     place: _Place,
-    recorded: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    recorded: Array,
+) -> tuple[Array, Array]:
     """Return errors (G, m, k) of a channel in its unit, and their columns (G, m, k, Q)."""
     reading = place.reading
     values = place.read(log)
@@ -137,7 +136,7 @@ def _compared(
         by_column[..., :before] = moved[..., :before]
         by_column[..., after:] = moved[..., before:]
     if reading.coefficients is not None:
-        by_column[..., before:after] = place.by_offset(log) * reading.offset_unit
+        by_column[..., before:after] = place.by_offset(log) * OFFSET_UNIT
     values = values + place.bias
     if name != "attitude":
         return values - recorded, by_column
@@ -151,7 +150,7 @@ class _Place:
     def __init__(
         self,
         segments: NDArray[np.intp],
-        time: NDArray[np.float64],
+        time: Array,
         name: str,
         reading: Reading,
     ) -> None:
@@ -160,11 +159,11 @@ class _Place:
         rate = reading.rate
         self.place = (time - reading.offsets[self.clock, segments][:, None]) * rate
         self.before = (time - reading.reference_offset[self.clock, segments][:, None]) * rate
-        self.bias: NDArray[np.float64] | float = 0.0
+        self.bias: Array | float = 0.0
         if name == "body_rate":
             self.bias = reading.offsets[len(CLOCKS) :, segments].T[:, None]
 
-    def read(self, series: _Series) -> NDArray[np.float64]:
+    def read(self, series: _Series) -> Array:
         """Return what the log of a simulation holds at the stamps, (G, m, *rest)."""
         if self.name != "command":
             return series.mixed(self.segments, self.place, lambda share: share)
@@ -176,7 +175,7 @@ class _Place:
         held -= series.mixed(self.segments, self.before, _risen)
         return held
 
-    def by_offset(self, series: _Series) -> NDArray[np.float64]:
+    def by_offset(self, series: _Series) -> Array:
         """Return the derivatives (G, m, c, offsets) by the offsets, in s and rad/s."""
         below = series.below(self.place)
         slope = series.at(self.segments, below + 1) - series.at(self.segments, below)
@@ -191,7 +190,7 @@ class _Place:
         return moved
 
 
-def _risen(share: NDArray[np.float64]) -> NDArray[np.float64]:
+def _risen(share: Array) -> Array:
     """Return how far the ramp into the next value has risen."""
     return np.clip(1.0 - (1.0 - share) / RAMP, 0.0, 1.0)
 
@@ -202,28 +201,28 @@ class _Series:
     These are (G, m), and what is read is (G, m, *rest), or (G, passes, m, *rest).
     """
 
-    def __init__(self, rows: NDArray[np.float64], *, by_pass: bool = False) -> None:
+    def __init__(self, rows: Array, *, by_pass: bool = False) -> None:
         self.passes = rows.shape[1] if by_pass else None
         self.samples, *self.rest = rows.shape[2 if by_pass else 1 :]
         self.flat = rows.reshape(-1, int(np.prod(self.rest)))
 
-    def below(self, place: NDArray[np.float64]) -> NDArray[np.intp]:
+    def below(self, place: Array) -> NDArray[np.intp]:
         return np.clip(np.floor(place + 1e-6).astype(np.intp), 0, self.samples - 2)
 
-    def at(self, segments: NDArray[np.intp], number: NDArray[np.intp]) -> NDArray[np.float64]:
+    def at(self, segments: NDArray[np.intp], number: NDArray[np.intp]) -> Array:
         if self.passes is not None:
             segments = segments[:, None] * self.passes + np.arange(self.passes)[:, None]
             number = number[:, None]
         row = segments * self.samples + number
-        rows: NDArray[np.float64] = np.take(self.flat, row.ravel(), axis=0)
+        rows: Array = np.take(self.flat, row.ravel(), axis=0)
         return rows.reshape(*row.shape, *self.rest)
 
     def mixed(
         self,
         segments: NDArray[np.intp],
-        place: NDArray[np.float64],
-        share_of: Callable[[NDArray[np.float64]], NDArray[np.float64]],
-    ) -> NDArray[np.float64]:
+        place: Array,
+        share_of: Callable[[Array], Array],
+    ) -> Array:
         """Return what lies between the samples before and after places."""
         below = self.below(place)
         first, second = self.at(segments, below), self.at(segments, below + 1)
@@ -237,19 +236,17 @@ class _Series:
 
 
 def at_stamps(
-    channel: NDArray[np.float64],
+    channel: Array,
     name: str,
-    time: NDArray[np.float64],
+    time: Array,
     reading: Reading,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return what a recording of a simulation (F, samples, c) would hold at stamps (F, n)."""
     place = _Place(np.arange(len(time)), time, name, reading)
     return place.read(_Series(channel)) + place.bias
 
 
-def _attitude_error(
-    recorded: NDArray[np.float64], flown: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _attitude_error(recorded: Array, flown: Array) -> tuple[Array, Array]:
     """Return the rotation vectors (F, n, 3) from recorded to flown, and (F, n, 3, 4) slopes."""
     shape, lanes = flown.shape[:-1], int(np.prod(flown.shape[:-1]))
     given = (recorded.reshape(lanes, 4).T, flown.reshape(lanes, 4).T)
@@ -273,8 +270,6 @@ def _rotation_program() -> Program:
         packages=CODE,
     )
 
-
-Array = NDArray[np.float64]
 
 ROWS_AT_ONCE = 1024
 """Residuals whose products are summed up by one call of BLAS: few enough for one thread, so that

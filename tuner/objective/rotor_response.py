@@ -12,7 +12,7 @@ import numpy as np
 
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.vehicle import Motor
-from tuner.recordings.flight import Array
+from tuner.core.numerics import Array
 
 
 @dataclass(frozen=True)

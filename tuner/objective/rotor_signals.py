@@ -18,10 +18,11 @@ import numpy as np
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
+from tuner.core.numerics import Array
 from tuner.findings.findings import Code, Finding
 from tuner.objective.inlets import linear_interpolation
 from tuner.recordings.content import PER_MOTOR
-from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.flight import Flight, Series
 from tuner.recordings.interpolation import resample
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.unit_detection import UNITS
@@ -74,9 +75,15 @@ def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> Explained
         return None
     step, turning, squares = read
     torque = _smoothed(squares) @ levers(vehicle)
-    delays = range(-1, max(1, round(LATEST / step)) + 1)
-    correlations = (_correlation(turning, torque, delay) for delay in delays)
-    best = max(correlations, key=lambda correlation: correlation[0] + correlation[1])
+
+    def after(delay: int) -> Array:
+        late, early = turning[max(0, delay) :], torque[: len(torque) - max(0, delay)]
+        if delay < 0:
+            late, early = turning[:delay], torque[-delay:]
+        return _correlations(late - late.mean(axis=0), early - early.mean(axis=0))
+
+    found = (after(delay) for delay in range(-1, max(1, round(LATEST / step)) + 1))
+    best = max(found, key=lambda correlation: correlation[0] + correlation[1]).tolist()
     rates = flight.series[source].rate, flight.series["body_rate"].rate
     return Explained(source, (best[0], best[1], best[2]), *rates)
 
@@ -94,7 +101,8 @@ def _turning(
     begin = max(span[0], gyro.time[0], rotors.time[0])
     end = min(span[1], gyro.time[-1], rotors.time[-1])
     count = int((end - begin) * rate)
-    if count < FEWEST:
+    known = [bool(np.isfinite(signal.values).any(axis=0).all()) for signal in (gyro, rotors)]
+    if count < FEWEST or not all(known):
         return None
     clock = begin + np.arange(count) / rate
     step = float(clock[1] - clock[0])
@@ -128,13 +136,10 @@ def _smoothed(values: Array) -> Array:
     return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
 
 
-def _correlation(turning: Array, torque: Array, delay: int) -> tuple[float, ...]:
-    late, early = turning[max(0, delay) :], torque[: len(torque) - max(0, delay)]
-    if delay < 0:
-        late, early = turning[:delay], torque[-delay:]
-    a, b = late - late.mean(axis=0), early - early.mean(axis=0)
-    size = np.sqrt((a * a).sum(axis=0) * (b * b).sum(axis=0))
-    return tuple(((a * b).sum(axis=0) / np.where(size > 0, size, np.inf)).tolist())
+def _correlations(turning: Array, torque: Array) -> Array:
+    """Return the correlation (3,) about each axis of two signals (n, 3) of mean zero."""
+    size = np.sqrt((turning * turning).sum(axis=0) * (torque * torque).sum(axis=0))
+    return np.asarray((turning * torque).sum(axis=0) / np.maximum(size, 1e-300))
 
 
 LAGS = (0.005, 0.015, 0.03, 0.06)
@@ -203,15 +208,14 @@ def motor_order(
     turning = _without_slow(turning, step)
     lagged = [_without_slow(_lagged(squares, step, lag), step) for lag in LAGS]
     arms = levers(vehicle)
-    orders = list(permutations(range(4)))
     alike_of = {
-        order: max(_alike(turning, x, arms[list(order)]) for x in lagged) for order in orders
+        order: max(min(_correlations(turning, x @ arms[list(order)])[:2]) for x in lagged)
+        for order in permutations(range(4))
     }
-    best, second = sorted(orders, key=alike_of.__getitem__, reverse=True)[:2]
+    best, second = sorted(alike_of, key=alike_of.__getitem__, reverse=True)[:2]
     if alike_of[best] < ENOUGH or alike_of[second] > alike_of[best] - CLEARER:
         return None
-    by_yaw = [_correlations(turning, x, arms[list(best)])[2] for x in lagged]
-    yaw = max(by_yaw, key=abs)
+    yaw = max((_correlations(turning, x @ arms[list(best)])[2] for x in lagged), key=abs)
     return MotorOrder(best, bool(yaw < 0.0) if abs(yaw) > ENOUGH else None)
 
 
@@ -266,18 +270,6 @@ def flight_in_rotor_order(flight: Flight, vehicle: VehicleFile) -> Flight:
         signals=signals,
         initial=replace(flight.initial, **initial),
     )
-
-
-def _alike(turning: Array, squares: Array, arms: Array) -> float:
-    """Return the lesser correlation of torque and angular acceleration about x and y."""
-    roll, pitch, _ = _correlations(turning, squares, arms)
-    return float(min(roll, pitch))
-
-
-def _correlations(turning: Array, squares: Array, arms: Array) -> Array:
-    torque = squares @ arms
-    size = np.sqrt((turning * turning).sum(axis=0) * (torque * torque).sum(axis=0))
-    return np.asarray((turning * torque).sum(axis=0) / np.maximum(size, 1e-300))
 
 
 def _without_slow(values: Array, step: float) -> Array:

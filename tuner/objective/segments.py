@@ -163,7 +163,7 @@ def segments_of(
     return Segments(
         inlet=inlet,
         start=start_of([flight.initial for flight in flights]),
-        measured=_all_measured(flights, noise, weights),
+        measured={name: _measured(flights, name, sd, weights) for name, sd in noise.items()},
         flight=np.arange(len(flights)),
         resting=np.asarray([rests(flight.initial) for flight in flights]),
         wander=None if wander is None else np.asarray(wander),
@@ -247,7 +247,7 @@ def window_segments(
     return Segments(
         inlet=inlet_of(names, pieces, schedule),
         start=start,
-        measured=_all_measured(pieces, compared, weights),
+        measured={name: _measured(pieces, name, sd, weights) for name, sd in compared.items()},
         flight=np.asarray([number for number, _ in cut]),
         turning=np.stack([recent_command(piece, lag) for piece in pieces], axis=-1),
         begin=np.asarray([window.begin for _, window in cut]),
@@ -270,14 +270,6 @@ def on_time(flight: Flight, signals: Sequence[str], late: float) -> Flight:
     return replace(flight, series={**flight.series, **moved})
 
 
-def _all_measured(
-    flights: Sequence[Flight],
-    noise: Mapping[str, float],
-    weights: Mapping[str, Mapping[str, float]],
-) -> dict[str, Measured]:
-    return {name: _measured(flights, name, sigma, weights) for name, sigma in noise.items()}
-
-
 def _measured(
     flights: Sequence[Flight],
     channel: str,
@@ -287,7 +279,10 @@ def _measured(
     """Return a channel of all flights, in their time, behind the end zero; level, an attitude."""
     width = 4 if channel in ("attitude", "rotor_speed", "command") else 3
     first = 1 if channel == "attitude" else 0
-    recorded = [_during(flight, flight.series.get(channel), width) for flight in flights]
+    nothing = Series(np.zeros(0), np.zeros((0, width)))
+    recorded = [
+        flight.series.get(channel, nothing).between(0.0, flight.time[-1]) for flight in flights
+    ]
     shape = max(len(series.time) for series in recorded), len(flights)
     time, values = np.zeros(shape), np.zeros((shape[0], width, shape[1]))
     weight = np.zeros((shape[0], width - first, shape[1]))
@@ -301,11 +296,3 @@ def _measured(
         values[:length, :, number] = np.where(finite, series.values, 0.0)
         weight[:length, :, number] = scale[:, first:]
     return Measured(time, values, weight)
-
-
-def _during(flight: Flight, series: Series | None, width: int) -> Series:
-    """Return what was recorded during the mission; no rows where nothing was."""
-    if series is None:
-        return Series(np.zeros(0), np.zeros((0, width)))
-    inside = (series.time >= 0.0) & (series.time <= flight.time[-1])
-    return Series(series.time[inside], series.values[inside])

@@ -26,10 +26,11 @@ from sim_jax.control.geometric import (
 )
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Array as JaxArray
+from tuner.core.numerics import Array
 from tuner.findings.findings import Code, Finding
 from tuner.objective.inlets import linear_interpolation, zero_order_hold
 from tuner.objective.simulation import CODE
-from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.flight import Flight, Series
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.model import controller_of
 

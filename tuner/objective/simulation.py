@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Float
-from numpy.typing import NDArray
 
 from lanes import Argument, program_of
 from sim_jax.environment import Air, Environment
@@ -36,6 +35,7 @@ from sim_jax.terms import total
 from sim_jax.terms.total import total_wrench
 from sim_jax.trim import in_trim
 from sim_jax.vehicle import PerRotor, Vehicle
+from tuner.core.numerics import Array
 from tuner.objective.battery import relative_log_voltage
 from tuner.objective.initial_conditions import ROWS, SPIN, moved, spun_up, trimmed, whole
 from tuner.objective.segments import Segments
@@ -46,8 +46,6 @@ from tuner.vehicle.model import (
     with_coefficients,
     with_terms_computed,
 )
-
-Array = NDArray[np.float64]
 
 MOTION, TURNED, SPEEDS, SETPOINTS = "motion", "turned", "speeds", "setpoints"
 """What no recording holds: the centre of mass's position, velocity and body rate; the body's

@@ -8,12 +8,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from tuner.config import JobFile
 from tuner.config.job import CoefficientSettings
 from tuner.core.errors import ConfigError
+from tuner.core.numerics import Array
 from tuner.vehicle import ControllerFile, VehicleFile, initial_values
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.joint_prior import JointPrior
@@ -60,23 +61,23 @@ class Space:
         return tuple(name for parameter in self.parameters for name in parameter.ratios)
 
     @property
-    def initial(self) -> NDArray[np.float64]:
+    def initial(self) -> Array:
         """The start as a search vector, shape (K,)."""
         return self.vector_of({p.name: p.initial for p in self.parameters})
 
-    def vector_of(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+    def vector_of(self, values: Mapping[str, float]) -> Array:
         """Return the search vector (K,) of coefficient values, clipped just inside the bounds."""
         return self.vector_at(np.array([p.scaled(values[p.name]) for p in self.parameters]))
 
-    def vector_at(self, scaled: NDArray[np.float64]) -> NDArray[np.float64]:
+    def vector_at(self, scaled: Array) -> Array:
         """Return the search vector (*S, K) at scaled coordinates, just inside the bounds."""
         return self.at_share((scaled - self.lower) / self.width)
 
-    def scaled(self, vector: ArrayLike) -> NDArray[np.float64]:
+    def scaled(self, vector: ArrayLike) -> Array:
         """Return the scaled coordinates of search vectors (*S, K)."""
         return np.asarray(self.lower + self.width * self.share(vector))
 
-    def prior_residuals(self, vector: ArrayLike) -> NDArray[np.float64]:
+    def prior_residuals(self, vector: ArrayLike) -> Array:
         """Return (*S, R) what half the square of is the priors' loss at search vectors (*S, K).
 
         Of each parameter's own prior, then of the joint one. Their derivatives by the scaled
@@ -107,7 +108,7 @@ class Space:
         """Return every free coefficient's value at a search vector (K,), tied ones too."""
         return {name: float(value) for name, value in self.values(vector).items()}
 
-    def slopes(self, vector: ArrayLike) -> dict[str, NDArray[np.float64]]:
+    def slopes(self, vector: ArrayLike) -> dict[str, Array]:
         """Return every free coefficient's derivatives (K,) by a search vector, tied ones too."""
         slope = np.where(self.is_log, self.at(vector), 1.0) * self.slope(np.asarray(vector))
         return {
@@ -116,11 +117,11 @@ class Space:
             for name, ratio in parameter.ratios.items()
         }
 
-    def share(self, vector: ArrayLike) -> NDArray[np.float64]:
+    def share(self, vector: ArrayLike) -> Array:
         """Return where between its bounds each scaled coordinate of a search vector lies, 0..1."""
         return np.asarray(expit(np.asarray(vector) / self.stretch))
 
-    def at_share(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at_share(self, share: Array) -> Array:
         """Return the search vector (*S, K) so far between the bounds, just inside them."""
         inside = np.clip(share, 1e-6, 1 - 1e-6)
         return np.asarray(np.log(inside / (1 - inside)) * self.stretch)
@@ -129,7 +130,7 @@ class Space:
         """Return a parameter's value from its scaled coordinate."""
         return float(np.exp(scaled)) if self.is_log[index] else float(scaled)
 
-    def slope(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def slope(self, vector: Array) -> Array:
         """Return dx/dz, the scaled coordinate's change with the search vector, shape (K,)."""
         share = self.share(vector)
         return np.asarray(self.width * share * (1 - share) / self.stretch)

@@ -19,15 +19,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc  # scipy.stats takes a quarter of a second to import
 
 from sim_jax.constants import GRAVITY
+from tuner.core.numerics import Array
 from tuner.objective.initial_conditions import ROWS, rests
 from tuner.objective.noise import FLOOR, white_noise
 from tuner.recordings.flight import Flight, Series
-
-Array = NDArray[np.float64]
 
 BEFORE = 1.0
 """s of hover before a mission from which it is looked at."""

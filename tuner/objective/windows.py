@@ -10,9 +10,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuner.core.errors import RecordingError
+from tuner.core.numerics import Array
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.recordings.states import initial_state, states_at
 
@@ -164,12 +164,12 @@ def _usable(
     return [(a, b) for a, b in stretches if is_known(float(time[a]), float(time[b]))]
 
 
-def _between(time: NDArray[np.float64], begin: float, end: float) -> NDArray[np.float64]:
+def _between(time: Array, begin: float, end: float) -> Array:
     """Return the times from one to another, both included."""
     return time[np.searchsorted(time, begin) : np.searchsorted(time, end, side="right")]
 
 
-def _period(time: NDArray[np.float64]) -> float:
+def _period(time: Array) -> float:
     """Return the s between samples; 0 of what is left of a signal most of which was dropped."""
     steps = np.diff(time)
     usual = float(np.median(steps))
@@ -201,9 +201,5 @@ def _is_known(state: InitialState) -> bool:
 
 
 def _around(series: Mapping[str, Series], begin: float, end: float) -> dict[str, Series]:
-    cut = {}
-    for name, signal in series.items():
-        near = (signal.time >= begin - BEFORE) & (signal.time <= end + BEHIND)
-        if near.any():
-            cut[name] = Series(signal.time[near] - begin, signal.values[near])
-    return cut
+    near = {name: signal.between(begin - BEFORE, end + BEHIND) for name, signal in series.items()}
+    return {n: Series(s.time - begin, s.values) for n, s in near.items() if len(s.time)}

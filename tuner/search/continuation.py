@@ -15,15 +15,20 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.numerics import scaled_inverse, scaled_solve
-from tuner.objective.batch import sums_at
+from tuner.core.numerics import Array, scaled_inverse, scaled_solve
 from tuner.objective.criterion import OFFSET_UNIT, Point, SegmentSums
-from tuner.objective.normal import Objective
+from tuner.objective.normal import (
+    Objective,
+    misfit,
+    normal_equations,
+    root_mean_squares,
+    strays,
+    sums_at,
+)
 from tuner.objective.segments import CLOCKS
 from tuner.search.evolution import evolve
 from tuner.search.iteration import Iteration
 from tuner.search.levenberg_marquardt import descend, starts_asked_for
-from tuner.search.normal_equations import misfit, normal_equations, root_mean_squares, strays
 from tuner.search.progress import (
     Free,
     Iterate,
@@ -214,9 +219,7 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
     objective, free = problem.objective, problem.free
     here: SegmentSums = jax.tree.map(lambda leaf: np.asarray(leaf)[best], sums)
     point = point_of(problem.points, best)
-    loss, gradient, hessian = normal_equations(
-        objective.space, objective.flight, point, problem.criterion, here
-    )
+    loss, gradient, hessian = normal_equations(objective, point, problem.criterion, here)
     moves = np.flatnonzero(np.concatenate([free.coefficients, free.offsets.ravel()]))
     inverse = scaled_inverse(hessian[np.ix_(moves, moves)], RIDGE)
     late = np.concatenate([np.zeros(len(objective.space)), np.ravel(point.offsets)])[moves]
@@ -235,7 +238,7 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
     return stay.reshape(free.offsets.shape)
 
 
-def _rise(inverse: NDArray[np.float64], late: NDArray[np.float64], clocks: list[int]) -> float:
+def _rise(inverse: Array, late: Array, clocks: list[int]) -> float:
     square = inverse[np.ix_(clocks, clocks)]
     return float(0.5 * late[clocks] @ scaled_solve(square, late[clocks]))
 

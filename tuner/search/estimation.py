@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from tuner.core.disk import whole_file
 from tuner.core.errors import InputError
 from tuner.core.files import read_arrays
+from tuner.core.numerics import Array
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.inlets import INLETS
@@ -303,7 +304,7 @@ def stages_of(job: Job, objective: Objective, method: str = "gradient") -> tuple
     )
 
 
-def _through_windows(job: Job, starts: NDArray[np.float64], free: Free) -> NDArray[np.float64]:
+def _through_windows(job: Job, starts: Array, free: Free) -> Array:
     """Return where windows lead each start (S, K), for flights that do not begin gently."""
     assert job.windows is not None
     progress = grow(
@@ -332,7 +333,7 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     return free
 
 
-def starting_vectors(job: Job) -> NDArray[np.float64]:
+def starting_vectors(job: Job) -> Array:
     """Return S start vectors (S, K): the vehicle file's, then random ones around it.
 
     A logarithmic coefficient is drawn between the vehicle file's value divided by the job's
@@ -408,7 +409,7 @@ def polished(
 def searched_again(
     job: Job,
     fitted: Fitted,
-    vector: NDArray[np.float64],
+    vector: Array,
     *,
     free: Free,
     title: str,

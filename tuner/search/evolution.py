@@ -7,9 +7,8 @@ from warnings import catch_warnings
 
 import numpy as np
 
-from tuner.objective.batch import CHUNK, evaluate
 from tuner.objective.criterion import Point
-from tuner.search.normal_equations import position_rmse
+from tuner.objective.normal import CHUNK, evaluate, position_rmse
 from tuner.search.progress import Iterate, StageProblem, point_of
 
 POPULATION = CHUNK

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
@@ -43,7 +43,7 @@ def unmatched(scales: Scales) -> dict[str, dict[str, float]]:
     return lost
 
 
-def offset_findings(job: Job, offsets: NDArray[np.float64]) -> tuple[Finding, ...]:
+def offset_findings(job: Job, offsets: Array) -> tuple[Finding, ...]:
     """Return which clocks and gyros the search estimated to be off.
 
     Parameters

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.findings.findings import Finding
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
@@ -85,7 +85,7 @@ class Fitted:
 
 
 def by_flight(
-    scales: Mapping[str, NDArray[np.float64]], flights: Sequence[Flight]
+    scales: Mapping[str, Array], flights: Sequence[Flight]
 ) -> dict[str, dict[str, float]]:
     """Return flight name -> channel -> number, of channel -> (N,) numbers."""
     return {

@@ -10,13 +10,14 @@ import numpy as np
 
 from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
+from tuner.core.numerics import Array
 from tuner.equation_error.measured import Measured, measured, rows_of
 from tuner.equation_error.regression import convolved
 from tuner.findings.findings import Code, Finding
 from tuner.objective.inlets import INLETS
 from tuner.objective.rotor_signals import Explained, Source, explained, levers, motor_order
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
-from tuner.recordings.flight import Array, Flight
+from tuner.recordings.flight import Flight
 from tuner.recordings.notes import NoteCode
 from tuner.vehicle import ControllerFile, VehicleFile
 

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
-from tuner.core.numerics import Z95
+from tuner.core.numerics import Z95, Array
 from tuner.equation_error.measured import Mask, measured_with, with_rotors
 from tuner.equation_error.regression import MEMORY, convolved, whitening_filter
 from tuner.objective.inlets import INLETS
-from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import states_at
 from tuner.search.inlet_choice import regressors
 from tuner.search.job_flights import Recording

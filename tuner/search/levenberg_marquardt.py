@@ -19,20 +19,19 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tuner.objective.batch import sums_at
+from tuner.core.numerics import Array
 from tuner.objective.criterion import Criterion, Point, SegmentSums
-from tuner.objective.normal import Objective
-from tuner.search.normal_equations import (
+from tuner.objective.normal import (
     NEAR,
     NormalEquations,
+    Objective,
     normal_equations,
     position_rmse,
     root_mean_squares,
+    sums_at,
 )
 from tuner.search.progress import Iterate, StageProblem
 from tuner.search.stages import WEIGHED
-
-Array = NDArray[np.float64]
 
 ACCEPTED, WELL_PREDICTED = 0.05, 0.7
 """Share of the predicted fall of the loss from which a point is accepted, and λ made smaller."""
@@ -83,9 +82,8 @@ class Step(NamedTuple):
     best
         The segments' sums there, gradient and Hessian included.
     sums
-        Those at the point that was tried.
-    ahead
-        Those at the point to be tried next, where that was flown already.
+        Those at the point that was tried last; before the first step at the starts, where these
+        were flown already.
     """
 
     point: Point
@@ -97,7 +95,6 @@ class Step(NamedTuple):
     quadratic: NormalEquations | None = None
     best: SegmentSums | None = None
     sums: SegmentSums | None = None
-    ahead: SegmentSums | None = None
 
     @property
     def loss(self) -> Array:
@@ -128,7 +125,7 @@ def begin(points: Point, damping: Array | None = None, sums: SegmentSums | None 
         damping=np.ones(starts) if damping is None else np.asarray(damping, float),
         still=np.zeros(starts, bool),
         predicted_reduction=np.full(starts, np.inf),
-        ahead=sums,
+        sums=sums,
     )
 
 
@@ -153,13 +150,11 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
 
     def quadratics(sums: SegmentSums) -> list[NormalEquations]:
         return [
-            normal_equations(
-                objective.space, objective.flight, one.tried, criterion, _of(sums, start)
-            )
+            normal_equations(objective, one.tried, criterion, _of(sums, start))
             for start, one in enumerate(each)
         ]
 
-    sums, here = before.ahead, None
+    sums, here = before.sums if before.quadratic is None else None, None
     unknown = 0 if criterion.states is None else len(criterion.states)
     if before.quadratic is not None and CHEAP * unknown <= len(objective.space):
         plain = sums_at(objective, before.tried, criterion, derivatives=False)

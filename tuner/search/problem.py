@@ -273,9 +273,8 @@ def limits_of(flights: Sequence[Flight]) -> Limits:
     """
     arena = Limits()
     for flight in flights:
-        place = flight.series["position"]
-        inside = (place.time >= 0) & (place.time <= flight.duration)
-        places = place.values[inside & np.isfinite(place.values).all(axis=1)]
+        places = flight.series["position"].between(0.0, flight.duration).values
+        places = places[np.isfinite(places).all(axis=1)]
         low = places[:, 2].min() < arena.floor + CLEARANCE
         if low or np.abs(places).max() > arena.half_width / 2:
             return AIRBORNE

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from sim_jax.control.gains import Controller
 from sim_jax.numeric import Scalar
+from tuner.core.numerics import Array
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
@@ -114,10 +115,10 @@ class StageProblem:
     criterion: Criterion
     stage: Stage
     points: Point
-    losses: NDArray[np.float64]
+    losses: Array
     free: Free
     seed: int
-    damping: NDArray[np.float64]
+    damping: Array
     last: bool
     sums: SegmentSums | None = None
 
@@ -154,13 +155,13 @@ class Iterate:
     """
 
     points: Point
-    losses: NDArray[np.float64]
+    losses: Array
     accepted: NDArray[np.bool_]
     position_rmse: float
     damping: float = float("nan")
     converged: bool = False
     sums: SegmentSums | None = None
-    next_start: tuple[Point, NDArray[np.float64]] | None = None
+    next_start: tuple[Point, Array] | None = None
 
 
 Optimiser: TypeAlias = Callable[[StageProblem], Iterator[Iterate]]
@@ -200,12 +201,12 @@ class Progress:
 
     stage: int
     points: Point
-    scales: dict[str, NDArray[np.float64]]
-    states: NDArray[np.float64] | None
-    losses: NDArray[np.float64]
+    scales: dict[str, Array]
+    states: Array | None
+    losses: Array
     iterations: tuple[Iteration, ...]
     evaluations: int
-    damping: NDArray[np.float64]
+    damping: Array
     loop: Loop
     converged: bool = False
     left: float = float("nan")
@@ -220,7 +221,7 @@ class Progress:
         return point_of(self.iterate.points, int(np.argmin(self.iterate.losses)))
 
 
-def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
+def beginning(objective: Objective, vectors: Array) -> Progress:
     """Return the state before the first stage for S start vectors (S, K)."""
     offsets = np.zeros((len(vectors), *objective.start(vectors[0]).offsets.shape))
     freedom = objective.segments.freedom
@@ -239,9 +240,9 @@ def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
 
 def criterion_of(
     stage: Stage,
-    scales: dict[str, NDArray[np.float64]],
-    offsets: NDArray[np.float64],
-    states: NDArray[np.float64] | None = None,
+    scales: dict[str, Array],
+    offsets: Array,
+    states: Array | None = None,
 ) -> Criterion:
     """Return what the solver needs to know of a stage.
 
@@ -264,7 +265,7 @@ def criterion_of(
 
 
 def plain_criterion(
-    objective: Objective, horizon: int, scales: dict[str, NDArray[np.float64]] | None = None
+    objective: Objective, horizon: int, scales: dict[str, Array] | None = None
 ) -> Criterion:
     """Return the criterion of plain squares up to a horizon in samples, no clock late.
 

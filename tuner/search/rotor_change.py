@@ -20,9 +20,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from tuner.core.numerics import Array
 from tuner.findings.findings import Code, Finding
 from tuner.objective.rotor_signals import Source, squared_speed
-from tuner.recordings.flight import Array, Flight
+from tuner.recordings.flight import Flight
 from tuner.recordings.states import filtered, states_at
 from tuner.search.job_flights import Recording
 from tuner.vehicle import VehicleFile

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.disturbances.information import hidden
-from tuner.disturbances.predictor import Predictor
+from tuner.disturbances.predictor import Predictor, hidden
 from tuner.objective.information import begun
 from tuner.objective.space import Space
 from tuner.search.findings import findings_at

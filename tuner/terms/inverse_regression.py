@@ -48,16 +48,14 @@ from sim_jax.terms.total import total_wrench
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.core.numerics import huber_weights, robust_sd, scaled_solve
 from tuner.findings.findings import Code, Finding, Level
-from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Point, SegmentSums
-from tuner.objective.normal import Objective, some_segments
+from tuner.objective.normal import Objective, normal_equations, some_segments, sums_at
 from tuner.objective.simulation import fly
 from tuner.objective.space import Space
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import states_at
 from tuner.search.fitted import Fitted
 from tuner.search.levenberg_marquardt import descend
-from tuner.search.normal_equations import normal_equations
 from tuner.search.problem import Job
 from tuner.search.progress import Free, StageProblem
 from tuner.search.stages import Stage
@@ -286,8 +284,7 @@ class _Settling:
             states=None,
         )
         _, down, curved = normal_equations(
-            objective.space,
-            objective.segments.flight,
+            objective,
             Point(np.asarray(vector), point.offsets),
             self.fitted.criterion,
             sums,
@@ -361,9 +358,7 @@ def with_inputs_balanced(
         kept = examine(fitted, otherwise=otherwise, in_doubt={**in_doubt, **doubt})
         return fitted, kept, findings
     scores = objective.sums(point, fitted.criterion, derivatives=False)
-    loss, _, _ = normal_equations(
-        objective.space, np.asarray(segments.flight), point, fitted.criterion, scores
-    )
+    loss, _, _ = normal_equations(objective, point, fitted.criterion, scores)
     fitted = replace(fitted, point=point, loss_best=float(loss))
     examination = examine(fitted, otherwise=otherwise, in_doubt=in_doubt, at_minimum=False)
     return fitted, examination, findings

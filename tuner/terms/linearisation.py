@@ -26,7 +26,7 @@ from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point, Seg
 from tuner.objective.information import (
     BLOCK,
     FisherInformation,
-    information_from_jacobian,
+    information_at,
     with_secants,
 )
 from tuner.objective.normal import Objective, portions
@@ -268,7 +268,7 @@ def linear_at(
         )
         fitted = offsets_fitted[: len(offsets_fitted) - len(around), flights]
         parts.append(
-            information_from_jacobian(
+            information_at(
                 *_with_coefficients_around(*batch, jacobian, around), offsets_fitted=fitted
             )
         )

@@ -10,8 +10,7 @@ from functools import partial
 import numpy as np
 
 from tuner.core.phrases import listed
-from tuner.disturbances.information import hidden
-from tuner.disturbances.predictor import Predictor
+from tuner.disturbances.predictor import Predictor, hidden
 from tuner.disturbances.recorded import FLIGHT_CONTROLLER
 from tuner.disturbances.refit import STEPS, with_least_innovations
 from tuner.findings.findings import Code, Finding

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Z95, Array, scaled_solve
-from tuner.disturbances.information import with_hidden, with_strengths
-from tuner.disturbances.predictor import Predictor
+from tuner.disturbances.predictor import Predictor, with_hidden, with_strengths
 from tuner.objective.criterion import Criterion, Jacobian, Point
-from tuner.objective.information import FisherInformation, information_from_jacobian
+from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.normal import Objective, portion, portions
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
@@ -113,7 +112,7 @@ def examine(
         jacobian = batch[0].jacobian(*batch[1:])
         moved = {name: other.residuals(*batch[1:]) for name, other in others.items()}
         compared = jacobian if predictor is None else jacobian.of(predictor.rows)
-        informations.append(information_from_jacobian(*batch, compared, otherwise=moved))
+        informations.append(information_at(*batch, compared, otherwise=moved))
         sensitivities.append(
             local_sensitivity(*batch, jacobian, reference=reference, flights=flight_names)
         )

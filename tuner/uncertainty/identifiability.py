@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from tuner.core.numerics import scaled_solve
 from tuner.core.phrases import listed
 from tuner.objective.criterion import Point
+from tuner.objective.normal import normal_equations
 from tuner.search.estimation import LAST, LAST_TWO, free_offsets, polished
 from tuner.search.fitted import Fitted
-from tuner.search.normal_equations import normal_equations
 from tuner.search.problem import Job
 from tuner.search.progress import Free, Progress
 from tuner.uncertainty.estimates import Uncertainty
@@ -216,9 +216,7 @@ def _moved(fitted: Fitted, vector: NDArray[np.float64], free: Free) -> Point:
     """Return the point with some coefficients elsewhere (K,), what is free following them."""
     objective, point = fitted.objective, fitted.point
     sums = objective.sums(point, fitted.criterion)
-    hessian = normal_equations(
-        objective.space, objective.flight, point, fitted.criterion, sums
-    ).hessian
+    hessian = normal_equations(objective, point, fitted.criterion, sums).hessian
     change = np.zeros(len(hessian))
     change[: len(vector)] = vector - point.coefficients
     follow = np.flatnonzero(np.concatenate([free.coefficients, free.offsets.ravel()]))

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Array
-from tuner.objective.batch import Batch, evaluate
 from tuner.objective.criterion import Criterion, Jacobian, Point
-from tuner.objective.normal import Objective
+from tuner.objective.normal import Batch, Objective, evaluate
 from tuner.uncertainty.records import (
     EffectOverTime,
     GlobalSensitivity,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.disturbances.disturbances import LEAST, MOST, STRENGTHS
-from tuner.disturbances.information import hidden, with_hidden, with_strengths
+from tuner.disturbances.predictor import hidden, with_hidden, with_strengths
 from tuner.objective.information import FisherInformation
 from tuner.uncertainty.estimates import _shares
 

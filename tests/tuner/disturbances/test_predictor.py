@@ -26,19 +26,20 @@ from tuner.disturbances.disturbances import (
 )
 from tuner.disturbances.disturbances import STRENGTHS as NAMED
 from tuner.disturbances.extended_kalman_filter import GATE
-from tuner.disturbances.information import USUALLY, with_strengths
 from tuner.disturbances.observer import Observer
 from tuner.disturbances.predictor import (
+    USUALLY,
     Likelihood,
     Predictor,
     likelihood_of,
     slopes_of,
     steps_from,
     unscaled,
+    with_strengths,
 )
 from tuner.disturbances.refit import _equations, with_least_innovations
 from tuner.objective.criterion import Point
-from tuner.objective.information import information_at, information_from_jacobian
+from tuner.objective.information import information_at
 from tuner.objective.normal import Objective
 from tuner.objective.simulation import beginning_of, recorded_of
 from tuner.recordings.flight import Flight, InitialState, Series
@@ -134,7 +135,7 @@ def error_of(problem: Objective, predictor: Predictor, point: Point) -> np.ndarr
     criterion = unscaled(making.fitted_of(problem, point).criterion)
     told = predictor.jacobian(problem, point, range(len(FREE)))
     return covariance_of(
-        information_from_jacobian(problem, point, criterion, told, offsets_fitted=OFFSETS)
+        information_at(problem, point, criterion, told, offsets_fitted=OFFSETS)
     ).error
 
 
@@ -220,7 +221,7 @@ def test_from_far_off_it_ends_in_the_same_place(fitted, exact) -> None:
     again, there = with_least_innovations(begin, flights, (problem, where, criterion), free)
     told = predictor.jacobian(problem, point, range(len(FREE)))
     error = covariance_of(
-        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
+        information_at(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
     ).error
     slope = exact.space.slope(np.asarray(point.coefficients))
     moved = (np.asarray(there.coefficients) - np.asarray(point.coefficients)) * slope
@@ -306,7 +307,7 @@ def test_how_noisy_commands_are_is_learnt_whatever_is_claimed(exact, claimed) ->
     assert noise == pytest.approx(1.0, abs=0.1)
     told = predictor.jacobian(problem, point, range(len(FREE)))
     error = covariance_of(
-        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
+        information_at(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
     ).error
     away = problem.space.scaled(point.coefficients) - problem.space.scaled(truth.coefficients)
     assert np.abs(np.asarray(away) / error).max() < 3.0

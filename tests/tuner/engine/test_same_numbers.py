@@ -15,8 +15,8 @@ from tuner.engine import using
 from tuner.evaluate import simulate as simulation
 from tuner.evaluate.simulate import simulate
 from tuner.job.sensitivity import unfitted
-from tuner.objective.batch import evaluate, sums_at
 from tuner.objective.criterion import Point
+from tuner.objective.normal import evaluate, sums_at
 from tuner.search.job_flights import read_usable
 from tuner.search.problem import job_of
 from tuner.uncertainty.refits import (

@@ -27,9 +27,9 @@ from tuner.objective.battery import (
     with_reference_voltage,
 )
 from tuner.objective.criterion import Point
+from tuner.objective.normal import normal_equations
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, InitialState, Series
-from tuner.search.normal_equations import normal_equations
 from tuner.uncertainty.estimates import DRAWS, STEP
 from tuner.uncertainty.model_error import alternatives_of
 
@@ -220,7 +220,7 @@ def test_the_exponent_is_estimated_with_the_derivative_that_it_has(volts):
     def equations(vector):
         there = fit.start(vector)
         sums = fit.sums(there, criterion)
-        return normal_equations(fit.space, fit.segments.flight, there, criterion, sums)
+        return normal_equations(fit, there, criterion, sums)
 
     middle = 0.5 * (start + np.asarray(point.coefficients))
     _, gradient, _ = equations(middle)

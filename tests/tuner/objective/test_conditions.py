@@ -7,9 +7,8 @@ import pytest
 from tests.tuner.uncertainty.making import criterion_of, problem, truth, with_data
 from tuner.objective.criterion import OFFSET_SD, Point, units_of
 from tuner.objective.information import information_at
-from tuner.objective.normal import with_conditions
+from tuner.objective.normal import normal_equations, with_conditions
 from tuner.objective.segments import OFFSETS
-from tuner.search.normal_equations import normal_equations
 from tuner.vehicle import conditions
 
 NAMES = ("wind_x", "wind_y", "battery_decline")
@@ -34,7 +33,7 @@ def fit():
 def equations(objective, point):
     criterion = criterion_of(objective, prior=0.0)
     sums = objective.sums(point, criterion)
-    return normal_equations(objective.space, objective.segments.flight, point, criterion, sums)
+    return normal_equations(objective, point, criterion, sums)
 
 
 def test_the_prior_of_a_condition_is_that_of_an_offset_in_its_unit():

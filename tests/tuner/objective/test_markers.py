@@ -11,7 +11,7 @@ from tests.tuner.uncertainty.making import (
     with_data,
 )
 from tuner.objective.criterion import Point
-from tuner.search.normal_equations import normal_equations
+from tuner.objective.normal import normal_equations
 from tuner.search.progress import Loop, with_loop
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import NotCarried
@@ -40,7 +40,7 @@ def fit():
 def equations(objective, vector):
     point, criterion = objective.start(vector), criterion_of(objective, prior=0.0)
     sums = objective.sums(point, criterion)
-    return normal_equations(objective.space, objective.segments.flight, point, criterion, sums)
+    return normal_equations(objective, point, criterion, sums)
 
 
 def test_the_markers_are_flown_around_the_centre_of_mass(fit):

@@ -9,7 +9,7 @@ import pytest
 
 from tests.tuner.uncertainty.making import criterion_of, problem, truth, with_data
 from tuner.objective.criterion import OFFSET_UNIT, Point
-from tuner.search.normal_equations import normal_equations
+from tuner.objective.normal import normal_equations
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
 
@@ -22,7 +22,7 @@ def fit():
 def loss_at(fit, coefficients, offsets, criterion):
     point = Point(jnp.asarray(coefficients), jnp.asarray(offsets))
     sums = fit.sums(point, criterion, derivatives=True)
-    return normal_equations(fit.space, fit.segments.flight, point, criterion, sums)
+    return normal_equations(fit, point, criterion, sums)
 
 
 def test_gradient_equals_finite_differences(fit):

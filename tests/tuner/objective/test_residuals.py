@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.residuals import Reading, at_stamps, residuals
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, Segments
 from tuner.objective.simulation import Flown
@@ -53,7 +54,7 @@ def test_a_jump_that_a_clock_passes_is_seen_and_has_a_slope():
     segments = Segments(None, None, {"command": measured}, np.zeros(1, int))
     flown = Flown({"command": series[None, :, None]}, {"command": None}, np.full(1, np.inf))
     (block,) = residuals(flown, segments, "command", reading_of(late, coefficients=0))
-    slope = block.columns[0, :, 0, CLOCK_OF["command"]]
+    slope = block.columns[0, :, 0, CLOCK_OF["command"]] / OFFSET_UNIT
     assert np.abs(slope).max() > 1.0
     assert slope == pytest.approx((there - here) / (2.0 * step), rel=1e-6, abs=1e-6)
 

@@ -353,6 +353,11 @@ def test_the_line_on_a_wrong_motor_order_says_which_fits(order: str) -> None:
     series = {"body_rate": Series(time, rate), "command": Series(time, recorded)}
     (wrong,) = order_findings("flight", series, vehicle, (0.0, 14.0))
     assert f"Write motor_order: {order} into the topic map" in one_line(wrong)
+    for name, signal_of in series.items():  # a column that was never measured
+        values = np.array(signal_of.values)
+        values[:, 2] = np.nan
+        dead = {**series, name: Series(time, values)}
+        assert order_findings("flight", dead, vehicle, (0.0, 14.0)) == ()
 
 
 def test_a_motor_order_that_is_none_is_refused(tmp_path: Path) -> None:

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
-from tuner.objective.batch import sums_at
+from tuner.objective.normal import normal_equations, sums_at
 from tuner.objective.segments import OFFSETS
 from tuner.search import continuation, levenberg_marquardt
 from tuner.search.continuation import _clocks_that_differ, grow
-from tuner.search.normal_equations import normal_equations
 from tuner.search.progress import Free, beginning, criterion_of, point_of
 from tuner.search.stages import schedule_of
 
@@ -87,8 +86,8 @@ def test_the_search_ends_within_a_tenth_of_a_standard_error_of_the_minimum(fit):
     assert progress.points is iterate.points  # what it ends with was flown
     point, here = point_of(iterate.points, 0), jax.tree.map(lambda leaf: leaf[0], iterate.sums)
     criterion = criterion_of(stage, last.scales, np.asarray(point.offsets))
-    flight, count = np.asarray(fit.segments.flight), len(fit.space)
-    _, gradient, hessian = normal_equations(fit.space, flight, point, criterion, here)
+    count = len(fit.space)
+    _, gradient, hessian = normal_equations(fit, point, criterion, here)
     compared = sum(float(np.sum(n)) for n in here.counts.values())
     gradient, hessian = np.asarray(gradient)[:count], np.asarray(hessian)[:count, :count]
     away = np.sqrt(compared * gradient @ np.linalg.solve(hessian, gradient))

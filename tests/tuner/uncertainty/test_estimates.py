@@ -9,8 +9,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.information import information_at
-from tuner.objective.normal import Objective
-from tuner.search.normal_equations import normal_equations
+from tuner.objective.normal import Objective, normal_equations
 from tuner.uncertainty.estimates import Uncertainty, _lags, uncertainty_of
 from tuner.uncertainty.verdict import Verdict
 
@@ -49,9 +48,7 @@ def test_information_is_the_searchs_with_clock_offsets_eliminated(
     point = Point(making.truth(objective).coefficients + 0.01, jnp.asarray(offsets))
     criterion = making.criterion_of(objective)
     sums = objective.sums(point, criterion, derivatives=True)
-    _, _, hessian = normal_equations(
-        objective.space, objective.segments.flight, point, criterion, sums
-    )
+    _, _, hessian = normal_equations(objective, point, criterion, sums)
     compared = sum(float(n.sum()) for n in sums.counts.values())
     count = len(objective.space)
     kept = np.concatenate([np.arange(count), count + np.flatnonzero(OFFSETS_FITTED)])

@@ -11,8 +11,8 @@ from tuner.core.shipped import configs_folder, find_config
 from tuner.findings.findings import Code
 from tuner.ground.bench_json import BenchRecord, joint_prior
 from tuner.objective.criterion import Criterion, Point, SegmentSums
+from tuner.objective.normal import normal_equations
 from tuner.objective.space import space_of
-from tuner.search.normal_equations import normal_equations
 from tuner.uncertainty.ground import ground_conflicts, sources_of
 from tuner.vehicle import ControllerFile, read_vehicle
 from tuner.vehicle.joint_prior import JointPrior
@@ -85,7 +85,9 @@ def equations(fit, vector):
         reference_offset=np.zeros((2, 1)),
     )
     point = Point(vector, np.zeros((offsets, 1)))
-    return normal_equations(fit, np.zeros(1, int), point, criterion, sums)
+    return normal_equations(
+        SimpleNamespace(space=fit, flight=np.zeros(1, int)), point, criterion, sums
+    )
 
 
 def test_the_search_s_gradient_is_that_of_its_loss():
