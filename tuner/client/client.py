@@ -138,7 +138,13 @@ class Client:
         return str(self._json("POST", "/jobs", json=request, headers=headers)["id"])
 
     def upload(self, path: Path, on_upload: Callable[[Path], None] = lambda _: None) -> str:
-        """Send a recording unless the server has it, and return its id."""
+        """Send a recording unless the server has it, and return its id.
+
+        Raises
+        ------
+        InputError
+            It is a folder or cannot be read, or the server does not take it.
+        """
         if path.is_dir():
             raise InputError(
                 path, "is a folder, and a server takes single files", "give the .db3 or .mcap in it"

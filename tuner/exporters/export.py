@@ -221,13 +221,6 @@ def _places(draft: Draft, path: Path, into: Path | None) -> tuple[Path, dict[Pat
 
     A model that is split over several files stays where it is, or is written into a folder, each
     file in a folder of the name of its own.
-
-    Raises
-    ------
-    ExportError
-        It is split, and is to become one file.
-    OutputError
-        It cannot be written there.
     """
     if into is None or path == into or not draft.others:
         check_file(path, folder_is_made=True)

@@ -192,13 +192,7 @@ def _write_requested(
 
 
 def _uncertainty_with(examination: Examination, name: str) -> Uncertainty:
-    """Return the uncertainty of the fitted coefficients and a named one.
-
-    Raises
-    ------
-    InputError
-        There is no such coefficient in this simulation.
-    """
+    """Return the uncertainty of the fitted coefficients and a named one."""
     if name in examination.uncertainty.names:
         return examination.uncertainty
     if name in examination.freed:

@@ -146,7 +146,15 @@ def load_flights(
     rate: float = 100.0,
     cache: bool = True,
 ) -> tuple[Flight, ...]:
-    """Read every mission of a recording; see `load_flight`."""
+    """Read every mission of a recording; see `load_flight`.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read, nothing flies in it, or a mission cannot be a flight.
+    ConfigError
+        The topic map or the side-car is wrong.
+    """
     path = Path(path)
     if not exists(path):
         raise RecordingError(path, "no such file", "check the path")

@@ -85,13 +85,7 @@ def _identity(data: Path) -> str:
 
 
 def _only_server(data: Path) -> IO[str]:
-    """Take the lock of a data folder, which the system lets go when the process ends.
-
-    Raises
-    ------
-    InputError
-        Another server has it.
-    """
+    """Take the lock of a data folder, which the system lets go when the process ends."""
     file = (data / "server.lock").open("w")
     try:
         import fcntl  # noqa: PLC0415 (not on Windows)

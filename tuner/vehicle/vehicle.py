@@ -319,7 +319,7 @@ def write_vehicle(vehicle: VehicleFile, path: str | Path, *, header: str = "") -
 
     Raises
     ------
-    ConfigError
+    OutputError
         The file cannot be written.
     """
     write_text(Path(path), vehicle_text(vehicle, header=header))
