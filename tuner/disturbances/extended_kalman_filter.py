@@ -12,9 +12,9 @@ unit variance if the model holds.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -157,9 +157,8 @@ def filtered(schedule: Schedule, feed: Feed, expected: Expected, *, gains: bool 
         Whether gains are kept, which take most of the memory.
     """
     short, in_flight = _shortly_delayed(_undelayed(schedule), expected)
-    static = _Static("filter", short, in_flight, moves=False)
     wanted = (*[True] * 3, *[gains] * 2)
-    *rows, gain, factors = _run(_given(feed, expected), static, wanted=wanted).values
+    *rows, gain, factors = _run((short, in_flight), _given(feed, expected), wanted).values
     white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)
     kept = Gains(gain, factors, schedule.physics_rate) if gains else None
     return Filtered(white, root, loss, kept)
@@ -191,9 +190,8 @@ def innovations(
         still = np.zeros(len(tangents["offsets"]))
         names = sorted(expected.coefficients)  # the order of the leaves
         moved = [tangents["offsets"], *(tangents.get(name, still) for name in names)]
-    static = _Static("innovations", _undelayed(schedule), 0, moves=moved is not None)
     wanted = (True, False) if moved is None else ((True, False), (False, True))
-    run = _run(_given(feed, expected, gains), static, moved, wanted)
+    run = _run((_undelayed(schedule),), _given(feed, expected, gains), wanted, moved)
     return np.moveaxis(run.values[0], 0, -1), run.columns and run.columns[1]
 
 
@@ -209,16 +207,6 @@ class _Given(NamedTuple):
     gains: Gains | None
 
 
-@dataclass(frozen=True)
-class _Static:
-    """What a program belongs to, besides the structure of what it is given."""
-
-    kind: Literal["filter", "innovations"]
-    schedule: Schedule
-    in_flight: int
-    moves: bool
-
-
 def _given(feed: Feed, expected: Expected, gains: Gains | None = None) -> _Given:
     """Return the arguments of a program."""
     weights = [np.asarray(feed.samples[name].weight) for name in feed.widths]
@@ -231,11 +219,12 @@ def _given(feed: Feed, expected: Expected, gains: Gains | None = None) -> _Given
 
 
 def _run(
+    static: tuple[Any, ...],
     given: _Given,
-    static: _Static,
+    wanted: Any,
     tangents: list[NDArray[np.float64]] | None = None,
-    wanted: Any = None,
 ) -> Run:
+    """Fly all segments with given gains; without any, filter them."""
 
     def table(leaf: Any) -> Argument:
         shape = np.shape(leaf)[1:-1]
@@ -245,7 +234,7 @@ def _run(
         shape = ("ticks", *np.shape(leaf)[2:])
         return Argument(shape, np.result_type(leaf), lanes=True, apart=True)
 
-    feed, expected, moves = given.feed, given.expected, static.moves
+    feed, expected, moves = given.feed, given.expected, tangents is not None
     arguments = _Given(
         Feed(
             segments=laid_out(feed.segments),
@@ -264,13 +253,14 @@ def _run(
         order=Argument(("ticks", *given.order.shape[1:]), int, lanes=False),
         gains=jax.tree.map(apart, given.gains),
     )
+    kind = "filter" if given.gains is None else "innovations"
     program = program_of(
-        _filter if static.kind == "filter" else _innovations,
+        _filter if kind == "filter" else _innovations,
         arguments,
-        static,
-        name=static.kind,
+        *static,
+        name=kind,
         at_once=AT_ONCE,
-        made_of=(static, total.TERMS),
+        made_of=(kind, static, moves, total.TERMS),
         packages=CODE,
     )
     count, ticks = feed.offsets.shape[-1], len(given.order)
@@ -286,10 +276,10 @@ def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Arra
     return order, order(jnp.asarray(given.order.shape[1] - 1))
 
 
-def _filter(static: _Static, given: _Given, lengths: Mapping[str, int]) -> Any:
+def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[str, int]) -> Any:
     """Filter one segment: white, root and loss of `Filtered`, gains and factors of `Gains`."""
-    observer, first = Observer.of(static.schedule, given.feed, given.expected)
-    in_flight, processes = static.in_flight, observer.processes
+    observer, first = Observer.of(schedule, given.feed, given.expected)
+    processes = observer.processes
     first_sd = jnp.asarray(first_errors(first, in_flight))
     size, wide = len(first_sd) + COUNT, len(given.expected.noise)
     shown = len(first_errors(first, 0))  # to samples: commands on their way are not, nor pushes
@@ -354,18 +344,20 @@ def _filter(static: _Static, given: _Given, lengths: Mapping[str, int]) -> Any:
     return lax.scan(tick, begin, jnp.arange(lengths["turns"]))[1]
 
 
-def _innovations(static: _Static, given: _Given, lengths: Mapping[str, int]) -> tuple[Array, Array]:
+def _innovations(
+    schedule: Schedule, given: _Given, lengths: Mapping[str, int]
+) -> tuple[Array, Array]:
     """Fly one segment with gains that are given: its whitened innovations (ticks, m).
 
     And the same in single precision, of which derivatives are taken: they take most of the memory.
     """
     assert given.gains is not None
-    observer, first = Observer.of(static.schedule, given.feed, given.expected)
+    observer, first = Observer.of(schedule, given.feed, given.expected)
     gains, factors = given.gains.gain, given.gains.factors
     wide, size = gains.shape[1:]
     in_flight, finer = commands_in_flight(first, size - COUNT), 1
     if in_flight:
-        finer = static.schedule.physics_rate // given.gains.rate
+        finer = schedule.physics_rate // given.gains.rate
 
     def for_each_step(change: Array) -> Array:
         """Return a correction of all commands on their way from that of the filter's steps."""

@@ -8,7 +8,7 @@ they last or which coefficients are free.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -95,16 +95,6 @@ class _Given(NamedTuple):
     conditions: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class _Static:
-    """What a program belongs to, besides the structure of what it is given."""
-
-    schedule: Schedule
-    limits: Limits
-    channels: tuple[str, ...]
-    moves: bool
-
-
 def fly(
     model: Model,
     segments: Segments,
@@ -169,14 +159,14 @@ def fly(
             }
         )
     arguments = _arguments(given, own_coefficients=own, moves=moves)
-    static = _Static(schedule, limits, logged, moves)
+    static = (schedule, limits, logged)
     program = program_of(
         _flight,
         arguments,
-        static,
+        *static,
         at_once=AT_ONCE,
         name="flight of a segment",
-        made_of=(static, total.TERMS),
+        made_of=(static, moves, total.TERMS),
         packages=CODE,
     )
     run = program(
@@ -274,14 +264,18 @@ def _directions(given: _Given, tangents: Mapping[str, Array]) -> list[Array]:
 
 
 def _flight(
-    static: _Static, given: _Given, lengths: Mapping[str, int]
+    schedule: Schedule,
+    limits: Limits,
+    channels: tuple[str, ...],
+    given: _Given,
+    lengths: Mapping[str, int],
 ) -> tuple[dict[str, Any], Any]:
     """Fly one segment: channel -> (samples, c), and the time of a crash."""
     model = with_coefficients(given.model, given.coefficients)
     parts: tuple[Start, Inlet, Environment] = beginning_of(
         model,
         given.segments,
-        static.schedule,
+        schedule,
         states=given.states,
         conditions=given.conditions,
     )
@@ -289,19 +283,19 @@ def _flight(
     plant, first = begun(
         model.vehicle,
         model.controller,
-        static.schedule,
+        schedule,
         inlet,
         start,
         environment=environment,
-        limits=static.limits,
+        limits=limits,
     )
 
     def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
         after, row = plant.sample(state, number)
-        return after, recorded_of(row, model, environment, given.conditions, static.channels)
+        return after, recorded_of(row, model, environment, given.conditions, channels)
 
-    last, channels = lax.scan(sample, first, jnp.arange(lengths["turns"]))
-    return channels, last.crash_time
+    last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))
+    return logged, last.crash_time
 
 
 def recorded_of(

@@ -15,8 +15,7 @@ rest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.special import chdtrc  # scipy.stats takes a quarter of a second to import
@@ -42,6 +41,8 @@ TRIM = 0.1
 CHANCE = 1e-6
 """Probability with which a hover at rest is taken to move."""
 POSITION, VELOCITY, TILT, RATE, STEADY = range(5)
+NOISE = {POSITION: FLOOR["position"], TILT: FLOOR["attitude"], RATE: FLOOR["body_rate"]}
+"""Smallest standard deviation of what is measured."""
 
 
 def wander_of(flights: Sequence[Flight]) -> Array | None:
@@ -67,27 +68,12 @@ def wander_of(flights: Sequence[Flight]) -> Array | None:
     return wander if wander.any() else None
 
 
-@dataclass(frozen=True)
-class _Hover:
-    """What was recorded before a mission, as seen along the heading at its start.
+def _hover(flight: Flight) -> dict[int, Series] | None:
+    """Return the hover before a mission, if it was one and was recorded: state -> (n, 2) samples.
 
-    Attributes
-    ----------
-    position
-        (n, 3) m along heading, to its left, and up.
-    tilt
-        (n, 2) rad about body x and y.
-    rate
-        (n, 2) rad/s; no rows where no gyro was recorded.
+    Position in m along the heading at its start and to its left; tilt in rad and rate in rad/s
+    about body y and x, the latter without rows if no gyro was recorded.
     """
-
-    position: Series
-    tilt: Series
-    rate: Series
-
-
-def _hover(flight: Flight) -> _Hover | None:
-    """Return the hover before a mission, if it was one and was recorded."""
     pose = [flight.series.get(name) for name in ("position", "attitude")]
     if not rests(flight.initial) or any(series is None for series in pose):
         return None
@@ -96,16 +82,15 @@ def _hover(flight: Flight) -> _Hover | None:
         return None
     if max(position.time[0], attitude.time[0]) > -BEFORE:
         return None
-    x, y = _axes(flight) @ position.values[:, :2].T
     qw, qx, qy, qz = attitude.values.T
-    tilt = np.column_stack([2.0 * (qw * qx + qy * qz), 2.0 * (qw * qy - qx * qz)])
-    gyro = flight.series.get("body_rate")
-    rate = _before(gyro) if gyro is not None else Series(np.zeros(0), np.zeros((0, 3)))
-    return _Hover(
-        Series(position.time, np.column_stack([x, y, position.values[:, 2]])),
-        Series(attitude.time, tilt),
-        Series(rate.time, rate.values[:, :2]),
-    )
+    tilt = np.column_stack([2.0 * (qw * qy - qx * qz), 2.0 * (qw * qx + qy * qz)])
+    gyro = flight.series.get("body_rate", Series(np.zeros(0), np.zeros((0, 3))))
+    rate = _before(gyro)
+    return {
+        POSITION: Series(position.time, (_axes(flight) @ position.values[:, :2].T).T),
+        TILT: Series(attitude.time, tilt),
+        RATE: Series(rate.time, rate.values[:, 1::-1]),
+    }
 
 
 def _axes(flight: Flight) -> Array:
@@ -121,7 +106,7 @@ def _before(series: Series) -> Series:
     return Series(series.time[inside], series.values[inside])
 
 
-def _at_end(hover: _Hover, flight: Flight) -> Array:
+def _at_end(hover: Mapping[int, Series], flight: Flight) -> Array:
     """Return the wander (L,) of one flight; zeros where it is at rest."""
     moves = np.zeros(max(rows.stop for rows in ROWS.values()))
     ends, covariances = _filtered(hover)
@@ -135,22 +120,28 @@ def _at_end(hover: _Hover, flight: Flight) -> Array:
     return moves
 
 
-def _filtered(hover: _Hover) -> tuple[Array, Array]:
+def _filtered(hover: Mapping[int, Series]) -> tuple[Array, Array]:
     """Return velocity, tilt beyond the trim and rate at time 0 (2, 3), with covariances (2, 3, 3).
 
     One row along the heading, one to its left. All strengths of unrest are filtered side by side,
     and the likeliest of each row is taken.
     """
     mean = np.zeros((2, len(STRENGTHS), 5))
-    mean[..., POSITION] = hover.position.values[0, :2, None]
+    mean[..., POSITION] = hover[POSITION].values[0, :, None]
     covariance = np.diag([0.01, 0.1, TRIM, 0.1, TRIM]) ** 2 * np.ones((2, len(STRENGTHS), 1, 1))
     likelihood = np.zeros((2, len(STRENGTHS)))
-    samples = _samples(hover)
+    noises = {s: np.fmax(white_noise(series), NOISE[s]) for s, series in hover.items()}
+    samples = [
+        (time, state, row)
+        for state, series in hover.items()
+        for time, row in zip(series.time.tolist(), series.values, strict=True)
+    ]
+    samples.sort(key=lambda sample: sample[0])
     now = samples[0][0]
-    for time, state, values, noise in samples:
+    for time, state, values in samples:
         mean, covariance = _predicted(mean, covariance, time - now)
         now = time
-        variance = covariance[..., state, state] + noise[:, None] ** 2
+        variance = covariance[..., state, state] + noises[state][:, None] ** 2
         gain = covariance[..., state] / variance[..., None]
         surprise = values[:, None] - mean[..., state]
         likelihood -= 0.5 * (surprise**2 / variance + np.log(variance))
@@ -161,20 +152,6 @@ def _filtered(hover: _Hover) -> tuple[Array, Array]:
     beyond = np.eye(5)[[VELOCITY, TILT, RATE]]
     beyond[1, STEADY] = -1.0
     return mean[best] @ beyond.T, beyond @ covariance[best] @ beyond.T
-
-
-def _samples(hover: _Hover) -> list[tuple[float, int, Array, Array]]:
-    """Return s, which state was measured, its values (2,) along both axes, and their noise (2,)."""
-    samples = []
-    for series, columns, state, floor in (
-        (hover.position, (0, 1), POSITION, FLOOR["position"]),
-        (hover.tilt, (1, 0), TILT, FLOOR["attitude"]),
-        (hover.rate, (1, 0), RATE, FLOOR["body_rate"]),
-    ):
-        noise = np.fmax(white_noise(series)[list(columns)], floor)
-        for time, row in zip(series.time, series.values, strict=True):
-            samples.append((float(time), state, row[list(columns)], noise))
-    return sorted(samples, key=lambda sample: sample[0])
 
 
 def _predicted(mean: Array, covariance: Array, step: float) -> tuple[Array, Array]:

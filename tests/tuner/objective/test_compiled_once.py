@@ -60,7 +60,7 @@ def test_a_flight_of_another_length_is_the_same_program(flight, updated):
 
 
 def test_what_flies_is_kept_for_other_processes():
-    assert digest_of((simulation._Static, total.TERMS), simulation.CODE)
+    assert digest_of((simulation._flight, total.TERMS), simulation.CODE)
 
 
 def test_columns_do_not_depend_on_what_else_is_free():

@@ -107,9 +107,9 @@ def test_channels_in_another_order_are_no_other_program(monkeypatch, tangents):
     segments = Segments(ActuatorInlet(commands), one, {}, np.zeros(1, int))
     asked = []
 
-    def program(_, arguments, static, **options):
+    def program(_, arguments, *static, **options):
         asked.append((jax.tree.flatten(arguments), static, options))
-        return lambda *_, **__: Run(({name: name for name in static.channels}, None), None)
+        return lambda *_, **__: Run(({name: name for name in static[-1]}, None), None)
 
     monkeypatch.setattr(simulation, "program_of", program)
     for names in (("position", "attitude"), ("attitude", "position")):
