@@ -16,7 +16,7 @@ from sim_jax.numeric import Array as JaxArray
 from sim_jax.rollout import rollout
 from sim_jax.state import Setpoints
 from tuner.core.numerics import Array
-from tuner.disturbances.recorded import SETPOINTS
+from tuner.disturbances.ticks import SETPOINTS
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import CLOCKS, OFFSETS, Measured

@@ -30,7 +30,7 @@ from tuner.disturbances.disturbances import (
     disturbance_of,
     processes_of,
 )
-from tuner.disturbances.recorded import Sampled
+from tuner.disturbances.ticks import Sampled
 from tuner.objective.criterion import OFFSET_UNIT, Either, units_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
 from tuner.objective.simulation import beginning_of

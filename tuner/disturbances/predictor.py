@@ -27,7 +27,7 @@ from tuner.core.numerics import Array, robust_sd, scaled_solve
 from tuner.disturbances.disturbances import COMMAND_NOISE, LEAST, MOST, STRENGTHS, USUAL
 from tuner.disturbances.extended_kalman_filter import GATE, Filtered, filtered, innovations
 from tuner.disturbances.observer import CHANNELS, Expected, Feed
-from tuner.disturbances.recorded import (
+from tuner.disturbances.ticks import (
     FLIGHT_CONTROLLER,
     Sampled,
     each_reading,

@@ -19,6 +19,7 @@ from sim_jax.state import Start
 from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
 from tuner.objective.battery import log_voltage_of
+from tuner.objective.hover import wander_of
 from tuner.objective.initial_conditions import (
     freedom_of,
     freedom_of_spin,
@@ -28,7 +29,6 @@ from tuner.objective.initial_conditions import (
 )
 from tuner.objective.inlets import INLETS, inlet_of
 from tuner.objective.noise import repeats
-from tuner.objective.wander import wander_of
 from tuner.objective.windows import Window, windows_of
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import position_error
@@ -93,7 +93,7 @@ class Segments(eqx.Module):
     disturbance: Disturbance | None = None
     """What pushes them, as far as that is known."""
     wander: Float[Array, "L F"] | None = None
-    """How far from rest each hover was at its end (`tuner.objective.wander`); None at rest."""
+    """How far from rest each hover was at its end (`tuner.objective.hover`); None at rest."""
     freedom: Float[Array, "L F"] | None = None
     """Standard deviations of what is free of the start; None if it is known."""
     freed: tuple[int, ...] = eqx.field(static=True, default=())

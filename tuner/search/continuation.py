@@ -26,7 +26,7 @@ from tuner.objective.normal import (
     sums_at,
 )
 from tuner.objective.segments import CLOCKS
-from tuner.search.evolution import evolve
+from tuner.search.cma_es import evolve
 from tuner.search.iteration import Iteration
 from tuner.search.levenberg_marquardt import descend, starts_asked_for
 from tuner.search.progress import (

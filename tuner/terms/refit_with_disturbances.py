@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 
 from tuner.core.phrases import listed
+from tuner.disturbances.maximum_likelihood import STEPS, with_least_innovations
 from tuner.disturbances.predictor import Predictor, hidden
-from tuner.disturbances.recorded import FLIGHT_CONTROLLER
-from tuner.disturbances.refit import STEPS, with_least_innovations
+from tuner.disturbances.ticks import FLIGHT_CONTROLLER
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.search.estimation import LAST, free_offsets, polished

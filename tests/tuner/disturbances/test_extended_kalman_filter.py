@@ -23,7 +23,7 @@ from tuner.core.disk import cache_folder
 from tuner.disturbances import extended_kalman_filter as ekf
 from tuner.disturbances.disturbances import COUNT, USUAL
 from tuner.disturbances.observer import Expected, Feed, first_errors
-from tuner.disturbances.recorded import Sampled
+from tuner.disturbances.ticks import Sampled
 from tuner.objective.segments import Segments
 from tuner.vehicle.model import coefficients_in, model_of, schedule_of
 

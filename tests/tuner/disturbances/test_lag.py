@@ -12,8 +12,8 @@ import pytest
 from tests.tuner.disturbances.test_predictor import OFFSETS, gusty
 from tests.tuner.uncertainty import making
 from tuner.config import JobFile
+from tuner.disturbances.maximum_likelihood import with_least_innovations
 from tuner.disturbances.predictor import Predictor
-from tuner.disturbances.refit import with_least_innovations
 from tuner.objective.information import begun
 from tuner.objective.normal import Objective
 from tuner.objective.space import extended

@@ -20,7 +20,7 @@ from tuner.disturbances.observer import (
     commands_in_flight,
     first_errors,
 )
-from tuner.disturbances.recorded import Sampled, gathered
+from tuner.disturbances.ticks import Sampled, gathered
 
 SCHEDULE = Schedule(log_rate=400, position_control_rate=400, longest_actuator_latency=0.02)
 TICK = jnp.asarray(25)  # beyond the delay line's ten places

@@ -26,6 +26,7 @@ from tuner.disturbances.disturbances import (
 )
 from tuner.disturbances.disturbances import STRENGTHS as NAMED
 from tuner.disturbances.extended_kalman_filter import GATE
+from tuner.disturbances.maximum_likelihood import _equations, with_least_innovations
 from tuner.disturbances.observer import Observer
 from tuner.disturbances.predictor import (
     USUALLY,
@@ -37,7 +38,6 @@ from tuner.disturbances.predictor import (
     unscaled,
     with_strengths,
 )
-from tuner.disturbances.refit import _equations, with_least_innovations
 from tuner.objective.criterion import Point
 from tuner.objective.information import information_at
 from tuner.objective.normal import Objective

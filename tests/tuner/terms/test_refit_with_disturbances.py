@@ -13,7 +13,7 @@ import pytest
 from tests.tuner.uncertainty.making import ended
 from tuner.config import JobFile
 from tuner.disturbances.disturbances import USUAL
-from tuner.disturbances.refit import STEPS
+from tuner.disturbances.maximum_likelihood import STEPS
 from tuner.search.fitted import COLOURED, Fitted
 from tuner.search.problem import Job
 from tuner.terms import refit_with_disturbances as disturbances

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim_jax.constants import GRAVITY
+from tuner.objective.hover import wander_of
 from tuner.objective.initial_conditions import ROWS
-from tuner.objective.wander import wander_of
 from tuner.recordings.flight import Flight, InitialState, Series
 
 NOISE = {"position": 5e-4, "attitude": 2.5e-4, "body_rate": 0.01}

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tuner.core.numerics import Array, scaled_solve
 from tuner.disturbances.disturbances import LEAST, MOST, within
 from tuner.disturbances.predictor import Predictor, unscaled
-from tuner.disturbances.recorded import gathered
+from tuner.disturbances.ticks import gathered
 from tuner.objective.criterion import OFFSET_SD, OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective, normal_equations
 from tuner.objective.residuals import gauss_newton, robust

@@ -9,9 +9,9 @@ import pytest
 
 from tests.tuner.uncertainty.making import problem
 from tuner.disturbances.disturbances import USUAL
+from tuner.disturbances.maximum_likelihood import _Equations
 from tuner.disturbances.observer import Feed
 from tuner.disturbances.predictor import Predictor
-from tuner.disturbances.refit import _Equations
 
 
 def test_no_step_is_taken_where_a_filter_has_lost_a_flight():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sim_jax.schedule import Schedule
-from tuner.disturbances.recorded import each_reading, gathered, sampled, setpoints_on_ticks
+from tuner.disturbances.ticks import each_reading, gathered, sampled, setpoints_on_ticks
 from tuner.objective.noise import repeats
 from tuner.objective.segments import Measured
 from tuner.recordings.flight import Flight, InitialState, Series
