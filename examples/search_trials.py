@@ -89,7 +89,7 @@ def reference() -> str:
     """Fit from the original coefficients, and fly the held-out flight."""
     job, fitted, seconds = solved(settings_of())
     flown = validate(job, fitted, vehicle_fitted(job, fitted))
-    (held,) = job.held_out
+    (held,) = (r.flight for r in job.recordings if r.holdout)
     first, last = flown.initial[held.name].rmse, flown.best[held.name].rmse
     ratios = [getattr(first, axis) / getattr(last, axis) for axis in ("x", "y", "z")]
     place = ", ".join(f"{1e3 * getattr(last, axis):.2f}" for axis in ("x", "y", "z"))

@@ -325,7 +325,8 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     simulation's own.
     """
     free = np.ones((len(job.objective.of_flight), len(job.fitted)), bool)
-    free[: len(CLOCKS), list(job.offset_is_fixed)] = False
+    known = [r.time_offset is not None for r in job.recordings if not r.holdout]
+    free[: len(CLOCKS), known] = False
     fed = [not INLETS[inlet].closed_loop for inlet in job.inlets]
     free[CLOCKS.index("flight_controller"), fed] = False
     if job.objective.segments.windowed and job.objective.segments.freedom is None:

@@ -90,32 +90,9 @@ class Job:
         return tuple(recording.flight for recording in self.recordings if not recording.holdout)
 
     @property
-    def held_out(self) -> tuple[Flight, ...]:
-        """The flights that are evaluated and never fitted."""
-        return tuple(recording.flight for recording in self.recordings if recording.holdout)
-
-    @property
     def inlets(self) -> tuple[InletName, ...]:
         """Where each fitted flight enters the simulated loop."""
         return tuple(recording.inlet for recording in self.recordings if not recording.holdout)
-
-    @property
-    def offset_is_fixed(self) -> tuple[bool, ...]:
-        """Whether the clock offset of each fitted flight is given rather than estimated."""
-        return tuple(
-            recording.time_offset is not None
-            for recording in self.recordings
-            if not recording.holdout
-        )
-
-    @property
-    def clipped(self) -> bool:
-        """Whether some recorded rotor was clipped low."""
-        return any(
-            bool((np.nan_to_num(flight.signals["command"], nan=1.0) < CLIPPED).any())
-            for flight in self.fitted
-            if flight.has("command")
-        )
 
     def undecided(self, objective: Objective) -> tuple[str, ...]:
         """Return the choices of a `Loop` that matter to a problem of this job.
@@ -123,8 +100,9 @@ class Job:
         Where no rotor was clipped nothing saturates, and where the markers sit at the centre of
         mass and along the body's axes it is the same who sees them.
         """
+        commands = [flight.signals["command"] for flight in self.fitted if flight.has("command")]
         matters = {
-            "saturation_feedback": self.clipped,
+            "saturation_feedback": any((rows < CLIPPED).any() for rows in commands),
             "sees_markers": any(INLETS[inlet].closed_loop for inlet in self.inlets)
             and any(
                 name.startswith("marker_")
