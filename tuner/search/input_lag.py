@@ -56,9 +56,9 @@ def with_inputs_on_time(
     """Return recordings with the lateness of what is fed in, where it can be told.
 
     Rotor speeds are late by themselves; commands are by what their flight's lateness differs from
-    the flights' mean, which is the vehicle's own lag. What may be chance, or the loop's answer to
-    what disturbs the vehicle, is no lateness. A flight that does not tell has the mean of the
-    others' rotor speeds, and so have flights that are held out: nothing is fitted to them.
+    the others', for what these have in common is the vehicle's own lag. What may be chance, or the
+    loop's answer to what disturbs the vehicle, is no lateness. A flight that does not tell has the
+    mean of the others' rotor speeds, and so have those held out: nothing is fitted to them.
     """
     late: dict[str, float] = {}
     for inlet in {recording.inlet for recording in recordings}:
@@ -75,46 +75,56 @@ def with_inputs_on_time(
         ]
         if not lags:
             continue
-        own = 0.0 if is_measured else float(np.mean([lag.seconds for _, lag in lags]))
+        own = 0.0 if is_measured else _common(lags, signal, vehicle)
         told = {
             flight.name: lag.seconds - own if _is_later(flight, signal, vehicle, lag, own) else 0.0
             for flight, lag in lags
         }
-        mean = float(np.mean(list(told.values()))) if is_measured else 0.0
-        late |= {r.flight.name: told.get(r.flight.name, mean) for r in same}
+        mean = float(np.mean(list(told.values())))
+        none = 0.0 if is_measured else mean
+        late |= {r.flight.name: told.get(r.flight.name, mean) - none for r in same}
     return tuple(
         replace(r, input_late=late.get(r.flight.name, r.input_late)) if r.time_offset is None else r
         for r in recordings
     )
 
 
-def _is_later(flight: Flight, signal: str, vehicle: VehicleFile, lag: Lag, than: float) -> bool:
-    """Return whether inputs are late by more, or less, than so many s, beyond chance and answers.
+def _common(lags: Sequence[tuple[Flight, Lag]], signal: str, vehicle: VehicleFile) -> float:
+    """Return the lateness, of the least, the middle and the largest, that all flights like best."""
+    at = np.quantile([lag.seconds for _, lag in lags], (0.0, 0.5, 1.0))
+    likelihood = sum(_of_turning(flight, signal, vehicle, at) for flight, _ in lags)
+    return float(at[int(np.argmax(likelihood))])
 
-    By the turning alone: the velocity, of which forces are, is filtered.
-    """
+
+def _is_later(flight: Flight, signal: str, vehicle: VehicleFile, lag: Lag, than: float) -> bool:
+    """Return whether inputs are late by more or less than so many s, chance and answers apart."""
     if abs(lag.seconds - than) <= Z95 * lag.sd:
         return False
+    late, on_time = _of_turning(flight, signal, vehicle, (lag.seconds, than))
+    return bool(late - on_time > 0.5 * Z95**2)
+
+
+def _of_turning(
+    flight: Flight, signal: str, vehicle: VehicleFile, at: Sequence[float] | Array
+) -> Array:
+    """Return the log-likelihood of the turning's innovations at each of some latenesses in s.
+
+    Of the turning alone: the velocity, of which forces are, is filtered.
+    """
     inputs = flight.series[signal]
-    known = np.isfinite(inputs.values).all(axis=1)
-    rotors = Series(inputs.time[known], _speed_like(inputs.values[known], signal, vehicle))
+    there = np.isfinite(inputs.values).all(axis=1)
+    rotors = Series(inputs.time[there], _speed_like(inputs.values[there], signal, vehicle))
     steps = measured_with(flight, rotors, noise=0.0)
     if steps is None:
-        return False
-    late, on_time = (
-        with_rotors(steps, Series(rotors.time - seconds, rotors.values))
-        for seconds in (lag.seconds, than)
-    )
-    known, order = late.known & on_time.known, max(1, round(MEMORY / steps.step))
-    gain = 0.0
-    for axis in range(3):
-        turning = steps.accelerations[:, 3 + axis]
-        better, worse = (
-            _innovation(turning, regressors(part, vehicle)[axis], known, order)
-            for part in (late, on_time)
-        )
-        gain += 0.5 * known.sum() * np.log(worse / better)
-    return bool(gain > 0.5 * Z95**2)
+        return np.zeros(len(at))
+    parts = [with_rotors(steps, Series(rotors.time - late, rotors.values)) for late in at]
+    known = np.all([part.known for part in parts], axis=0)
+    order, likelihood = max(1, round(MEMORY / steps.step)), np.zeros(len(at))
+    for place, part in enumerate(parts):
+        for axis, columns in enumerate(regressors(part, vehicle)):
+            new = _innovation(steps.accelerations[:, 3 + axis], columns, known, order)
+            likelihood[place] -= 0.5 * known.sum() * np.log(new)
+    return likelihood
 
 
 def _innovation(answer: Array, columns: Array, known: Mask, order: int) -> float:
