@@ -127,6 +127,13 @@ class Filtered(eqx.Module):
     loss: Float[Either, "T F"]
     gains: Gains | None
 
+    def first(self, ticks: int, segments: slice = slice(None)) -> Filtered:
+        """Return the same of some segments' first ticks, without gains."""
+        white, root, loss = (
+            np.asarray(rows[:ticks, ..., segments]) for rows in (self.white, self.root, self.loss)
+        )
+        return Filtered(white, root, loss, None)
+
 
 def _undelayed(schedule: Schedule) -> Schedule:
     """Return a schedule without the delay line of estimates, which rate control does not see."""

@@ -166,7 +166,7 @@ class Predictor:
         whole = np.asarray(self.found.white)
         share = np.count_nonzero(whole[:some]) / max(int(np.count_nonzero(whole)), 1)
         steps = steps_from(self.strengths)
-        here = likelihood_of(self.found, some)
+        here = self.found.first(some)
         slope, information, moved = slopes_of(
             here, self._beside(objective, point, steps, some), steps
         )
@@ -176,7 +176,7 @@ class Predictor:
 
     def _beside(
         self, objective: Objective, point: Point, steps: Array, ticks: int
-    ) -> Iterator[Likelihood]:
+    ) -> Iterator[Filtered]:
         """Return how likely the first ticks are with each of the strengths a step away, in turn.
 
         As many are filtered side by side as fill a kernel's block of segments.
@@ -196,7 +196,7 @@ class Predictor:
             found = filtered(self.schedule, tiled, expected, gains=False)
             for number in range(some.shape[1]):
                 segments = slice(number * count, (number + 1) * count)
-                yield likelihood_of(found, ticks, segments)
+                yield found.first(ticks, segments)
 
     @property
     def noise_seen(self) -> dict[str, float]:
@@ -411,14 +411,6 @@ class Predictor:
         )
 
 
-def likelihood_of(found: Filtered, ticks: int, segments: slice = slice(None)) -> Likelihood:
-    """Return what a filter makes of some segments' first ticks."""
-    white, root, loss = (
-        np.asarray(rows[:ticks, ..., segments]) for rows in (found.white, found.root, found.loss)
-    )
-    return Likelihood(float(np.sum(loss)), white, root)
-
-
 def unscaled(criterion: Criterion) -> Criterion:
     """Return a criterion for residuals that are whitened already, a filter knowing the start."""
     ones = {name: np.ones_like(scale) for name, scale in criterion.scale.items()}
@@ -427,23 +419,6 @@ def unscaled(criterion: Criterion) -> Criterion:
 
 STEP = 0.02
 """Of a logarithm, over which is differentiated."""
-
-
-class Likelihood(NamedTuple):
-    """What a filter makes of recordings with some strengths.
-
-    Attributes
-    ----------
-    loss
-        Negative log-likelihood.
-    white, root
-        (T, m, F) innovations, each given those before it in its tick, over their standard
-        deviations, and those.
-    """
-
-    loss: float
-    white: Array
-    root: Array
 
 
 class Slopes(NamedTuple):
@@ -469,7 +444,7 @@ def steps_from(strengths: Array) -> Array:
     return np.where(strengths + STEP <= MOST, STEP, -STEP)
 
 
-def slopes_of(here: Likelihood, beside: Iterable[Likelihood], steps: Array) -> Slopes:
+def slopes_of(here: Filtered, beside: Iterable[Filtered], steps: Array) -> Slopes:
     """Return how the likelihood changes with the strengths, by differences.
 
     Parameters
@@ -482,13 +457,15 @@ def slopes_of(here: Likelihood, beside: Iterable[Likelihood], steps: Array) -> S
         (7,) see `steps_from`.
     """
     moves, spreads = np.zeros((2, len(steps), *here.white.shape))
-    slope = np.zeros(len(steps))
+    slope, loss = np.zeros(len(steps)), float(np.sum(here.loss))
     for number, (there, step) in enumerate(zip(beside, steps.tolist(), strict=True)):
         turn = there.root / here.root
         moves[number] = (turn * there.white - here.white) / step
         spreads[number] = np.sqrt(0.5) * (turn**2 - 1.0) / step
         bend = np.sum(moves[number] ** 2) + np.sum(spreads[number] ** 2)
-        slope[number] = (there.loss - here.loss) / step - 0.5 * step * bend  # where it begins
+        slope[number] = (
+            float(np.sum(there.loss)) - loss
+        ) / step - 0.5 * step * bend  # where it begins
     flat = (part.reshape(len(steps), -1) for part in (moves, spreads))
     return Slopes(slope, sum(part @ part.T for part in flat), moves)
 

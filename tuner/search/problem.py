@@ -119,6 +119,8 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     ------
     RecordingError
         All of them are held out.
+    ConfigError
+        Nothing that was recorded is compared.
     """
     recordings = tuple(sorted(recordings, key=lambda recording: recording.holdout))
     to_fit = [recording for recording in recordings if not recording.holdout]
@@ -156,6 +158,10 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         model = replace(model, reference_voltage=None)
 
     def problem(segments: Segments, seconds: float, limits: Limits) -> Objective:
+        if not segments.measured:
+            raise ConfigError(
+                "channels", "none that is left on was recorded and is simulated", "leave one on"
+            )
         samples = int(np.ceil(seconds * schedule.log_rate - 1e-6))
         return Objective(
             model,

@@ -25,14 +25,12 @@ from tuner.disturbances.disturbances import (
     within,
 )
 from tuner.disturbances.disturbances import STRENGTHS as NAMED
-from tuner.disturbances.extended_kalman_filter import GATE
+from tuner.disturbances.extended_kalman_filter import GATE, Filtered
 from tuner.disturbances.maximum_likelihood import _equations, with_least_innovations
 from tuner.disturbances.observer import Observer
 from tuner.disturbances.predictor import (
     USUALLY,
-    Likelihood,
     Predictor,
-    likelihood_of,
     slopes_of,
     steps_from,
     unscaled,
@@ -267,10 +265,8 @@ def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitt
     problem, predictor, point = fitted
     ticks = predictor.ticks
 
-    def alone(strengths: np.ndarray) -> Likelihood:
-        return likelihood_of(
-            replace(predictor, strengths=strengths).at(problem, point).found, ticks
-        )
+    def alone(strengths: np.ndarray) -> Filtered:
+        return replace(predictor, strengths=strengths).at(problem, point).found.first(ticks)
 
     steps = steps_from(predictor.strengths)
     beside = [alone(predictor.strengths + step) for step in np.diag(steps)]

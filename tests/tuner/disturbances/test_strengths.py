@@ -20,7 +20,8 @@ from tuner.disturbances.disturbances import (
     processes_of,
     within,
 )
-from tuner.disturbances.predictor import STEP, Likelihood, Slopes, slopes_of, steps_from
+from tuner.disturbances.extended_kalman_filter import Filtered
+from tuner.disturbances.predictor import STEP, Slopes, slopes_of, steps_from
 
 ORDER = (*SLOW, *FAST)
 
@@ -28,7 +29,7 @@ ORDER = (*SLOW, *FAST)
 SAMPLES, WIDE = 3000, 5
 
 
-def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Likelihood]:
+def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Filtered]:
     """Return the likelihood of samples whose covariance strengths make up, and trade off in."""
     rng = np.random.default_rng(seed)
     shapes = np.random.default_rng(0).standard_normal((7, WIDE, WIDE))
@@ -40,16 +41,17 @@ def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Likelihood]:
 
     samples = rng.standard_normal((SAMPLES, WIDE)) @ root(truth).T
 
-    def filtered(strengths: np.ndarray) -> Likelihood:
+    def filtered(strengths: np.ndarray) -> Filtered:
         factor = root(strengths)
         white = np.linalg.solve(factor, samples.T).T
         loss = 0.5 * np.sum(white**2) + SAMPLES * np.log(np.diag(factor)).sum()
-        return Likelihood(float(loss), white, np.broadcast_to(np.diag(factor), white.shape))
+        spread = np.broadcast_to(np.diag(factor), white.shape)
+        return Filtered(white, spread, np.asarray(loss), None)
 
     return filtered
 
 
-def differenced(filtered: Callable[[np.ndarray], Likelihood], strengths: np.ndarray) -> Slopes:
+def differenced(filtered: Callable[[np.ndarray], Filtered], strengths: np.ndarray) -> Slopes:
     steps = steps_from(strengths)
     beside = (filtered(strengths + step) for step in np.diag(steps))
     return slopes_of(filtered(strengths), beside, steps)

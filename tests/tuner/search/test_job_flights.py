@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tuner.config import JobFile, Options, settle
-from tuner.core.errors import InputError, RecordingError
+from tuner.config import CHANNELS, JobFile, Options, settle
+from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import sentence
 from tuner.search.job_flights import (
     Recording,
@@ -14,6 +14,7 @@ from tuner.search.job_flights import (
     recordings_of,
     with_known,
 )
+from tuner.search.problem import job_of
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 SPIN, CIRCLE = "yaw_spin_3rps", "circle_4mps"
@@ -91,3 +92,13 @@ def test_recordings_of_which_no_flight_can_be_made_are_left_out_by_name(tmp_path
 def test_a_flight_alone_enters_as_reference_on_time(flights):
     assert Recording(flights[0]).inlet == "reference"
     assert Recording(flights[0]).time_offset == 0.0
+
+
+@pytest.mark.parametrize(
+    ("inlet", "left"), [("reference", "acceleration"), ("actuator", "command")]
+)
+def test_channels_of_which_nothing_is_compared_are_refused(settings, flights, inlet, left):
+    off = {channel: channel == left for channel in CHANNELS}
+    chosen = replace(settings, job=JobFile(inlet=inlet, channels=off))
+    with pytest.raises(ConfigError, match="channels"):
+        job_of(chosen, recordings_of(chosen, flights))
