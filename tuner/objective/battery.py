@@ -156,7 +156,7 @@ def _resistance(pairs: Sequence[tuple[Series, Series]], *, spikes_count: bool) -
     falls, varied = [np.empty(0)], [np.empty(0)]
     for reading, load in pairs:
         drawn = np.interp(reading.time, load.time, _charge(load))
-        trend = _polynomials(drawn, _order(reading.time))
+        trend = _polynomials(drawn, 1 + int(np.ceil(float(np.ptp(reading.time)) / TREND)))
         if len(reading.time) < trend.shape[1] + FEWEST:
             continue
         there = np.interp(reading.time, load.time, load.values[:, 0])
@@ -190,11 +190,6 @@ def _charge(load: Series) -> Numbers:
     """Return the load's integral (n,): a battery declines by the charge that was drawn."""
     means = 0.5 * (load.values[1:, 0] + load.values[:-1, 0])
     return np.concatenate([[0.0], np.cumsum(means * np.diff(load.time))])
-
-
-def _order(time: Numbers) -> int:
-    """Return the largest degree of a decline over some time."""
-    return 1 + int(np.ceil(float(np.ptp(time)) / TREND))
 
 
 def _polynomials(span: Numbers, order: int) -> Numbers:

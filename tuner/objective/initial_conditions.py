@@ -10,6 +10,7 @@ of the coefficients alone.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -33,6 +34,8 @@ from tuner.vehicle import of_scope
 REST_SPEED, REST_RATE, REST_TILT = 0.1, 0.1, 0.1
 #: m/s and rad/s at the start above which a recording does not begin gently.
 GENTLE_SPEED, GENTLE_RATE = 0.5, 0.5
+#: rad/s of rotors of which none was measured.
+UNKNOWN_SPEED = 600.0
 
 
 def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
@@ -48,20 +51,33 @@ def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
         Whether a start that is as slow and level as a hover is at rest and level, heading as
         recorded. A slow moment in the middle of a flight is no hover.
     """
-    rows = [_start(state, resting=resting and rests(state)) for state in initial]
-    stacked = {key: np.stack([row[key] for row in rows], axis=-1) for key in rows[0]}
-    speed, command = stacked["rotor_speed"], stacked["command"]
+    states = [_at_rest(state) if resting and rests(state) else state for state in initial]
+
+    def rows(name: str) -> NDArray[np.float64]:
+        return np.stack([getattr(state, name) for state in states], axis=-1)
+
+    speed, command = rows("rotor_speed"), rows("command")
+    known = np.isfinite(speed)
+    mean = np.where(known, speed, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    speed = np.where(known, speed, np.where(known.any(axis=0), mean, UNKNOWN_SPEED))
+    position = rows("position")
     return Start(
         motion=Motion(
-            Vec3.of(stacked["position"]),
-            Vec3.of(stacked["velocity"]),
-            Quaternion.of(stacked["attitude"]),
-            Vec3.of(stacked["body_rate"]),
+            Vec3.of(position),
+            Vec3.of(rows("velocity")),
+            Quaternion.of(rows("attitude")),
+            Vec3.of(rows("body_rate")),
         ),
-        rotor_speed=(speed[0], speed[1], speed[2], speed[3]),
-        command=(command[0], command[1], command[2], command[3]),
-        rate_integral=Vec3.of(stacked["integral"]),
+        rotor_speed=tuple(speed),
+        command=tuple(np.where(np.isfinite(command), command, 0.5)),
+        rate_integral=Vec3.of(np.zeros_like(position)),
     )
+
+
+def _at_rest(initial: InitialState) -> InitialState:
+    heading = np.array([initial.attitude[0], 0.0, 0.0, initial.attitude[3]])
+    level, still = heading / np.linalg.norm(heading), np.zeros(3)
+    return replace(initial, attitude=level, velocity=still, body_rate=still)
 
 
 def rests(initial: InitialState) -> bool:
@@ -81,27 +97,6 @@ def begins_gently(flight: Flight) -> bool:
         np.linalg.norm(start.velocity) < GENTLE_SPEED
         and np.linalg.norm(start.body_rate) < GENTLE_RATE
     )
-
-
-def _start(initial: InitialState, *, resting: bool) -> dict[str, NDArray[np.float64]]:
-    attitude, velocity, rate = initial.attitude, initial.velocity, initial.body_rate
-    if resting:
-        heading = np.array([attitude[0], 0.0, 0.0, attitude[3]])
-        attitude, velocity, rate = heading / np.linalg.norm(heading), np.zeros(3), np.zeros(3)
-    known = initial.rotor_speed[np.isfinite(initial.rotor_speed)]
-    speed = np.where(
-        np.isfinite(initial.rotor_speed), initial.rotor_speed, known.mean() if len(known) else 600.0
-    )
-    command = np.where(np.isfinite(initial.command), initial.command, 0.5)
-    return {
-        "position": initial.position,
-        "velocity": velocity,
-        "attitude": attitude,
-        "body_rate": rate,
-        "rotor_speed": speed,
-        "command": command,
-        "integral": np.zeros(3),
-    }
 
 
 def recent_command(flight: Flight, lag: float) -> NDArray[np.float64]:

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from tuner.core.numerics import Array
 from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
@@ -43,17 +42,10 @@ def unmatched(scales: Scales) -> dict[str, dict[str, float]]:
     return lost
 
 
-def offset_findings(job: Job, offsets: Array) -> tuple[Finding, ...]:
-    """Return which clocks and gyros the search estimated to be off.
-
-    Parameters
-    ----------
-    job
-        Gives the flights' names.
-    offsets
-        (offsets, N) in s and rad/s.
-    """
-    findings = []
+def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:
+    """Return what a fit shows about the set-up, the flights, their clocks and their gyros."""
+    findings = [*end_findings(job, loop_of(fitted.objective), fitted.scales)]
+    offsets = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
     for number, flight in enumerate(job.fitted):
         for kind, value in zip(OFFSETS, offsets[:, number].tolist(), strict=True):
             if value == 0.0:
@@ -63,15 +55,6 @@ def offset_findings(job: Job, offsets: Array) -> tuple[Finding, ...]:
             )
             findings.append(Finding(code, "info", flight.name, {unit: value}, (kind,)))
     return tuple(findings)
-
-
-def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:
-    """Return what a fit shows about the set-up, the flights and their clocks."""
-    offsets = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
-    return (
-        *end_findings(job, loop_of(fitted.objective), fitted.scales),
-        *offset_findings(job, offsets),
-    )
 
 
 def end_findings(job: Job, loop: Loop, scales: Scales) -> tuple[Finding, ...]:

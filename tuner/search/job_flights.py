@@ -142,16 +142,13 @@ def read_usable(
         if name not in names:
             raise InputError("--holdout", f"there is no flight '{name}'", did_you_mean(name, names))
     recordings: list[Recording] = []
+    held_out = job.holdout if holdout is None else holdout
     for flight in flights:
         try:
-            (recording,) = recordings_of(
-                settings, [_with_reference(flight, settings)], holdout=holdout
-            )
+            known = _with_reference(flight, settings)
+            recordings.append(_assigned(settings, known, flight.name in held_out))
         except RecordingError as error:
             left_out.append((flight.name, error))
-        else:
-            recordings.append(recording)
-    held_out = job.holdout if holdout is None else holdout
     none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
     if left_out and (not recordings or (fits and none_to_fit)):
         raise left_out[0][1]
