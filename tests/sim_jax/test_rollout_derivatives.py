@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 from jax import Array
 
+from sim_jax.control.geometric import ReferencePoint
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
+from sim_jax.numeric import where
 from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
 from sim_jax.vehicle import Vehicle
@@ -47,17 +50,20 @@ def nominal() -> Array:
     return values.at[-2:].set(jnp.asarray(LATENCIES))
 
 
-def jump(samples: int) -> Array:
-    """Return a step in m that makes the vehicle move in its first second."""
-    return jnp.where(jnp.arange(samples) > 10, 0.3, 0.0)
+def waits_and_jumps(points: ReferencePoint) -> ReferencePoint:
+    """Hold the reference still, where no error has a direction, then move it and its place."""
+    waiting = jnp.arange(points.position.x.shape[0]) <= 10
+    place = jax.tree.map(lambda leaf: leaf[0], points.position)
+    still = Vec3.zeros(place.x)
+    away = eqx.tree_at(lambda p: p.position.y, points, points.position.y + 0.3)
+    return where(waiting, ReferencePoint(place, still, still), away)
 
 
 @partial(jax.jit, static_argnames=("samples", "shape"))
 def flown(values: Array, *, samples: int, shape: str) -> Array:
     """Return position, attitude, rates and rotor speeds, (channels, samples, *batch)."""
     craft = eqx.tree_at(places, vehicle(), list(values))
-    points = reference(shape, ticks=samples)
-    points = eqx.tree_at(lambda p: p.position.y, points, points.position.y + jump(samples))
+    points = waits_and_jumps(reference(shape, ticks=samples))
     start = at_first_point(vehicle(), points)
     # exactly at their reference speed rotors are between rising and falling
     speeds = tuple(0.98 * speed for speed in start.rotor_speed)
