@@ -220,16 +220,22 @@ def wrench(
     moment = np.zeros_like(force)
     for place, spin, speed in zip(racer.places, racer.spins, rotors.T, strict=True):
         arm = place - centre
-        at = through + np.cross(rate, arm)
+        at = through + _cross(rate, arm)
         pull = -values["rotor_drag_coefficient"] * speed[:, None] * at
         lift = values["motor_constant"] * speed**2
         pull[:, 2] = lift - values["thrust_inflow_coefficient"] * speed * at[:, 2]
-        force, moment = force + pull, moment + np.cross(arm, pull)
+        force, moment = force + pull, moment + _cross(arm, pull)
         flap = values["flapping_moment_coefficient"] * speed
         moment += np.stack(
             [-flap * at[:, 1], flap * at[:, 0], -spin * values["moment_constant"] * lift], axis=1
         )
     return force, moment
+
+
+def _cross(first: Numbers, second: Numbers) -> Numbers:
+    """Return cross products along the last axis, for a third of `np.cross`'s time on few rows."""
+    ahead, behind = [1, 2, 0], [2, 0, 1]
+    return first[..., ahead] * second[..., behind] - first[..., behind] * second[..., ahead]
 
 
 def _step(
@@ -242,7 +248,7 @@ def _step(
     def slopes(velocity: Numbers, attitude: Rotation, rate: Numbers) -> tuple[Numbers, Numbers]:
         force, moment = wrench(racer, attitude, velocity - wind, rate, rotors)
         pull = attitude.apply(force) / racer.values["mass"] - np.array([0.0, 0.0, GRAVITY])
-        return pull, (moment - np.cross(rate, inertia * rate)) / inertia + hidden
+        return pull, (moment - _cross(rate, inertia * rate)) / inertia + hidden
 
     position, velocity, quaternion, rate = state
     attitude = Rotation.from_quat(quaternion)
@@ -269,14 +275,14 @@ def _loop(
     pull = path[2] + STIFFNESS * (path[0] - position) + DAMPING * (path[1] - velocity)
     pull += np.array([0.0, 0.0, GRAVITY])
     up = pull / np.linalg.norm(pull, axis=1, keepdims=True)
-    left = np.cross(up, np.array([1.0, 0.0, 0.0]))
+    left = _cross(up, np.array([1.0, 0.0, 0.0]))
     left /= np.linalg.norm(left, axis=1, keepdims=True)
-    goal = Rotation.from_matrix(np.stack([np.cross(left, up), left, up], axis=2))
+    goal = Rotation.from_matrix(np.stack([_cross(left, up), left, up], axis=2))
     asked = (attitude.inv() * goal).as_rotvec() / TURNING
     error = np.clip(asked, -12.0, 12.0) - rate
     steady = np.clip(steady + 30.0 * error / RATE, -40.0, 40.0)
     inertia = np.array([values[f"inertia_{axes}"] for axes in ("xx", "yy", "zz")])
-    moment = inertia * (RATE_GAINS * error + steady) + np.cross(rate, inertia * rate)
+    moment = inertia * (RATE_GAINS * error + steady) + _cross(rate, inertia * rate)
     thrust = values["mass"] * np.sum(pull * attitude.apply([0.0, 0.0, 1.0]), axis=1)
     levers = np.stack(
         [

@@ -56,15 +56,20 @@ def test_what_rotors_answer_makes_no_vehicle_heavy(begun):
         assert abs(error) < 3.0 * found.errors[name]
 
 
-@pytest.mark.parametrize("rate", [400.0, 100.0])
-def test_commands_alone_tell_inertia_by_the_lags_that_they_need(racer, rate, tmp_path):
+@pytest.fixture(scope="module", params=[400.0, 100.0], ids=["400 Hz", "100 Hz"])
+def commanded(request, racer, tmp_path_factory):
+    """A job by commands alone, and what it begins with."""
+    folder = tmp_path_factory.mktemp("commanded")
+    paths = fast_flights.write(*racer, folder, seed=4, rotor_rate=request.param, fed="command")
+    settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
+    given = job_of(settings, read_usable(settings)[0])
+    return given, with_accelerations(given)
+
+
+def test_commands_alone_tell_inertia_by_the_lags_that_they_need(racer, commanded):
     """The rotors turn faster than the new vehicle's are believed to, and are known by nothing."""
-    vehicle, signals = racer
-    paths = fast_flights.write(vehicle, signals, tmp_path, seed=4, rotor_rate=rate, fed="command")
-    settings = settle(Options([str(path) for path in paths], config=str(tmp_path / "tune.yaml")))
-    recordings, _ = read_usable(settings)
-    job, (finding,) = with_accelerations(job_of(settings, recordings))
-    truth = vehicle.values | {"input_scaling": fast_flights.FASTEST - fast_flights.IDLE}
+    _, (job, (finding,)) = commanded
+    truth = racer[0].values | {"input_scaling": fast_flights.FASTEST - fast_flights.IDLE}
     found = job.accelerations
     for name in (*TILTING, "inertia_zz", "motor_constant", "input_scaling"):
         error = np.log(found.values[name] / truth[name])
@@ -76,18 +81,16 @@ def test_commands_alone_tell_inertia_by_the_lags_that_they_need(racer, rate, tmp
     assert not set(job.space.names) & {*TILTING, "time_constant_up"}
 
 
-def test_commands_that_were_recorded_seldom_leave_more_unknown(racer, tmp_path, monkeypatch):
-    paths = fast_flights.write(*racer, tmp_path, seed=4, rotor_rate=100.0, fed="command")
-    settings = settle(Options([str(path) for path in paths], config=str(tmp_path / "tune.yaml")))
-    job = job_of(settings, read_usable(settings)[0])
-    seldom = with_accelerations(job)[0].accelerations.errors
+@pytest.mark.parametrize("commanded", [100.0], ids=["100 Hz"], indirect=True)
+def test_commands_that_were_recorded_seldom_leave_more_unknown(commanded, monkeypatch):
+    given, (job, _) = commanded
 
     def as_if_all(*given):
         steps, (commands, _) = read_commands(*given)
         return steps, (commands, commands)
 
     monkeypatch.setattr("tuner.job.accelerations.read_commands", as_if_all)
-    often = with_accelerations(job)[0].accelerations.errors
+    seldom, often = job.accelerations.errors, with_accelerations(given)[0].accelerations.errors
     assert all(seldom[name] > often[name] for name in (*TILTING, "actuator_latency"))
 
 
