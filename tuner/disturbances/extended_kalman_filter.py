@@ -215,7 +215,6 @@ class _Given(NamedTuple):
 
 
 def _given(feed: Feed, expected: Expected, gains: Gains | None = None) -> _Given:
-    """Return the arguments of a program."""
     weights = [np.asarray(feed.samples[name].weight) for name in feed.widths]
     sampled = np.concatenate([(weight > 0).any(axis=-1) for weight in weights], axis=1)
     first = np.argsort(~sampled, axis=1, kind="stable")

@@ -147,7 +147,6 @@ def _equations(
     criterion: Criterion,
     free: Mask,
 ) -> _Equations:
-    """Return gradient and Hessian at a point where some of the P parameters are free."""
     space, flight = objective.space, np.asarray(objective.segments.flight)
     (kinds, flights), count = point.offsets.shape, len(space)
     size = count + kinds

@@ -225,7 +225,6 @@ class Predictor:
         return not all(np.isfinite(white).all() for _, white in self._sizes())
 
     def _sizes(self) -> Iterator[tuple[str, Array]]:
-        """Return each channel with the sizes (n,) of its whitened innovations."""
         assert self.found is not None
         white = np.asarray(self.found.white, float)
         for name, rows in gathered(white, self.feed.widths, self.rows).items():

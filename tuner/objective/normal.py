@@ -247,7 +247,6 @@ class Objective(eqx.Module):
                 yield some, *some_segments(self, criterion, some)
 
     def _sums(self, point: Point, criterion: Criterion, moving: Mapping[str, int]) -> SegmentSums:
-        """Return what all segments contribute at once."""
         crash_time, blocks = self.compare(point, criterion, moving)
         segments, total, huber = self.segments.count, _columns(moving), criterion.huber
         loss, gradient = np.zeros(segments), np.zeros((segments, total))

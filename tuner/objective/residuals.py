@@ -191,7 +191,6 @@ class _Place:
 
 
 def _risen(share: Array) -> Array:
-    """Return how far the ramp into the next value has risen."""
     return np.clip(1.0 - (1.0 - share) / RAMP, 0.0, 1.0)
 
 

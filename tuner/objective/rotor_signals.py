@@ -131,7 +131,6 @@ def levers(vehicle: VehicleFile) -> Array:
 
 
 def _smoothed(values: Array) -> Array:
-    """Return (n, k) values averaged over `SMOOTHED` samples."""
     kernel = np.ones(SMOOTHED) / SMOOTHED
     return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
 

@@ -201,7 +201,6 @@ def _computed(flight: Flight, controller: ControllerFile, time: Array) -> Array:
 
 
 def _rates(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int]) -> JaxArray:
-    """Return the rate set-point (3,) of one state."""
     state, controller = given
     position, velocity = Vec3.of(state["position"]), Vec3.of(state["velocity"])
     estimate = Quaternion.of(state["attitude"]).normalized()
@@ -215,7 +214,6 @@ def _rates(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int
 
 
 def _velocity(flight: Flight) -> Series:
-    """Return the recorded velocity, or the position's change."""
     known = flight.series.get("velocity")
     if known is not None:
         return known

@@ -165,7 +165,6 @@ def _usable(
 
 
 def _between(time: Array, begin: float, end: float) -> Array:
-    """Return the times from one to another, both included."""
     return time[np.searchsorted(time, begin) : np.searchsorted(time, end, side="right")]
 
 
@@ -195,7 +194,6 @@ def _window(
 
 
 def _is_known(state: InitialState) -> bool:
-    """Return whether a window can begin at a state."""
     parts = (state.position, state.velocity, state.attitude)
     return all(bool(np.isfinite(part).all()) for part in parts)
 

@@ -459,7 +459,6 @@ def _grown(
     title: str,
     on_progress: Callable[[Progress], None],
 ) -> Fitted:
-    """Return where some stages lead."""
     stages = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in stages)
     progress = grow(
         fitted.objective, stages, progress, free=free, undecided=undecided, on_progress=on_progress
