@@ -38,10 +38,9 @@ from tuner.objective.normal import Objective
 from tuner.objective.space import Space
 from tuner.search.continuation import grow
 from tuner.search.estimation import free_offsets
-from tuner.search.fitted import Fitted
 from tuner.search.job_flights import read_usable
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Free, beginning, criterion_of, point_of
+from tuner.search.progress import Fitted, Free, beginning, criterion_of, point_of
 from tuner.search.stages import plan
 from tuner.terms.candidates import with_terms
 from tuner.uncertainty.estimates import uncertainty_of

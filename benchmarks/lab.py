@@ -37,8 +37,8 @@ from tuner.objective.battery import VOLTAGE, log_voltage_of
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight
 from tuner.search.explanation import Explanation
-from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
+from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import examined
 from tuner.terms.search_with_terms import search_with_terms

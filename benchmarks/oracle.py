@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.simulated_recordings import recorded
 from tuner.core.numerics import Array, Inverse
 from tuner.objective.information import information_at
-from tuner.search.fitted import Fitted
+from tuner.search.progress import Fitted
 
 DRAWS = 8
 """Of noise and gusts: their spread is then known to a quarter."""

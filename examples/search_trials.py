@@ -34,9 +34,9 @@ from tuner.findings.findings import Code  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
 from tuner.recordings.flight import Flight, Series  # noqa: E402
 from tuner.search.estimation import search  # noqa: E402
-from tuner.search.fitted import Fitted  # noqa: E402
 from tuner.search.job_flights import read_usable  # noqa: E402
 from tuner.search.problem import Job, job_of  # noqa: E402
+from tuner.search.progress import Fitted  # noqa: E402
 from tuner.uncertainty.estimates import uncertainty_of  # noqa: E402
 from tuner.uncertainty.verdict_texts import direction_in_words, verdict_in_words  # noqa: E402
 from tuner.vehicle import with_values  # noqa: E402 (jax is configured first)

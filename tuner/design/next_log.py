@@ -27,10 +27,9 @@ from tuner.objective.inlets import INLETS, STEADY_TORQUE
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured
 from tuner.recordings.flight import Series
-from tuner.search.fitted import Fitted
 from tuner.search.job_flights import Recording
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import plain_criterion
+from tuner.search.progress import Fitted, plain_criterion
 from tuner.vehicle import COEFFICIENTS, VehicleFile
 from tuner.vehicle.model import vehicle_of
 

@@ -22,11 +22,10 @@ from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings.flight import Flight
-from tuner.search.fitted import Fitted
 from tuner.search.iteration import PointEstimate
 from tuner.search.job_flights import with_known
 from tuner.search.problem import Job
-from tuner.search.progress import loop_of
+from tuner.search.progress import Fitted, loop_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, VehicleFile, initial_values, with_values
 from tuner.vehicle.controller import PositionControl
 

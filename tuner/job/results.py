@@ -44,9 +44,9 @@ from tuner.result import (
     SearchResult,
     Status,
 )
-from tuner.search.fitted import Fitted
 from tuner.search.job_flights import Recording
 from tuner.search.problem import SPIN_CHANNELS, Job
+from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, knowledge_of
 from tuner.uncertainty.records import Knowledge, Sources, write_files

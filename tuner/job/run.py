@@ -50,12 +50,11 @@ from tuner.result import BEST_FIT_FILE, Run, RunResult
 from tuner.search.estimation import OnProgress
 from tuner.search.explanation import Explanation
 from tuner.search.findings import inputs_late, turning_unexplained, voltage_taken
-from tuner.search.fitted import Fitted
 from tuner.search.input_lag import with_inputs_on_time
 from tuner.search.iteration import Iteration
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Progress
+from tuner.search.progress import Fitted, Progress
 from tuner.search.rotor_change import used_up_to_changes
 from tuner.terms.candidates import Selected
 from tuner.terms.inverse_regression import with_inputs_balanced

@@ -25,10 +25,9 @@ from tuner.report import render
 from tuner.report.contents import About, Recording, write_traces
 from tuner.search.continuation import SWITCH_GAIN
 from tuner.search.findings import UNMATCHED, loop_findings
-from tuner.search.fitted import Fitted, by_flight
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import beginning, loop_of, plain_criterion, with_loop
+from tuner.search.progress import Fitted, beginning, by_flight, loop_of, plain_criterion, with_loop
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.model_error import alternatives_of

@@ -24,7 +24,7 @@ from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles
 
 if TYPE_CHECKING:
     from tuner.evaluate.rmse import FlightErrors
-    from tuner.search.fitted import Fitted
+    from tuner.search.progress import Fitted
 
 
 @dataclass(frozen=True)

@@ -28,15 +28,16 @@ from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.findings import findings_at, unmatched
-from tuner.search.fitted import Fitted, by_flight
 from tuner.search.iteration import Iteration, Outcome
 from tuner.search.levenberg_marquardt import LEAST_DAMPING
 from tuner.search.problem import Job
 from tuner.search.progress import (
+    Fitted,
     Free,
     Loop,
     Progress,
     beginning,
+    by_flight,
     criterion_of,
     loop_of,
     point_of,

@@ -9,9 +9,8 @@ import numpy as np
 from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
-from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.search.progress import Loop, loop_of
+from tuner.search.progress import Fitted, Loop, loop_of
 from tuner.vehicle import VehicleFile
 
 UNMATCHED = 10.0

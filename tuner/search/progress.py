@@ -1,4 +1,4 @@
-"""Where a search stands, what it may move, and what an optimiser is asked and answers.
+"""Where a search stands and where it ended; what an optimiser is asked and answers.
 
 An optimiser runs one stage of the search: a function that yields an `Iterate` after each step, at
 least one, until the stage has had enough of them. `tuner.search.continuation.OPTIMISERS` names it.
@@ -6,8 +6,8 @@ least one, until the stage has had enough of them. `tuner.search.continuation.OP
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -18,14 +18,18 @@ from numpy.typing import NDArray
 from sim_jax.control.gains import Controller
 from sim_jax.numeric import Scalar
 from tuner.core.numerics import Array
+from tuner.findings.findings import Finding
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
-from tuner.search.iteration import Iteration
+from tuner.recordings.flight import Flight
+from tuner.search.iteration import Iteration, Outcome
 from tuner.search.stages import Stage
 
 HUBER = 4.0
 """Standard deviations beyond which a residual counts linearly, in the polish."""
+COLOURED = 1.2
+"""Residuals over measurement noise from which something else than noise must be in them."""
 
 
 class Loop(NamedTuple):
@@ -281,3 +285,79 @@ def point_of(points: Point, start: int) -> Point:
     """Return one of S points."""
     picked: Point = jax.tree.map(lambda leaf: leaf[start], points)
     return picked
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A search's result.
+
+    Attributes
+    ----------
+    objective
+        The problem.
+    point
+        The best point.
+    criterion
+        Horizon, scales and robust limit of the final problem, in which ``point`` is the minimum.
+    noise
+        Channel -> standard deviation of the measurement in its unit (attitude: rad).
+    scales
+        Flight name -> channel -> how much larger than the noise the residuals are.
+    iterations, outcomes
+        The trace of the search, and each start's end.
+    method
+        ``gradient``, ``cma`` or ``hybrid``.
+    evaluations
+        Simulated batches, Jacobians included.
+    wall_time
+        s.
+    loss_best
+        In the final weights.
+    converged
+        Whether the last stage stopped because its steps gained nothing, not at its limit.
+    polished
+        Whether the search went to its end: a model that is far off is not polished before terms
+        have been tried.
+    findings
+        Everything noticed on the way.
+    held
+        Coefficient that the flights do not identify -> the one kept at its initial value for it:
+        itself, or one that it trades off against.
+    """
+
+    objective: Objective
+    point: Point
+    criterion: Criterion
+    noise: Mapping[str, float]
+    scales: Mapping[str, Mapping[str, float]]
+    iterations: tuple[Iteration, ...]
+    outcomes: tuple[Outcome, ...]
+    method: str
+    evaluations: int
+    wall_time: float
+    loss_best: float
+    converged: bool
+    polished: bool = True
+    findings: tuple[Finding, ...] = field(default=())
+    held: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def vector(self) -> dict[str, float]:
+        """Coefficient -> number of the search vector."""
+        numbers = np.asarray(self.point.coefficients).tolist()
+        return dict(zip(self.objective.space.names, numbers, strict=True))
+
+    @property
+    def residuals_at_noise_level(self) -> bool:
+        """Whether residuals hold no more than measurement noise, on any flight and channel."""
+        return max(max(scale.values()) for scale in self.scales.values()) < COLOURED
+
+
+def by_flight(
+    scales: Mapping[str, Array], flights: Sequence[Flight]
+) -> dict[str, dict[str, float]]:
+    """Return flight name -> channel -> number, of channel -> (N,) numbers."""
+    return {
+        flight.name: {channel: float(scale[i]) for channel, scale in scales.items()}
+        for i, flight in enumerate(flights)
+    }

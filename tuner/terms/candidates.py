@@ -14,9 +14,8 @@ from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective, with_conditions
 from tuner.objective.space import Space, extended
 from tuner.search.findings import findings_at
-from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.search.progress import loop_of, with_loop
+from tuner.search.progress import Fitted, loop_of, with_loop
 from tuner.terms.score import EARNING
 from tuner.vehicle import COEFFICIENTS, conditions, term_groups, values_of
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
@@ -248,7 +247,7 @@ class Selected:
     def rows_given(self, held: Mapping[str, str]) -> tuple[SelectionRow, ...]:
         """Return the table once coefficients are held: a term that was chosen and is, is out.
 
-        ``held`` is a coefficient -> its stand-in, as of `tuner.search.fitted.Fitted`.
+        ``held`` is a coefficient -> its stand-in, as of `tuner.search.progress.Fitted`.
         """
         return tuple(
             row.model_copy(update={"kept": False, "reason": SelectionCode.NO_INFORMATION})

@@ -17,8 +17,8 @@ from tuner.disturbances.predictor import Predictor, hidden
 from tuner.objective.information import begun
 from tuner.objective.space import Space
 from tuner.search.findings import findings_at
-from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
+from tuner.search.progress import Fitted
 from tuner.terms.candidates import (
     Selected,
     is_stand_in,

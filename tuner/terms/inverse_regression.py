@@ -54,10 +54,9 @@ from tuner.objective.simulation import fly
 from tuner.objective.space import Space
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import states_at
-from tuner.search.fitted import Fitted
 from tuner.search.levenberg_marquardt import descend
 from tuner.search.problem import Job
-from tuner.search.progress import Free, StageProblem
+from tuner.search.progress import Fitted, Free, StageProblem
 from tuner.search.stages import Stage
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.model_error import alternatives_of

@@ -32,7 +32,7 @@ from tuner.objective.information import (
 from tuner.objective.normal import Objective, portions
 from tuner.objective.residuals import robust
 from tuner.objective.space import Space
-from tuner.search.fitted import Fitted
+from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import Stretches
 from tuner.vehicle import COEFFICIENTS, REGISTRY
 from tuner.vehicle.coefficient import Parameter

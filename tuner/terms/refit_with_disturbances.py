@@ -17,9 +17,8 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.search.estimation import LAST, free_offsets, polished
 from tuner.search.explanation import Explanation
-from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.search.progress import Free, Progress
+from tuner.search.progress import Fitted, Free, Progress
 from tuner.terms.candidates import Selected, is_stand_in, names_in
 from tuner.terms.innovations import Innovations, outside
 from tuner.terms.search_with_terms import candidates_of

@@ -18,9 +18,9 @@ from tuner.objective.inlets import INLETS
 from tuner.objective.space import extended
 from tuner.recordings.flight import Flight
 from tuner.search.estimation import OnProgress, search
-from tuner.search.fitted import Fitted
 from tuner.search.iteration import PointEstimate
 from tuner.search.problem import Job
+from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected, candidate_groups, groups_around, groups_named, start_of
 from tuner.terms.selection import Selection
 from tuner.vehicle import COEFFICIENTS

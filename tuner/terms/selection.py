@@ -33,9 +33,8 @@ from tuner.search.estimation import (
     searched_again,
 )
 from tuner.search.findings import findings_at
-from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.search.progress import Free, Progress, loop_of, with_loop
+from tuner.search.progress import Fitted, Free, Progress, loop_of, with_loop
 from tuner.terms.candidates import (
     Selected,
     coefficients_in,

@@ -15,7 +15,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.space import Space
-from tuner.search.fitted import Fitted
+from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import Covariance, IndependentErrors, covariance_of, flights_apart
 from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict, judge

@@ -15,7 +15,7 @@ from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.normal import Objective, portion, portions
 from tuner.objective.space import Space
-from tuner.search.fitted import Fitted
+from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import LACK, Uncertainty, at_rest, references, uncertainty_at
 from tuner.uncertainty.model_error import Lack
 from tuner.uncertainty.records import (

@@ -9,7 +9,7 @@ import numpy as np
 from tuner.core.numerics import Array, scaled_inverse, unit_diagonal
 from tuner.findings.findings import Code, Finding
 from tuner.objective.space import Space
-from tuner.search.fitted import Fitted
+from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.records import CONFLICT, Sources
 from tuner.vehicle import COEFFICIENTS

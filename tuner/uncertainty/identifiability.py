@@ -24,9 +24,8 @@ from tuner.core.phrases import listed
 from tuner.objective.criterion import Point
 from tuner.objective.normal import normal_equations
 from tuner.search.estimation import LAST, LAST_TWO, free_offsets, polished
-from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.search.progress import Free, Progress
+from tuner.search.progress import Fitted, Free, Progress
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.model_error import alternatives_of, lack_of

@@ -39,7 +39,7 @@ from tuner.objective.normal import Objective
 from tuner.objective.simulation import MOTION, SETPOINTS, SPEEDS, TURNED, Flown, environment_of, fly
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
-from tuner.search.fitted import Fitted
+from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import DRAWS, READINGS, STEP, Uncertainty
 from tuner.vehicle.model import Model
 

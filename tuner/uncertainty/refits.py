@@ -20,10 +20,9 @@ from tuner.evaluate.held_out import best_values, comparison_of
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.objective.normal import Objective
 from tuner.search.estimation import free_offsets, polished
-from tuner.search.fitted import Fitted
 from tuner.search.iteration import Iteration
 from tuner.search.problem import Job
-from tuner.search.progress import Free
+from tuner.search.progress import Fitted, Free
 from tuner.uncertainty.records import Refit
 from tuner.vehicle import with_values
 

@@ -20,7 +20,7 @@ from tuner.design.proposals import (
 )
 from tuner.design.ranking import CLEARANCE, Arena, candidates, rank_next_flights
 from tuner.objective.normal import Objective
-from tuner.search.fitted import Fitted
+from tuner.search.progress import Fitted
 from tuner.uncertainty.examination import Examination, examine
 
 FREE = ("inertia_xx", "inertia_zz", "input_scaling", "motor_constant", "moment_constant")

@@ -29,9 +29,8 @@ from tuner.objective.simulation import SETPOINTS, fly
 from tuner.objective.space import space_of
 from tuner.recordings.flight import InitialState
 from tuner.search.estimation import free_offsets, polished
-from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.search.progress import Free
+from tuner.search.progress import Fitted, Free
 
 BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
 

@@ -14,8 +14,8 @@ from tests.tuner.uncertainty import making
 from tuner.config import JobFile
 from tuner.objective.information import FisherInformation
 from tuner.objective.space import Space, extended, space_of
-from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
+from tuner.search.progress import Fitted
 from tuner.terms import innovations
 from tuner.terms.candidates import Selected, start_of
 from tuner.terms.innovations import Innovations

@@ -14,8 +14,8 @@ from tests.tuner.uncertainty.making import ended
 from tuner.config import JobFile
 from tuner.disturbances.disturbances import USUAL
 from tuner.disturbances.maximum_likelihood import STEPS
-from tuner.search.fitted import COLOURED, Fitted
 from tuner.search.problem import Job
+from tuner.search.progress import COLOURED, Fitted
 from tuner.terms import refit_with_disturbances as disturbances
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import ROUGHLY, with_disturbances

@@ -24,7 +24,7 @@ from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.space import space_of
-from tuner.search.fitted import Fitted
+from tuner.search.progress import Fitted
 from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle
 from tuner.vehicle.model import model_of, schedule_of
 

@@ -13,7 +13,7 @@ from tests.tuner.uncertainty import making
 from tuner.core.errors import InputError
 from tuner.job.sensitivity import _uncertainty_with
 from tuner.objective.normal import Objective
-from tuner.search.fitted import Fitted
+from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
 from tuner.uncertainty.examination import FullProblem, full_problem_of
 from tuner.uncertainty.profile_likelihood import profile_likelihood
