@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress
 from math import prod
 from operator import or_
 from typing import Any
@@ -20,6 +21,7 @@ from lanes.values import (
     OF_LANE,
     Elements,
     Memory,
+    Tangent,
     UnsupportedError,
     Value,
     array_of,
@@ -32,12 +34,9 @@ Bound = Mapping[Any, Memory]
 
 
 def _rebuilt(value: Elements, left: Iterator[ir.Value]) -> Elements:
-    """Return an array in registers with the LLVM values that come next."""
+    """Return an array in registers with the LLVM values that come next; tangents lie in memory."""
     return array_of(
-        [
-            tuple(next(left) for _ in e) if isinstance(e, tuple) else next(left)
-            for e in value.ravel()
-        ],
+        [e if isinstance(e, Tangent) else next(left) for e in value.ravel()],
         value.shape,
     )
 
@@ -58,7 +57,27 @@ class _Carry:
         """
         self.lower, self.kinds = lower, list(kinds)
         self._taken = {id(v.storage.pointer) for v in read if isinstance(v, Memory)}
-        self.values = [self._laid(*each) for each in zip(values, self.kinds, strict=True)]
+        laid = [self._laid(*each) for each in zip(values, self.kinds, strict=True)]
+        self.values = [
+            array_of(
+                [lower.slot(e.kind) if isinstance(e, Tangent) else e for e in v.ravel()], v.shape
+            )
+            if isinstance(v, np.ndarray)
+            else v
+            for v in laid
+        ]
+        self._move(laid)
+
+    def _move(self, given: Sequence[Value]) -> None:
+        """Compute tangents into where they are carried."""
+        outs = []
+        for value, new in zip(self.values, given, strict=True):
+            if isinstance(value, np.ndarray):
+                assert isinstance(new, np.ndarray)
+                for slot, element in zip(value.ravel(), new.ravel(), strict=True):
+                    if isinstance(slot, Tangent) and slot is not element:
+                        outs.append((element, self.lower.into(slot)))
+        self.lower.flushed(outs)
 
     def _laid(self, value: Value, kind: int) -> Elements | Memory:
         if isinstance(value, Memory) and value.storage.writable:
@@ -95,6 +114,7 @@ class _Carry:
                 following.append(value)
             else:
                 following.append(self.lower.promoted(out, kind))
+        self._move(following)
         return following
 
     def loop(
@@ -103,11 +123,14 @@ class _Carry:
         turn: Callable[[list[Value]], Sequence[Value]],
     ) -> list[Value]:
         """Write a loop; return the carried values after it."""
+        slots = (e for v in self.values if isinstance(v, np.ndarray) for e in v.ravel())
+        self.lower.carried.append({e.operands[0] for e in slots if isinstance(e, Tangent)})
         nodes = self.lower.loop(
             self.parts(self.values),
             lambda nodes: goes_on(self.rebuilt(nodes)),
             lambda nodes: self.parts(turn(self.rebuilt(nodes))),
         )
+        self.lower.carried.pop()
         return self.rebuilt(nodes)
 
 
@@ -133,6 +156,9 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     consts, carried, length = p["num_consts"], p["num_carry"], p["length"]
     body = p["jaxpr"]
     once = length == 1
+    if not once:
+        operands = lower.computed(operands)
+        lower.settle(before=True)
     fixed = [_laid_before(lower, v, indexed=False) for v in operands[:consts]]
     rows = [_laid_before(lower, v, indexed=not once) for v in operands[consts + carried :]]
     given = [*fixed, *operands[consts : consts + carried], *rows]
@@ -159,26 +185,38 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
             place = b.sub(b.sub(lower.size(length), constant(I64, 1)), number)
         now = [_row(lower, v, place) for v in rows]
         outs = lower.run(body.jaxpr, body.consts, [*fixed, *carry, *now])
-        for memory, few, out in zip(into, collected, outs[carried:], strict=True):
-            at = place if few is memory else b.urem(number, constant(I64, few.shape[0]))
-            lower.store_rows(few, at, out)
+        whole = [few is memory for memory, few in zip(into, collected, strict=True)]
+        with lower.holding(outs):
+            single = lower.computed(list(compress(outs[carried:], whole))) if any(whole) else []
+            for memory, out in zip(compress(into, whole), single, strict=True):
+                lower.store_rows(memory, place, out)
+        for few, out in zip(collected, outs[carried:], strict=True):
+            if few not in into:
+                lower.store_rows(few, b.urem(number, constant(I64, few.shape[0])), out)
+        return outs[:carried]
+
+    def lay_full(number: ir.Value) -> None:
         after = b.add(number, constant(I64, 1))
         for count in together:
             rest = b.urem(after, constant(I64, count))
             with b.if_then(b.icmp_signed("==", rest, constant(I64, 0))):
                 lay(after, count, constant(I64, count))
-        return outs[:carried]
 
     start = operands[consts : consts + carried]
     if once:
-        return [*turn(constant(I64, 0), start), *into]
+        ends = turn(constant(I64, 0), start)
+        with lower.holding(ends):
+            lower.settle()
+        return [*ends, *into]
     first, size = array_of([constant(I64, 0)], ()), lower.size(length)
     carry = _Carry(lower, [first, *start], [0, *kinds[:carried]], [*fixed, *rows])
 
     def again(inside: list[Value]) -> list[Value]:
         number = lower.elements(inside[0])[()]
         outs = turn(number, inside[1:])
-        return carry.handed_on([array_of([b.add(number, constant(I64, 1))], ()), *outs])
+        following = carry.handed_on([array_of([b.add(number, constant(I64, 1))], ()), *outs])
+        lay_full(number)
+        return following
 
     _, *end = carry.loop(
         lambda inside: b.icmp_signed("<", lower.elements(inside[0])[()], size), again
@@ -191,6 +229,8 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
 def _while(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> list[Value]:
     p = eqn.params
     conds, consts = p["cond_nconsts"], p["body_nconsts"]
+    operands = lower.computed(operands)
+    lower.settle(before=True)
     operands = [
         *(_laid_before(lower, v, indexed=False) for v in operands[: conds + consts]),
         *operands[conds + consts :],
@@ -210,14 +250,13 @@ def _while(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> l
 
     def turn(inside: list[Value]) -> list[Value]:
         outs = lower.run(p["body_jaxpr"].jaxpr, p["body_jaxpr"].consts, [*of_body, *inside])
-        following = carry.handed_on(outs)
         if not kind_of(going[0]):
-            return following
+            return carry.handed_on(outs)
         # lanes that have ended stay as they are
         return carry.handed_on(
             [
                 lower.elementwise("select_n", {}, [going[0], old, new], new.shape)
-                for old, new in zip(inside, following, strict=True)
+                for old, new in zip(inside, outs, strict=True)
             ]
         )
 
@@ -228,6 +267,8 @@ def _cond(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> li
     branches = eqn.params["branches"]
     which = lower.elements(operands[0])[()]
     rest = operands[1:]
+    if is_vector(which) or not isinstance(which, ir.Constant):
+        rest = lower.computed(rest)
     if is_vector(which):  # what one lane changes in place would change for all
         rest = [_laid_before(lower, v, indexed=False) for v in rest]
     kinds = [OF_LANE * is_vector(which)] * len(eqn.outvars)
@@ -268,15 +309,19 @@ def _branched(
 ) -> list[Value]:
     """Compute one of two lists of values of the same kinds, by a branch."""
     b = lower.b
+    lower.settle(before=True)
     before = [storage.version for storage in lower.storages]
     ends: list[_End] = []
-    with b.if_else(flag) as branches:
-        for branch, compute in zip(branches, (yes, no), strict=True):
-            for storage, version in zip(lower.storages, before, strict=False):
-                storage.version = version
-            with branch:
-                found = compute()
-                ends.append(_End(found, b.block, [s.version for s in lower.storages]))
+    begins = [b.append_basic_block(name) for name in ("yes", "no")]
+    b.cbranch(flag, *begins)
+    for begin, compute in zip(begins, (yes, no), strict=True):
+        for storage, version in zip(lower.storages, before, strict=False):
+            storage.version = version
+        b.position_at_end(begin)
+        found = compute()
+        with lower.holding(found):
+            lower.settle()
+        ends.append(_End(found, b.block, [s.version for s in lower.storages]))
     stays = [
         isinstance(x, Memory) and isinstance(y, Memory) and x.storage is y.storage
         for x, y in zip(ends[0].values, ends[1].values, strict=True)
@@ -284,17 +329,63 @@ def _branched(
     for end in ends:
         for storage, version in zip(lower.storages, end.versions, strict=False):
             storage.version = version
-        with b.goto_block(end.block):
-            end.values = [
-                value if stay else lower.elements(value)
-                for value, stay in zip(end.values, stays, strict=True)
-            ]
+        b.position_at_end(end.block)
+        end.values = [
+            value if stay else lower.elements(value)
+            for value, stay in zip(end.values, stays, strict=True)
+        ]
+        end.block = b.block
+    taken: set[int] = set()
+    merged: list[Any] = [
+        x if stay else _met_all(lower, x, y, taken)
+        for x, y, stay in zip(ends[0].values, ends[1].values, stays, strict=True)
+    ]
+    after = b.append_basic_block("after")
+    for end in ends:
+        b.position_at_end(end.block)
+        outs = [
+            (element, lower.into(to))
+            for into, value, stay in zip(merged, end.values, stays, strict=True)
+            if isinstance(value, np.ndarray) and not stay
+            for to, element in zip(into.ravel(), value.ravel(), strict=True)
+            if isinstance(to, Tangent) and to is not element
+        ]
+        lower.flushed(outs)
+        b.branch(after)
+        end.block = b.block
+    b.position_at_end(after)
     for storage, *versions in zip(lower.storages, ends[0].versions, ends[1].versions, strict=False):
         storage.version = max(versions)
     return [
-        _merged(lower, first, second, ends)
-        for first, second in zip(ends[0].values, ends[1].values, strict=True)
+        _merged(lower, first, second, ends, into)
+        for first, second, into in zip(ends[0].values, ends[1].values, merged, strict=True)
     ]
+
+
+def _met_all(lower: Lowering, x: Any, y: Any, taken: set[int]) -> Elements:
+    pairs = zip(x.ravel(), y.ravel(), strict=True)
+    return array_of([_met(lower, *pair, taken) for pair in pairs], x.shape)
+
+
+def _met(lower: Lowering, x: Any, y: Any, taken: set[int]) -> Any:
+    """Return where a tangent of either branch lies; else nothing.
+
+    What a branch leaves where a loop carries it is changed there, if it is not asked for again.
+    """
+    if x is y or not isinstance(x, Tangent):
+        return x if x is y else None
+    for slot in (x, y):
+        storage = slot.operands[0]
+        if (
+            slot.is_read
+            and lower.carried
+            and storage in lower.carried[-1]
+            and id(storage) not in taken
+            and not lower.is_read_again(slot)
+        ):
+            taken.add(id(storage))
+            return slot
+    return lower.slot(x.kind)
 
 
 @dataclass
@@ -306,22 +397,22 @@ class _End:
     versions: list[int]
 
 
-def _merged(lower: Lowering, first: Value, second: Value, ends: Sequence[_End]) -> Value:
+def _merged(lower: Lowering, first: Value, second: Value, ends: Sequence[_End], into: Any) -> Value:
     """Return the value of one branch or the other, where both have ended."""
     if isinstance(first, Memory):
         return Memory(first.storage, first.shape, first.storage.version)
     assert isinstance(first, np.ndarray)
     assert isinstance(second, np.ndarray)
     nodes = []
-    for x, y in zip(parts_of(first.ravel()), parts_of(second.ravel()), strict=True):
-        if x is y:
-            nodes.append(x)
+    for x, y, known in zip(first.ravel(), second.ravel(), into.ravel(), strict=True):
+        if known is not None:
+            nodes.append(known)
             continue
         node = lower.b.phi(x.type)
         for value, end in zip((x, y), ends, strict=True):
             node.add_incoming(value, end.block)
         nodes.append(node)
-    return _rebuilt(first, iter(nodes))
+    return array_of(nodes, first.shape)
 
 
 def _selected(
@@ -331,7 +422,7 @@ def _selected(
     result_of: Callable[[Any], list[Value]],
 ) -> list[Value]:
     """Compute the first branch, each other one where a lane asks for it, and select."""
-    chosen = result_of(branches[0])
+    chosen = lower.computed(result_of(branches[0]))
     for number, branch in enumerate(branches[1:], start=1):
         flag = _is_number(lower, which, number, len(branches))
 

@@ -58,15 +58,15 @@ class Argument:
 class _Frame(NamedTuple):
     """What the function is called with, and what holds for the block of lanes under way.
 
-    A block takes one pass of columns for each of its lanes. ``segment`` is whose results a lane
-    computes, ``turn`` which pass of columns.
+    A block takes some columns for each of its lanes. ``segment`` is whose results a lane computes,
+    ``turn`` which column is its first; there are ``columns``.
     """
 
     given: list[ir.Value]
     taken: list[ir.Value]
     lanes: ir.Value
     own_lanes: ir.Value
-    passes: ir.Value
+    columns: ir.Value
     first_lane: ir.Value
     own_lane: ir.Value
     segment: ir.Value
@@ -79,8 +79,8 @@ class Layout:
 
     Attributes
     ----------
-    arguments, moving, columns
-        Of the program; which arguments have tangents; columns in a pass.
+    arguments, moving
+        Of the program; which arguments have tangents.
     lengths
         Name -> stand-in of each length that is an argument.
     outputs, moved
@@ -89,7 +89,6 @@ class Layout:
 
     arguments: Sequence[Argument]
     moving: Sequence[int]
-    columns: int
     lengths: Lengths
     outputs: Sequence[Any]
     moved: Sequence[int]
@@ -99,7 +98,8 @@ class Layout:
 
         Its function ``run`` takes tables of the addresses of arguments and results, the lengths,
         the segment and the turn of each lane, how many lanes there are, after how many blocks the
-        arguments begin again, how many passes, and from which block to which it is to compute.
+        arguments begin again, how many columns there are, how many a block takes, and from which
+        block to which it is to compute.
 
         Raises
         ------
@@ -110,9 +110,11 @@ class Layout:
         emitter = Emitter(module, width)
         b = emitter.b
         bytes_of, whole = ir.IntType(8).as_pointer().as_pointer(), I64.as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [bytes_of, bytes_of, whole, whole, whole, *[I64] * 5])
+        kind = ir.FunctionType(ir.VoidType(), [bytes_of, bytes_of, whole, whole, whole, *[I64] * 6])
         function = ir.Function(module, kind, "run")
-        ins, outs, lengths, segments, turns, lanes, blocks, passes, begin, end = function.args
+        ins, outs, lengths, segments, turns, lanes, blocks, every, columns, begin, end = (
+            function.args
+        )
         entry, body = (function.append_basic_block(name) for name in ("entry", "begin"))
         stack = ir.IRBuilder(entry)
         b.position_at_end(body)
@@ -126,7 +128,7 @@ class Layout:
             stand_in: b.load(b.gep(lengths, [constant(I64, number)]))
             for number, stand_in in enumerate(self.lengths.values())
         }
-        lower = Lowering(emitter, self.columns, known, allocate)
+        lower = Lowering(emitter, columns, known, allocate)
         given = [
             _pointer_in(b, ins, number, var.aval.dtype)
             for number, var in enumerate(closed.jaxpr.invars)
@@ -150,7 +152,7 @@ class Layout:
                 taken,
                 lanes,
                 b.mul(blocks, at_once),
-                passes,
+                every,
                 first_lane,
                 b.mul(b.srem(block, blocks), at_once),
                 of_lanes(segments),
@@ -205,11 +207,10 @@ class Layout:
         is_first = lower.e.any_lane(b.icmp_signed("==", frame.turn, zero))
         memories = []
         for pointer, shape, moved in zip(frame.taken, self.outputs, self.moved, strict=True):
-            unit = constant(I64, self.columns if moved else 1)
-            own, *strides = lower.row_major((0, *shape.shape), unit)
+            own, *strides = lower.row_major((0, *shape.shape))
             parts = [(frame.segment, own)]
             if moved:
-                parts = [(frame.segment, b.mul(frame.passes, own)), (frame.turn, own)]
+                parts = [(frame.segment, b.mul(frame.columns, own)), (frame.turn, own)]
             is_wanted = b.icmp_unsigned("!=", b.ptrtoint(pointer, I64), nowhere)
             storage = Storage(
                 pointer,
@@ -217,7 +218,7 @@ class Layout:
                 tuple(strides),
                 own,
                 None,
-                column_stride=constant(I64, 1) if moved else None,
+                column_stride=own if moved else None,
                 begins=lower.begins(parts),
                 writable=True,
                 guard=is_wanted if moved else b.and_(is_first, is_wanted),

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import reduce
 from itertools import product
@@ -31,27 +31,32 @@ from lanes.rules import (
     mangled,
     type_of,
 )
+from lanes.tangents import Factors, Graph, Node
 from lanes.values import (
     OF_COLUMN,
     OF_LANE,
+    READ,
     Deferred,
     Element,
     Elements,
     Index,
     Memory,
     Storage,
+    Tangent,
     UnsupportedError,
     Value,
     array_of,
     base,
     is_vector,
     kind_of,
-    parts_of,
 )
 
 I64 = ir.IntType(64)
 FEW = 512
 """Elements up to which an array may lie in registers."""
+MOST_COLUMNS = 15
+"""Columns that a block of lanes takes at most; odd, for what lies an even number of lines apart
+meets in a few sets of the cache."""
 SPILLED = 24
 """Elements above which an array that enters a loop is laid in memory."""
 
@@ -64,7 +69,7 @@ class Lowering:
     emitter
         Writes instructions.
     columns
-        How many columns tangents have.
+        How many columns of tangents a block of lanes takes, an argument of the function.
     lengths
         Stand-in of a length -> the length, an argument of the function.
     allocate
@@ -74,11 +79,21 @@ class Lowering:
     def __init__(
         self,
         emitter: Emitter,
-        columns: int,
+        columns: ir.Value,
         lengths: Mapping[int, ir.Value],
         allocate: Callable[[ir.Type, int], ir.Value],
     ) -> None:
         self.e, self.columns, self.lengths, self._allocate = emitter, columns, lengths, allocate
+        self._column: ir.Value | None = None
+        """The number of the column that is computed."""
+        self._alive: list[dict[Any, Value]] = []
+        """What is asked for later, by the jaxprs that are under way."""
+        self.carried: list[set[Storage]] = []
+        """Where the loops that are under way carry tangents."""
+        self._queue: list[tuple[Element, Tangent]] = []
+        """What is to be written where, with what is computed next."""
+        self._pending: dict[int, list[Tangent]] = {}
+        """What is read of memory that may change."""
         self.storages: list[Storage] = []
         """All that is written to."""
 
@@ -105,11 +120,35 @@ class Lowering:
             zip(jaxpr.constvars, map(self.literal, consts), strict=True)
         )
         values.update(zip(jaxpr.invars, arguments, strict=True))
-        for eqn in jaxpr.eqns:
+        self._alive.append(values)
+        for eqn, last in zip(jaxpr.eqns, _last_reads(jaxpr), strict=True):
             operands = [self._read(values, var) for var in eqn.invars]
+            for var in last:
+                values.pop(var, None)
             outs = self._equation(eqn, operands, bound)
             values.update(zip(eqn.outvars, outs, strict=True))
+        self._alive.pop()
         return [self._read(values, var) for var in jaxpr.outvars]
+
+    def is_read_again(self, slot: Tangent) -> bool:
+        """Return whether a number in memory, as it is now, is asked for later."""
+        storage = slot.operands[0]
+        return any(node.operands[0] is storage for node in self._held().values())
+
+    def _held(self) -> dict[int, Tangent]:
+        """Return tangents' numbers that are asked for later, and what they are computed of."""
+        left: list[Any] = [v for values in self._alive for v in values.values()]
+        seen: dict[int, Tangent] = {}
+        while left:
+            value = left.pop()
+            if isinstance(value, Deferred):
+                left += value.sources
+            elif isinstance(value, np.ndarray):
+                left += [x for x in value.ravel() if isinstance(x, Tangent)]
+            elif isinstance(value, Tangent) and value.number not in seen:
+                seen[value.number] = value
+                left += [x for x in value.operands if isinstance(x, Tangent)]
+        return seen
 
     def _read(self, values: Mapping[Any, Value], var: Any) -> Value:
         if isinstance(var, Literal):
@@ -206,14 +245,11 @@ class Lowering:
     def apply(self, name: str, params: Mapping[str, Any], *elements: Element) -> Element:
         """Apply a rule to elements, column by column where one is a tangent."""
         rule = ELEMENTWISE[name]
-        if any(isinstance(x, tuple) for x in elements):
-            self.e.flags = LINEAR
-            found = tuple(
-                self.apply(name, params, *(x[k] if isinstance(x, tuple) else x for x in elements))
-                for k in range(self.columns)
-            )
-            self.e.flags = CONTRACT
-            return found
+        moving = [x for x in elements if isinstance(x, Tangent)]
+        if moving:
+            to = name == "convert_element_type"
+            kind = type_of(params["new_dtype"]) if to else moving[0].kind
+            return Tangent(kind, name, params, elements)
         own = 1 if name == "select_n" else 0  # what chooses need not be what is chosen from
         return rule(self.e, params, *elements[:own], *self.e.alike(*elements[own:]))
 
@@ -250,16 +286,129 @@ class Lowering:
         """Return an array in registers, of every lane and of every column if it is to be."""
 
         def of(element: Element) -> Element:
-            if isinstance(element, tuple):
-                return tuple(map(of, element))
-            return self.e.splat(element) if kind & OF_LANE else element
+            if isinstance(element, Tangent):
+                return element
+            wide = self.e.splat(element) if kind & OF_LANE else element
+            return Tangent(base(wide.type), "copy", {}, (wide,)) if kind & OF_COLUMN else wide
 
         elements = self.elements(value)
-        wide = [
-            (e,) * self.columns if kind & OF_COLUMN and not isinstance(e, tuple) else e
-            for e in elements.ravel()
+        return array_of([of(e) for e in elements.ravel()], elements.shape)
+
+    # tangents
+
+    def flushed(
+        self,
+        outs: Sequence[tuple[Element, Callable[[ir.Value], None]]],
+        changed: Set[int] = frozenset(),
+    ) -> None:
+        """Compute tangents' numbers, column by column, and hand them on.
+
+        With them is written what is to be written; what is asked for of memory that changes so, or
+        is ``changed`` next, is kept before.
+        """
+        changed = changed | {id(to.operands[0]) for _, to in self._queue}
+        held = self._held() if changed & self._pending.keys() else {}
+        kept = []
+        for storage in changed:
+            for node in self._pending.pop(storage, []):
+                if node.number in held:
+                    slot = self.slot(node.kind)
+                    kept.append((node, slot))
+        outs = [*((node, self.into(slot)) for node, slot in kept), *outs]
+        outs = [*((element, self.into(to)) for element, to in self._queue), *outs]
+        self._queue = []
+        if not outs:
+            return
+        graph = Graph([x for x, _ in outs])
+        factors = Factors(self.apply)
+        shared = {
+            (node, operand): factors.of(factor, node.kind)
+            for node in graph.nodes
+            if node.terms is not None
+            for operand, factor in node.terms.items()
+        }
+
+        def of_column(number: ir.Value) -> None:
+            found: dict[Node, ir.Value] = {}
+            self._column, self.e.flags = number, LINEAR
+            for node in graph.nodes:
+                if node.terms is not None:
+                    found[node] = self._sum_of(node, shared, [found[x] for x in node.terms])
+                elif not isinstance(node.of, Tangent):
+                    found[node] = node.of
+                elif node.of.is_read:
+                    found[node] = self._read_number(node.of.operands[0], node.of.operands[1:])
+                else:
+                    given = (found[x] if isinstance(x, Node) else x for x in node.operands)
+                    found[node] = self.apply(node.of.name, node.of.params, *given)
+            self.e.flags = CONTRACT
+            for (_, hand_on), node in zip(outs, graph.outs, strict=True):
+                hand_on(found[node])
+            self._column = None
+
+        self.count(constant(I64, 0), self.columns, 1, of_column)
+        for node, slot in kept:
+            node.operands = slot.operands
+
+    def _sum_of(
+        self, node: Node, shared: Mapping[Any, ir.Value], values: Sequence[ir.Value]
+    ) -> ir.Value:
+        """Return a sum of numbers times factors."""
+        total: ir.Value | None = None
+        assert node.terms is not None
+        for (operand, factor), value in zip(node.terms.items(), values, strict=True):
+            if factor == 1.0:
+                total = value if total is None else self.apply("add", {}, total, value)
+            elif factor == -1.0 and total is not None:
+                total = self.apply("sub", {}, total, value)
+            else:
+                part = self.apply("mul", {}, value, shared[node, operand])
+                total = part if total is None else self.apply("add", {}, total, part)
+        return constant(node.kind, 0.0) if total is None else total
+
+    def settle(self, *, before: bool = False) -> None:
+        """Write what is to be written; before loops and branches read what they may change."""
+        self.flushed([], changed=set(self._pending) if before else set())
+
+    @contextmanager
+    def holding(self, values: Sequence[Value]) -> Iterator[None]:
+        """Know that values are asked for later."""
+        self._alive.append(dict(enumerate(values)))
+        yield
+        self._alive.pop()
+
+    def slot(self, kind: ir.Type) -> Tangent:
+        """Return a tangent's number that lies in memory of its own."""
+        storage = self.local((), kind, OF_LANE | OF_COLUMN).storage
+        storage.writable = False
+        return Tangent(kind, READ, {}, (storage,))
+
+    def into(self, slot: Tangent) -> Callable[[ir.Value], None]:
+        """Return what writes a column where a tangent's number lies."""
+        storage, *index = slot.operands
+        return lambda value: self._write_number(storage, index, value)
+
+    def computed(self, values: Sequence[Value]) -> list[Value]:
+        """Return arrays whose tangents lie in memory: those that do not are computed now."""
+        known: dict[int, Tangent] = {}
+        outs = []
+
+        def of(element: Element) -> Element:
+            if not isinstance(element, Tangent):
+                return element
+            if element.is_read and not element.operands[0].writable:
+                return element
+            if element.number not in known:
+                known[element.number] = self.slot(element.kind)
+                outs.append((element, self.into(known[element.number])))
+            return known[element.number]
+
+        found = [
+            array_of([of(e) for e in v.ravel()], v.shape) if isinstance(v, np.ndarray) else v
+            for v in values
         ]
-        return array_of([of(e) for e in wide], elements.shape)
+        self.flushed(outs)
+        return found
 
     # memory
 
@@ -292,22 +441,27 @@ class Lowering:
         if memory.version != storage.version:
             raise UnsupportedError("an array that is read after it was changed in place")
         if storage.column_stride is None:
-            return self._load_column(storage, index, None)
-        return tuple(self._load_column(storage, index, k) for k in range(self.columns))
+            return self._read_number(storage, index)
+        if any(to.operands[0] is storage for _, to in self._queue):
+            self.settle()
+        node = Tangent(storage.kind, READ, {}, (storage, *index))
+        if storage.writable:
+            self._pending.setdefault(id(storage), []).append(node)
+        return node
 
-    def _load_column(self, storage: Storage, index: Index, column: int | None) -> ir.Value:
+    def _read_number(self, storage: Storage, index: Index) -> ir.Value:
         if any(map(is_vector, index)):
             if storage.begins:
                 raise UnsupportedError("an index of each lane's own where lanes lie apart")
-            return self._gathered(storage, index, column)
+            return self._gathered(storage, index)
         if storage.begins:
             return self._collected(storage, index, 1)[0]
-        place = self._place(storage, index, column)
+        place = self._place(storage, index)
         return self._read_at(storage, place, wide=storage.lane_stride is not None)
 
     def _collected(self, storage: Storage, index: Index, count: int) -> list[ir.Value]:
         """Read so many numbers that lie side by side in each lane's part."""
-        place, width = self._place(storage, index, None), self.e.width
+        place, width = self._place(storage, index), self.e.width
         lanes = self._parts(storage, place)
         found: list[ir.Value] = []
         whole = count // width * width if storage.kind != BOOL else 0
@@ -329,7 +483,7 @@ class Lowering:
             found.append(element)
         return found
 
-    def _gathered(self, storage: Storage, index: Index, column: int | None) -> ir.Value:
+    def _gathered(self, storage: Storage, index: Index) -> ir.Value:
         """Read at an index of each lane's own; where all are the same, at once."""
         index = [self.e.splat(i) for i in index]
         first = [self.b.extract_element(i, constant(ir.IntType(32), 0)) for i in index]
@@ -344,7 +498,7 @@ class Lowering:
             for lane in range(self.e.width):
                 number = constant(ir.IntType(32), lane)
                 own = [self.b.extract_element(i, number) for i in index]
-                place = self._place(storage, own, column)
+                place = self._place(storage, own)
                 if storage.lane_stride is not None:
                     step = self._product(storage.lane_stride, constant(I64, lane))
                     place = self.b.add(place, step)
@@ -353,7 +507,7 @@ class Lowering:
             return result
 
         def together() -> ir.Value:
-            return self.e.splat(self._load_column(storage, first, column))
+            return self.e.splat(self._read_number(storage, first))
 
         return self.either(self.e.any_lane(differ), one_by_one, together)
 
@@ -371,16 +525,16 @@ class Lowering:
             phi.add_incoming(value, block)
         return phi
 
-    def _place(self, storage: Storage, index: Index, column: int | None) -> ir.Value:
+    def _place(self, storage: Storage, index: Index) -> ir.Value:
         place = constant(I64, 0)
         for i, stride in zip(index, storage.strides, strict=True):
             place = self._sum(place, self._product(self.as_index(i), stride))
         if storage.first_lane is not None and not storage.begins:
             assert storage.lane_stride is not None
             place = self._sum(place, self._product(storage.first_lane, storage.lane_stride))
-        if column and storage.column_stride is not None:
-            step = self._product(storage.column_stride, constant(I64, column))
-            place = self._sum(place, step)
+        if storage.column_stride is not None:
+            assert self._column is not None
+            place = self.b.add(place, self._product(storage.column_stride, self._column))
         return place
 
     def _sum(self, first: ir.Value, second: ir.Value) -> ir.Value:
@@ -402,23 +556,23 @@ class Lowering:
             return value
         return self.b.icmp_unsigned("!=", value, self.e.number(value, 0))
 
-    def store(self, memory: Memory, index: Index, element: Element) -> None:
-        """Write one element."""
+    def store(self, memory: Memory, given: Sequence[tuple[Index, Element]]) -> None:
+        """Write elements."""
         storage = memory.storage
         assert storage.writable
-        if storage.column_stride is None:
-            if isinstance(element, tuple):
-                raise UnsupportedError("a tangent where none is expected")
-            self._store_column(storage, index, None, element)
+        if storage.column_stride is not None:
+            self._queue += [
+                (element, Tangent(storage.kind, READ, {}, (storage, *index)))
+                for index, element in given
+            ]
             return
-        for k in range(self.columns):
-            value = element[k] if isinstance(element, tuple) else element
-            self._store_column(storage, index, k, value)
+        for index, element in given:
+            if isinstance(element, Tangent):
+                raise UnsupportedError("a tangent where none is expected")
+            self._write_number(storage, index, element)
 
-    def _store_column(
-        self, storage: Storage, index: Index, column: int | None, value: ir.Value
-    ) -> None:
-        place = self._place(storage, index, column)
+    def _write_number(self, storage: Storage, index: Index, value: ir.Value) -> None:
+        place = self._place(storage, index)
         stored = storage.pointer.type.pointee
         if storage.kind == BOOL:
             value = self.b.zext(value, self.e.vector(stored) if is_vector(value) else stored)
@@ -435,6 +589,8 @@ class Lowering:
         """Write an array, or one row of it, if the memory's guard says so."""
         storage, first = memory.storage, constant(I64, 0)
         guard, own = storage.guard, storage.strides if number is None else storage.strides[1:]
+        if guard is not None:
+            self.settle()
         if storage.begins and number is not None:
             first = self._product(number, storage.strides[0])
         with nullcontext() if guard is None else self.b.if_then(guard):
@@ -456,18 +612,35 @@ class Lowering:
             if storage.begins:
                 self._scatter(storage, first, given)
                 return
+            places = []
             for place in np.ndindex(given.shape):
                 index = [constant(I64, i) for i in place]
-                self.store(memory, index if number is None else [number, *index], given[place])
+                places.append((index if number is None else [number, *index], given[place]))
+            self.store(memory, places)
+            if guard is not None:
+                self.settle()
 
     def _scatter(self, storage: Storage, first: ir.Value, given: Elements) -> None:
         """Write numbers of an output that lie side by side, from ``first``, in each lane's part."""
-        parts: list[ir.Value] = []
-        for element in given.ravel():
-            if storage.column_stride is None and isinstance(element, tuple):
+        elements = given.ravel().tolist()
+        if storage.column_stride is None:
+            if any(isinstance(e, Tangent) for e in elements):
                 raise UnsupportedError("a tangent where none is expected")
-            count = 1 if storage.column_stride is None else self.columns
-            parts += element if isinstance(element, tuple) else (element,) * count
+            self._lay_all(storage, first, elements)
+            return
+        parts: list[ir.Value] = []
+
+        def lay(value: ir.Value) -> None:
+            parts.append(value)
+            if len(parts) == len(elements):
+                assert self._column is not None
+                step = self._product(storage.column_stride, self._column)
+                self._lay_all(storage, self._sum(first, step), parts)
+
+        self.flushed([(e, lay) for e in elements])
+
+    def _lay_all(self, storage: Storage, first: ir.Value, parts: list[ir.Value]) -> None:
+        """Write numbers side by side in each lane's part."""
         stored, width = storage.pointer.type.pointee, self.e.width
         if storage.kind == BOOL:
             parts = [self.b.zext(p, self.e.vector(stored)) for p in map(self.e.splat, parts)]
@@ -513,8 +686,7 @@ class Lowering:
         Short rows of lanes that lie apart would be written number by number.
         """
         storage, shape = memory.storage, memory.shape[1:]
-        columns = 1 if storage.column_stride is None else self.columns
-        stored, size = storage.pointer.type.pointee, prod(shape) * columns
+        stored, size = storage.pointer.type.pointee, prod(shape)
         together = self._side_by_side(stored)
         rows = together // gcd(size, together)
         if storage.begins is None or rows == 1 or size > 2 * together:
@@ -522,11 +694,15 @@ class Lowering:
         width = self.e.width
         own = replace(
             storage,
-            pointer=self._allocate(stored, rows * size * width),
-            strides=self.row_major((rows, *shape), constant(I64, columns * width)),
+            pointer=self._allocate(
+                stored,
+                rows * size * width * (1 if storage.column_stride is None else MOST_COLUMNS),
+            ),
+            strides=self.row_major((rows, *shape), constant(I64, width)),
             lane_stride=constant(I64, 1),
-            column_stride=storage.column_stride and constant(I64, width),
+            column_stride=storage.column_stride and constant(I64, rows * size * width),
             begins=None,
+            guard=None,
         )
         return Memory(own, (rows, *shape))
 
@@ -535,9 +711,22 @@ class Lowering:
         storage, collected = memory.storage, rows.storage
         size = constant(I64, collected.strides[0].constant // self.e.width)
         into = self.b.gep(storage.pointer, [self._product(first, storage.strides[0])])
-        given = [into, storage.begins, collected.pointer, self._product(count, size)]
+        length, begins = self._product(count, size), storage.begins
+
+        def lay(into: ir.Value, rows: ir.Value) -> None:
+            self.b.call(self._laying(into.type), [into, begins, rows, length])
+
+        def of_column(number: ir.Value) -> None:
+            lay(
+                self.b.gep(into, [self._product(storage.column_stride, number)]),
+                self.b.gep(collected.pointer, [self._product(collected.column_stride, number)]),
+            )
+
         with nullcontext() if storage.guard is None else self.b.if_then(storage.guard):
-            self.b.call(self._laying(into.type), given)
+            if storage.column_stride is None:
+                lay(into, collected.pointer)
+            else:
+                self.count(constant(I64, 0), self.columns, 1, of_column)
 
     def _laying(self, kind: ir.Type) -> ir.Function:
         """Return the function that writes so many vectors side by side in each lane's part."""
@@ -599,7 +788,7 @@ class Lowering:
             raise UnsupportedError(f"an array of shape {shape} that is no output")
         count, stored = prod(shape), ir.IntType(8) if number == BOOL else number
         width = self.e.width if kind & OF_LANE else 1
-        total = count * width * (self.columns if kind & OF_COLUMN else 1)
+        total = count * width * (MOST_COLUMNS if kind & OF_COLUMN else 1)
         unit = constant(I64, width)
         storage = Storage(
             pointer=self._allocate(stored, total),
@@ -625,8 +814,7 @@ class Lowering:
         """Return an array as memory of this lowering's own, a copy of what lies elsewhere."""
         if not isinstance(value, np.ndarray):
             return self._copied(value, kind)
-        (first, *_) = parts_of(value.ravel())
-        memory = self.local(value.shape, base(first.type), kind | kind_of(value))
+        memory = self.local(value.shape, _type_in(value), kind | kind_of(value))
         self.store_rows(memory, None, value)
         return memory
 
@@ -637,10 +825,9 @@ class Lowering:
         def copy(index: Index) -> None:
             element = array_of([self.at(value, index)], ())
             if not copies:
-                (first, *_) = parts_of(element.ravel())
-                own = self.local(value.shape, base(first.type), kind | kind_of(element))
+                own = self.local(value.shape, _type_in(element), kind | kind_of(element))
                 copies.append(own)
-            self.store(copies[0], index, element[()])
+            self.store(copies[0], [(index, element[()])])
 
         self.for_each(value.shape, copy)
         return copies[0]
@@ -661,9 +848,11 @@ class Lowering:
         self, begin: ir.Value, end: ir.Value, step: int, body: Callable[[ir.Value], None]
     ) -> None:
         """Write a loop over numbers from one to before another."""
+        self.settle()
 
         def turn(carried: Sequence[ir.Value]) -> list[ir.Value]:
             body(carried[0])
+            self.settle()
             return [self.b.add(carried[0], constant(I64, step))]
 
         self.loop([begin], lambda carried: self.b.icmp_signed("<", carried[0], end), turn)
@@ -704,6 +893,17 @@ class Lowering:
         return self.e.select(self.b.icmp_signed(">", start, last), last, start)
 
 
+def _last_reads(jaxpr: Jaxpr) -> list[list[Any]]:
+    """Return for each equation which variables are read there for the last time."""
+    later = {var for var in jaxpr.outvars if not isinstance(var, Literal)}
+    found: list[list[Any]] = []
+    for eqn in reversed(jaxpr.eqns):
+        own = {var for var in eqn.invars if not isinstance(var, Literal)} - later
+        later |= own
+        found.append(list(own))
+    return found[::-1]
+
+
 def shape_of(var: Any) -> tuple[int, ...]:
     """Return the shape of a variable of a jaxpr."""
     return tuple(var.aval.shape)
@@ -712,6 +912,12 @@ def shape_of(var: Any) -> tuple[int, ...]:
 def dtype_of(var: Any) -> Any:
     """Return the type of a variable's numbers."""
     return var.aval.dtype
+
+
+def _type_in(elements: Elements) -> ir.Type:
+    """Return the type of an array's numbers."""
+    first = elements.ravel()[0]
+    return first.kind if isinstance(first, Tangent) else base(first.type)
 
 
 def _bytes(kind: ir.Type) -> int:
@@ -890,9 +1096,11 @@ def _dynamic_update_slice(lower: Lowering, _: JaxprEqn, operands: list[Value]) -
         raise UnsupportedError("a change in place at an index of each lane's own")
     if value.version != value.storage.version:
         raise UnsupportedError("an array that is changed after it was changed in place")
+    places = []
     for place in np.ndindex(update.shape):
         at = [lower._sum(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]
-        lower.store(value, at, update[place])
+        places.append((at, update[place]))
+    lower.store(value, places)
     value.storage.version += 1
     return Memory(value.storage, value.shape, value.storage.version)
 

@@ -27,6 +27,7 @@ import lanes.control  # noqa: F401 (fills in the rules of loops)
 from lanes.dependence import dependent
 from lanes.digest import UnknownError, digest_of
 from lanes.layout import Argument, Layout, Lengths, is_laid_by_loop
+from lanes.lowering import MOST_COLUMNS
 from lanes.machine import Code, keep_code_in, kept, object_code, register_bytes
 from lanes.values import UnsupportedError
 
@@ -46,7 +47,7 @@ FALLBACK = "/lanes/fallback"
 TASKS_A_CORE = 4
 """Pieces of work a core: their sizes differ."""
 WASTE = 0.15
-"""Share of lanes left empty from which blocks take several passes of columns."""
+"""Share of lanes left empty from which blocks take several turns of columns."""
 REPEATED = 2**27
 """bytes of arguments up to which they are laid out once for every pass."""
 ONE_BY_ONE = 64
@@ -55,6 +56,8 @@ IN_CACHE = 2**18
 """bytes that are laid out at a time."""
 MANY = 256
 """Lanes from which a block without columns is two vectors wide: one computes while one waits."""
+FORWARD = 3
+"""Columns that take as long as the values and the factors that columns share."""
 FEW = 512
 """Blocks without a loop that are computed sooner than another thread begins."""
 
@@ -69,19 +72,17 @@ class Run:
         The function's outputs, a pytree; leaves (lanes, \\*shape).
     columns
         Their derivatives along the Q tangents, leaves (lanes, \\*shape, Q). Those of an output
-        whose first axis is a loop's are left as they were laid, (lanes, passes, turns, \\*rest,
-        columns of a pass), the last pass filled up: `joined` lays them side by side. None for an
-        output that does not move, and if nothing moves.
+        whose first axis is a loop's are left as they were laid, (lanes, Q, turns, \\*rest): see
+        `joined`. None for an output that does not move, and if nothing moves.
     """
 
     values: Any
     columns: Any
 
 
-def joined(columns: NDArray[Any], count: int) -> NDArray[Any]:
-    """Return derivatives (lanes, passes, ..., columns of a pass) side by side, (lanes, ..., Q)."""
-    beside = np.moveaxis(columns, 1, -2)
-    return beside.reshape(*beside.shape[:-2], -1)[..., :count]
+def joined(columns: NDArray[Any]) -> NDArray[Any]:
+    """Return derivatives that lie one after the other, (lanes, Q, ...), side by side."""
+    return np.moveaxis(columns, 1, -1)
 
 
 Function: TypeAlias = Callable[[Any, Lengths], Any]
@@ -127,8 +128,6 @@ class Program:
         arrays. It must be traceable and forward-differentiable by jax.
     arguments
         Pytree of `Argument`, of the structure that ``function`` takes.
-    at_once
-        Columns computed in one pass over a block of lanes; with more, passes take turns.
     name
         For messages.
     made_of
@@ -143,7 +142,6 @@ class Program:
         function: Function,
         arguments: Any,
         *,
-        at_once: int = 2,
         name: str = "",
         made_of: Any = None,
         packages: tuple[str, ...] = (),
@@ -160,12 +158,11 @@ class Program:
         self.moving = tuple(number for number, a in enumerate(leaves) if a.moves)
         names = {length for a in leaves for length in a.shape if isinstance(length, str)}
         self.names = tuple(sorted(names))
-        self.columns = at_once if self.moving else 0
         self._kernels: dict[int, _Compiled | None] = {}
         self.key: str | None = None
         if made_of is not None:
             with suppress(UnknownError):
-                self.key = digest_of((made_of, arguments, self.columns), packages)
+                self.key = digest_of((made_of, arguments), packages)
 
     # what is computed
 
@@ -291,8 +288,7 @@ class Program:
         _, (shapes, _), stand_ins = self._traced
 
         def laid(leaf: Any, shape: Any) -> NDArray[Any]:
-            last = np.moveaxis(np.asarray(leaf), 0, -1)
-            return last[:, None] if is_laid_by_loop(shape, stand_ins) else last
+            return np.moveaxis(leaf, 0, 1 if is_laid_by_loop(shape, stand_ins) else -1)
 
         return Run(jax.tree.map(np.asarray, found), jax.tree.map(laid, columns, shapes))
 
@@ -352,7 +348,7 @@ class _Compiled:
             self.moved = known["moved"]
         self.code = Code(code, "run")
         void, whole = ctypes.c_void_p, ctypes.c_int64
-        self.function = ctypes.CFUNCTYPE(None, *[void] * 5, *[whole] * 5)(self.code.address)
+        self.function = ctypes.CFUNCTYPE(None, *[void] * 5, *[whole] * 6)(self.code.address)
 
     def _made(self) -> tuple[Any, list[jax.ShapeDtypeStruct], list[bool], bytes]:
         """Return what the program returns, which of it moves, and the object code."""
@@ -361,7 +357,7 @@ class _Compiled:
         outputs, structure = jax.tree.flatten(shapes)
         flags = [False] * len(program.arguments) + [True] * len(program.moving)
         moved = [bool(moves) for moves in dependent(closed.jaxpr, flags)]
-        layout = Layout(program.arguments, program.moving, program.columns, lengths, outputs, moved)
+        layout = Layout(program.arguments, program.moving, lengths, outputs, moved)
         began = time.perf_counter()
         code = object_code(layout.written(closed, self.width))
         spent = time.perf_counter() - began
@@ -389,25 +385,21 @@ class _Compiled:
         wanted: Any = None,
     ) -> Run:
         """Compute all lanes and columns."""
-        program, width, at_once = self.program, self.width, max(self.program.columns, 1)
-        columns = len(tangents[0]) if tangents else 0
-        passes = max(-(-columns // at_once), 1)
-        # Each lane takes one pass of columns over what is its own: few segments fill a block with
-        # several passes, many have a block for themselves and another one for each pass.
-        own_lanes = -(-lanes // width) * width
+        program, width = self.program, self.width
+        columns = len(tangents[0]) if tangents else 1
         tables = sum(
             leaf.nbytes
             for leaf, a in zip(leaves, program.arguments, strict=True)
             if a.lanes and not a.apart
         )
-        if passes > 1 and own_lanes - lanes > WASTE * lanes and tables * passes <= REPEATED:
-            own_lanes = lanes
-        total = own_lanes * passes
-        blocks = -(-total // width)
+        own_lanes, each, blocks = min(
+            (_laid(lanes, width, columns, each, tables) for each in range(1, MOST_COLUMNS + 1)),
+            key=lambda laid: (-(-laid[2] // _cores()) * (FORWARD + laid[1]), laid[2]),
+        )
         place = np.arange(blocks * width)
-        # lanes that fill a block up compute, and write, what others do
+        # lanes that fill a block up, and columns, compute and write what others do
         segment = np.minimum(place % own_lanes, lanes - 1)
-        turn = np.minimum(place // own_lanes, passes - 1)
+        turn = np.minimum(place // own_lanes * each, columns - each)
         own_blocks = min(lcm(own_lanes, width) // width, blocks)
         taken = segment[: own_blocks * width]
         given = [
@@ -417,10 +409,8 @@ class _Compiled:
             for leaf, a in zip(leaves, program.arguments, strict=True)
         ]
         for number, t in zip(program.moving, tangents, strict=True):
-            rows = np.zeros((passes * at_once, *t.shape[1:]), program.arguments[number].dtype)
-            rows[:columns] = t
-            by_pass = np.moveaxis(rows.reshape(passes, at_once, *t.shape[1:]), 0, -1)
-            given.append(np.ascontiguousarray(by_pass[..., turn]))
+            rows = t.astype(program.arguments[number].dtype)[turn + np.arange(each)[:, None]]
+            given.append(np.ascontiguousarray(np.moveaxis(rows, 1, -1)))
         sizes = {stand_in: lengths[name] for name, stand_in in self.lengths.items()}
         asked = (
             [True] * len(self.outputs) if wanted is None else self.structure.flatten_up_to(wanted)
@@ -432,7 +422,7 @@ class _Compiled:
                 continue
             own = tuple(sizes.get(n, n) for n in shape.shape)
             if moved:
-                own = (passes, *own, at_once)
+                own = (columns, *own)
             found.append(np.empty((lanes, *own), shape.dtype))
         ins, outs = _addresses(given), _addresses(found)
         values = (ctypes.c_int64 * max(len(self.lengths), 1))(
@@ -449,7 +439,8 @@ class _Compiled:
                 turn.ctypes.data,
                 len(place),
                 own_blocks,
-                passes,
+                columns,
+                each,
                 *task,
             )
 
@@ -469,7 +460,7 @@ class _Compiled:
             if not moved or array is None
             else array
             if is_laid_by_loop(shape, self.lengths)
-            else joined(array, columns)
+            else joined(array)
             for array, moved, shape in zip(
                 found[half:], self.moved[half:], self.outputs[half:], strict=True
             )
@@ -477,6 +468,20 @@ class _Compiled:
         return Run(
             jax.tree.unflatten(structure, found[:half]), jax.tree.unflatten(structure, by_column)
         )
+
+
+def _laid(lanes: int, width: int, columns: int, each: int, tables: int) -> tuple[int, int, int]:
+    """Return after how many lanes the next columns begin, how many a block takes, and its number.
+
+    Each lane takes some columns over what is its own: few segments fill a block with several turns
+    of columns, many have a block for themselves and another one for each turn.
+    """
+    each = min(each, columns)
+    turns = -(-columns // each)
+    own = -(-lanes // width) * width
+    if turns > 1 and own - lanes > WASTE * lanes and tables * turns <= REPEATED:
+        own = lanes
+    return own, each, -(-own * turns // width)
 
 
 def _side_by_side(leaf: NDArray[Any], taken: NDArray[np.intp], lanes: int) -> NDArray[Any]:

@@ -1,8 +1,8 @@
 """What a variable of a jaxpr is while it is lowered: elements in registers, or an array elsewhere.
 
 An array of a few numbers is a NumPy array of `Element`. An element is an LLVM value, scalar if all
-lanes share it and a vector if each has its own, or a tuple of them: one for each column, where it
-is a tangent. Reshaping, slicing or stacking such arrays costs no instruction.
+lanes share it and a vector if each has its own, or a `Tangent`. Reshaping, slicing or stacking such
+arrays costs no instruction.
 
 Longer arrays, and those whose length is an argument, are read element by element: `Memory` holds
 them, `Deferred` computes each when it is read.
@@ -10,9 +10,10 @@ them, `Deferred` computes each when it is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import reduce
+from itertools import count
 from operator import or_
 from typing import Any, TypeAlias
 
@@ -21,7 +22,7 @@ from llvmlite import ir
 from numpy.typing import NDArray
 
 Element: TypeAlias = Any
-"""An `ir.Value`, or a tuple of one a column."""
+"""An `ir.Value` or a `Tangent`."""
 Elements: TypeAlias = NDArray[np.object_]
 Index: TypeAlias = Sequence[ir.Value]
 
@@ -53,8 +54,8 @@ OF_LANE, OF_COLUMN = 1, 2
 
 
 def parts_of(elements: Iterable[Element]) -> list[ir.Value]:
-    """Return the LLVM values that elements consist of."""
-    return [x for e in elements for x in (e if isinstance(e, tuple) else (e,))]
+    """Return the elements that are LLVM values."""
+    return [e for e in elements if not isinstance(e, Tangent)]
 
 
 def kind_of(value: Value) -> int:
@@ -66,9 +67,36 @@ def kind_of(value: Value) -> int:
         return reduce(or_, map(kind_of, value.sources), 0)
     else:
         elements = value.ravel().tolist()
-        by_lane = any(map(is_vector, parts_of(elements)))
-        by_column = any(isinstance(e, tuple) for e in elements)
+        by_column = any(isinstance(e, Tangent) for e in elements)
+        by_lane = by_column or any(map(is_vector, parts_of(elements)))
     return OF_LANE * by_lane | OF_COLUMN * by_column
+
+
+@dataclass(eq=False)
+class Tangent:
+    """One number of a tangent: how each column of it is computed.
+
+    A block of lanes takes its columns one after the other: a loop over them computes many numbers
+    at once, where some are needed. Until then they are as here.
+    """
+
+    kind: ir.Type
+    """Of one lane's number in one column."""
+    name: str
+    """A primitive; `READ` reads memory."""
+    params: Mapping[str, Any]
+    operands: tuple[Element, ...]
+    number: int = field(default_factory=count().__next__)
+    """Of those that were written down before."""
+
+    @property
+    def is_read(self) -> bool:
+        """Whether it lies in memory."""
+        return self.name == READ
+
+
+READ = "read"
+"""The name of what lies in memory: its operands are a storage and an index."""
 
 
 @dataclass(eq=False)

@@ -60,20 +60,20 @@ def given(count, rows, seed=2):
     return values, [random.normal(size=5), random.normal(size=(5, 3))]
 
 
-def flat(run, columns=5):
+def flat(run):
     """Return all arrays of a run, columns side by side."""
     (rows, _), (moved_rows, moved) = run.values, run.columns
     return [
         *jax.tree.leaves(rows),
         run.values[1],
-        *(joined(moved_rows[name], columns) for name in ("state", "twice")),
+        *(joined(moved_rows[name]) for name in ("state", "twice")),
         moved,
     ]
 
 
 @pytest.fixture(scope="module")
 def program():
-    return Program(filtered, ARGUMENTS, at_once=2)
+    return Program(filtered, ARGUMENTS)
 
 
 @pytest.mark.parametrize(("count", "turns"), [(1, 7), (3, 20), (8, 1), (19, 33), (64, 2)])
@@ -109,7 +109,7 @@ def test_values_beside_derivatives_are_summed_up_in_the_order_that_is_written():
 
 @pytest.mark.parametrize("count", [1, 3, 4, 9])
 def test_lanes_that_lie_apart_are_read_as_those_that_lie_beside_each_other(count):
-    """By whole rows, by single numbers and by vectors of them; passes take turns with lanes."""
+    """By whole rows, by single numbers and by vectors of them; columns take turns with lanes."""
 
     def summed(given, lengths):
         table, gain = given["table"], given["gain"]

@@ -51,8 +51,6 @@ GATE = 4.0
 """Standard deviations beyond which an innovation corrects no further: an outlier."""
 WIDER = 4.0
 """Times, each innovation in a row that lies beyond."""
-AT_ONCE = 4
-"""Columns of derivatives in one pass over a block of segments."""
 WIDEST = 5
 """In a row beyond which the gate grows no further."""
 
@@ -180,7 +178,7 @@ def innovations(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
     """Return whitened innovations (T, m, F) with given gains, and derivatives; None for none.
 
-    Those are left as they were laid, (F, passes, T, m, columns of a pass): see `lanes.Run`.
+    Those are left as they were laid, (F, Q, T, m): see `lanes.Run`.
 
     Parameters
     ----------
@@ -265,7 +263,6 @@ def _run(
         arguments,
         *static,
         name=kind,
-        at_once=AT_ONCE,
         made_of=(kind, static, moves, total.TERMS),
         packages=CODE,
     )

@@ -402,7 +402,7 @@ class Predictor:
             residuals = gathered(errors, feed.widths, self.rows)
             if laid is not None:
                 for name, segment, part in taken_from(laid, feed.widths, self.rows):
-                    columns[name][segment][..., some] = joined(part[None], len(some))[0]
+                    columns[name][segment][..., some] = joined(part[None])[0]
         return Jacobian(
             residuals,
             {name: np.moveaxis(part, (-1, 0), (0, -1)) for name, part in columns.items()},

@@ -175,12 +175,12 @@ def gathered(
 def taken_from(
     laid: NDArray[np.float32], widths: Mapping[str, int], rows: Mapping[str, NDArray[np.intp]]
 ) -> Iterator[tuple[str, int, NDArray[np.float32]]]:
-    """Return channel, segment and the samples' (passes, n, k, columns) of derivatives on ticks.
+    """Return channel, segment and the samples' (Q, n, k) of derivatives on ticks.
 
     Parameters
     ----------
     laid
-        (F, passes, T, m, columns), the channels' rows one channel after the other.
+        (F, Q, T, m), the channels' rows one channel after the other.
     widths, rows
         As of `gathered`.
     """

@@ -99,7 +99,7 @@ def residuals(flown: Flown, segments: Segments, name: str, reading: Reading) -> 
     most = int(used.sum(axis=1).max(initial=0))
     order = np.argsort(~used, axis=1, kind="stable")[:, :most]
     log, moved_log = _Series(flown.channels[name]), flown.columns[name]
-    columns = None if moved_log is None else _Series(moved_log, by_pass=True)
+    columns = None if moved_log is None else _Series(moved_log, moved=True)
     together = max(BLOCK // max(most, 1), 1)
     for first in range(0, len(time), together):
         some = slice(first, first + together)
@@ -132,7 +132,7 @@ def _compared(
     before = reading.columns if reading.coefficients is None else reading.coefficients
     after = before + reading.total - reading.columns
     if columns is not None:
-        moved = joined(place.read(columns), reading.columns)
+        moved = joined(place.read(columns))
         by_column[..., :before] = moved[..., :before]
         by_column[..., after:] = moved[..., before:]
     if reading.coefficients is not None:
@@ -195,22 +195,22 @@ def _risen(share: Array) -> Array:
 
 
 class _Series:
-    """A log (F, samples, *rest), or (F, passes, samples, *rest), read at fractional sample numbers.
+    """A log (F, samples, *rest), or (F, Q, samples, *rest), read at fractional sample numbers.
 
-    These are (G, m), and what is read is (G, m, *rest), or (G, passes, m, *rest).
+    These are (G, m), and what is read is (G, m, *rest), or (G, Q, m, *rest).
     """
 
-    def __init__(self, rows: Array, *, by_pass: bool = False) -> None:
-        self.passes = rows.shape[1] if by_pass else None
-        self.samples, *self.rest = rows.shape[2 if by_pass else 1 :]
+    def __init__(self, rows: Array, *, moved: bool = False) -> None:
+        self.columns = rows.shape[1] if moved else None
+        self.samples, *self.rest = rows.shape[2 if moved else 1 :]
         self.flat = rows.reshape(-1, int(np.prod(self.rest)))
 
     def below(self, place: Array) -> NDArray[np.intp]:
         return np.clip(np.floor(place + 1e-6).astype(np.intp), 0, self.samples - 2)
 
     def at(self, segments: NDArray[np.intp], number: NDArray[np.intp]) -> Array:
-        if self.passes is not None:
-            segments = segments[:, None] * self.passes + np.arange(self.passes)[:, None]
+        if self.columns is not None:
+            segments = segments[:, None] * self.columns + np.arange(self.columns)[:, None]
             number = number[:, None]
         row = segments * self.samples + number
         rows: Array = np.take(self.flat, row.ravel(), axis=0)
@@ -226,7 +226,7 @@ class _Series:
         below = self.below(place)
         first, second = self.at(segments, below), self.at(segments, below + 1)
         share = share_of(place - below)
-        if self.passes is not None:
+        if self.columns is not None:
             share = share[:, None]
         second -= first
         second *= share.reshape(*share.shape, *[1] * (second.ndim - share.ndim))
@@ -263,7 +263,6 @@ def _rotation_program() -> Program:
     return Program(
         error,
         (either, replace(either, moves=True)),
-        at_once=4,
         name="attitude error",
         made_of=(),
         packages=CODE,

@@ -56,9 +56,6 @@ LOGGED = (
     *(MOTION, TURNED, SPEEDS, SETPOINTS),
 )
 """What every program without derivatives logs; what nobody asks for is not written."""
-AT_ONCE = 2
-"""Columns of derivatives in one pass over a block of segments: with more, code leaves the
-instruction cache and takes longer to build."""
 EFFECTS = tuple(name for name, row in COEFFICIENTS.items() if row.is_effect)
 TERMS = tuple(name for name in EFFECTS if COEFFICIENTS[name].group)
 """Coefficients beyond the base model, and those of them that a fit may add."""
@@ -74,7 +71,7 @@ class Flown(NamedTuple):
     channels
         Channel -> (F, samples, c).
     columns
-        Channel -> (F, passes, samples, c, columns of a pass) derivatives, as of a `lanes.Run`; None
+        Channel -> (F, Q, samples, c) derivatives, as of a `lanes.Run`; None
         where nothing moves.
     crash_time
         (F,) s, infinite for a segment that flew.
@@ -164,7 +161,6 @@ def fly(
         _flight,
         arguments,
         *static,
-        at_once=AT_ONCE,
         name="flight of a segment",
         made_of=(static, moves, total.TERMS),
         packages=CODE,

@@ -1,0 +1,336 @@
+"""Tangents as sums of others times factors that all columns share, in as few terms as can be.
+
+Derivatives are linear: what a column computes is a graph of sums, from tangents in memory
+to those that are asked for. A node of it whose own terms, put in where it is read, are no more than
+what is saved is eliminated (vertex elimination; Griewank and Walther, Evaluating Derivatives, ch.
+9); products of factors are then computed once, for all columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+from llvmlite import ir
+
+from lanes.rules import constant
+from lanes.values import Element, Tangent
+
+_Made: TypeAlias = "_Product | _Sum | _Choice | _Inverse"
+Factor: TypeAlias = "float | ir.Value | _Made"
+SHARED = 0.1
+"""What an operation on factors costs, of one that each column needs."""
+
+
+@dataclass(eq=False)
+class _Product:
+    first: Any
+    second: Any
+
+
+@dataclass(eq=False)
+class _Sum:
+    first: Any
+    second: Any
+
+
+@dataclass(eq=False)
+class _Inverse:
+    of: Any
+
+
+@dataclass(eq=False)
+class _Choice:
+    which: ir.Value
+    first: Any
+    second: Any
+
+
+def _times(x: Factor, y: Factor) -> Factor:
+    if isinstance(x, float) and isinstance(y, float):
+        return x * y
+    if isinstance(y, float):
+        x, y = y, x
+    if isinstance(x, float):
+        if x == 1.0:
+            return y
+        if isinstance(y, _Product) and isinstance(y.first, float):
+            return _times(x * y.first, y.second)
+    return _Product(x, y)
+
+
+def _plus(x: Factor, y: Factor) -> Factor:
+    if isinstance(x, float) and isinstance(y, float):
+        return x + y
+    return _Sum(x, y)
+
+
+_SIGNS: Mapping[str, Sequence[float]] = {
+    "add": (1.0, 1.0),
+    "add_any": (1.0, 1.0),
+    "sub": (1.0, -1.0),
+    "neg": (-1.0,),
+    "copy": (1.0,),
+}
+"""Primitive -> the signs of its operands, where it is a sum."""
+
+
+def _is_sign(factor: Factor) -> bool:
+    return isinstance(factor, float) and abs(factor) == 1.0
+
+
+@dataclass(eq=False)
+class Node:
+    """A number of a tangent: a sum, or what else a primitive makes of others.
+
+    Attributes
+    ----------
+    of
+        The tangent, or an LLVM value that all columns share.
+    terms
+        Of a sum: node -> factor. None for what is no sum.
+    operands
+        Of what is no sum.
+    readers
+        The nodes that it is read by.
+    kept
+        Whether it is not eliminated.
+    """
+
+    of: Any
+    terms: dict[Node, Factor] | None = None
+    operands: tuple[Any, ...] = ()
+    readers: dict[Node, None] = field(default_factory=dict)
+    kept: bool = False
+
+    @property
+    def kind(self) -> ir.Type:
+        """The type of one lane's number."""
+        return self.of.kind if isinstance(self.of, Tangent) else self.of.type
+
+    @property
+    def sum(self) -> dict[Node, Factor]:
+        """The terms of what is a sum."""
+        assert self.terms is not None
+        return self.terms
+
+
+def _cost(terms: Mapping[Node, Factor]) -> int:
+    """Return in how many operations terms are summed: a product and a sum are one."""
+    return max(len(terms) - any(map(_is_sign, terms.values())), 0)
+
+
+def _number(value: ir.Value) -> Factor:
+    """Return a factor, as a number where it is a constant."""
+    if isinstance(value, ir.Constant):
+        given: Any = value.constant
+        each = given if isinstance(given, list | tuple) else [given]
+        numbers: set[Any] = {getattr(x, "constant", x) for x in each}
+        if len(numbers) == 1 and isinstance(number := numbers.pop(), int | float):
+            return float(number)
+    return value
+
+
+class Graph:
+    """What a column computes.
+
+    Parameters
+    ----------
+    outs
+        What is asked for.
+    """
+
+    def __init__(self, outs: Sequence[Element]) -> None:
+        needed: dict[int, Tangent] = {}
+        left = [x for x in outs if isinstance(x, Tangent)]
+        while left:
+            tangent = left.pop()
+            if tangent.number not in needed:
+                needed[tangent.number] = tangent
+                left += [x for x in tangent.operands if isinstance(x, Tangent)]
+        self.nodes: list[Node] = []
+        self._plain: dict[int, Node] = {}
+        self._known: dict[Any, Node] = {}
+        self._found: dict[int, Node] = {}
+        for number in sorted(needed):
+            self._found[number] = self._node(needed[number])
+        self.outs = [self._of(x) for x in outs]
+        for node in self.outs:
+            node.kept = True
+        self._eliminate()
+
+    def _of(self, x: Element) -> Node:
+        if isinstance(x, Tangent):
+            return self._found[x.number]
+        if id(x) not in self._plain:
+            self._plain[id(x)] = Node(x, kept=True)
+            self.nodes.append(self._plain[id(x)])
+        return self._plain[id(x)]
+
+    def _node(self, tangent: Tangent) -> Node:
+        given = self._terms(tangent)
+        if given is None:
+            operands = tuple(self._of(x) if isinstance(x, Tangent) else x for x in tangent.operands)
+            key: Any = (tangent.name, *map(id, operands))
+            if key in self._known and (tangent.is_read or not tangent.params):
+                return self._known[key]
+            node = Node(tangent, None, operands, kept=True)
+            self._known[key] = node
+            for operand in operands:
+                if isinstance(operand, Node):
+                    operand.readers[node] = None
+        else:
+            terms: dict[Node, Factor] = {}
+            for x, factor in given:
+                if isinstance(x, ir.Value) and _number(x) == 0.0:
+                    continue
+                node = x if isinstance(x, Node) else self._of(x)
+                if node.terms != {}:
+                    _add(terms, node, factor)
+            if len(terms) == 1 and 1.0 in terms.values():
+                return next(iter(terms))
+            key = (
+                "sum",
+                *sorted((id(n), f if isinstance(f, float) else id(f)) for n, f in terms.items()),
+            )
+            if key in self._known:
+                return self._known[key]
+            node = Node(tangent, terms)
+            self._known[key] = node
+            for operand in terms:
+                operand.readers[node] = None
+        self.nodes.append(node)
+        return node
+
+    def _terms(self, tangent: Tangent) -> Sequence[tuple[Any, Factor]] | None:
+        """Return what a tangent is the sum of."""
+        name, operands = tangent.name, tangent.operands
+        moving = [isinstance(x, Tangent) for x in operands]
+        found: Sequence[tuple[Any, Factor]] | None = None
+        if name == "select_n" and moving == [False, True, True]:
+            found = self._chosen(*operands)
+        elif name in _SIGNS:
+            found = list(zip(operands, _SIGNS[name], strict=True))
+        elif name == "convert_element_type" and operands[0].kind == tangent.kind:
+            found = [(operands[0], 1.0)]
+        elif name == "mul" and not all(moving):
+            x, y = operands if moving[0] else reversed(operands)
+            found = [(x, _number(y))]
+        elif name == "div" and not moving[1]:
+            by = _number(operands[1])
+            found = [(operands[0], 1.0 / by if isinstance(by, float) and by else _Inverse(by))]
+        return found
+
+    def _chosen(self, which: ir.Value, *either: Tangent) -> Sequence[tuple[Any, Factor]] | None:
+        """Return a choice between multiples of one number as that number times a chosen factor.
+
+        One between others stays a choice: what is not chosen may be no number.
+        """
+        parts: list[tuple[Node, Factor]] = []
+        for node in map(self._of, either):
+            single = node.terms is not None and len(node.terms) == 1
+            parts += node.sum.items() if single else [(node, 1.0)]
+        (of, factor), (other, own) = parts
+        return [(of, _Choice(which, factor, own))] if of is other else None
+
+    def _eliminate(self) -> None:
+        """Eliminate nodes, alone and together with those that the same nodes read."""
+        changed = True
+        while changed:
+            changed = False
+            for node in reversed(self.nodes):
+                changed |= self._put_in([node])
+            together: dict[frozenset[Node], list[Node]] = {}
+            for node in self.nodes:
+                together.setdefault(frozenset(node.readers), []).append(node)
+            for nodes in together.values():
+                if len(nodes) > 1:
+                    changed |= self._put_in(nodes)
+        self.nodes = [n for n in self.nodes if n.kept or n.terms is None or n.readers]
+        self._order()
+
+    def _order(self) -> None:
+        """Put what is known late last in its sums."""
+        known: dict[Node, int] = {}
+        for node in self.nodes:
+            if node.terms is None:
+                given = [known[x] for x in node.operands if isinstance(x, Node)]
+                known[node] = max(given, default=-1) + 1
+                continue
+            ready = 0
+            rows = sorted(node.terms.items(), key=lambda row: (known[row[0]], row[1] != 1.0))
+            for operand, _ in rows:
+                ready = max(ready, known[operand]) + 1
+            node.terms, known[node] = dict(rows), ready
+
+    def _put_in(self, nodes: Sequence[Node]) -> bool:
+        """Put nodes' terms in where they are read, if that saves something."""
+        nodes = [
+            n
+            for n in nodes
+            if n.terms and n.readers and not n.kept and all(r.terms is not None for r in n.readers)
+        ]
+        own = set(nodes)
+        readers = {
+            reader: dict(reader.sum) for n in nodes for reader in n.readers if reader not in own
+        }
+        if not readers or any(own & set(n.readers) for n in nodes):
+            return False
+        change, shared = -sum(_cost(n.sum) for n in nodes), 0
+        for reader, terms in readers.items():
+            for node in nodes:
+                if node not in terms:
+                    continue
+                factor = terms.pop(node)
+                for operand, each in node.sum.items():
+                    shared += (not _is_sign(each) and not _is_sign(factor)) + (operand in terms)
+                    _add(terms, operand, _times(factor, each))
+            change += _cost(terms) - _cost(reader.sum)
+        if change + SHARED * shared > 0:
+            return False
+        for node in nodes:
+            for operand in node.sum:
+                operand.readers.pop(node)
+            node.terms, node.readers = {}, {}
+        for reader, terms in readers.items():
+            for operand in reader.sum:
+                operand.readers.pop(reader, None)
+            reader.terms = terms
+            for operand in terms:
+                operand.readers[reader] = None
+        return True
+
+
+def _add(terms: dict[Node, Factor], node: Node, factor: Factor) -> None:
+    total = _plus(terms[node], factor) if node in terms else factor
+    if isinstance(total, float) and total == 0.0:
+        terms.pop(node, None)
+    else:
+        terms[node] = total
+
+
+class Factors:
+    """Writes factors down before the columns are computed, each once."""
+
+    def __init__(self, apply: Callable[..., ir.Value]) -> None:
+        self._apply = apply
+        self._known: dict[int, ir.Value] = {}
+
+    def of(self, factor: Factor, kind: ir.Type) -> ir.Value:
+        """Return a factor's value."""
+        if isinstance(factor, float):
+            return constant(kind, factor)
+        if isinstance(factor, ir.Value):
+            return factor
+        if id(factor) not in self._known:
+            self._known[id(factor)] = self._made(factor, kind)
+        return self._known[id(factor)]
+
+    def _made(self, factor: _Made, kind: ir.Type) -> ir.Value:
+        if isinstance(factor, _Inverse):
+            return self._apply("div", {}, constant(kind, 1.0), self.of(factor.of, kind))
+        either = self.of(factor.first, kind), self.of(factor.second, kind)
+        if isinstance(factor, _Choice):
+            return self._apply("select_n", {}, factor.which, *either)
+        return self._apply("mul" if isinstance(factor, _Product) else "add", {}, *either)
