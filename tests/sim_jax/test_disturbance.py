@@ -56,6 +56,26 @@ def test_a_moment_turns_by_eulers_law_and_thrust_acts_along_the_bodys_axis() -> 
     assert float(gained) == pytest.approx(0.4 / float(vehicle().body.mass) * SECONDS, rel=1e-9)
 
 
+def test_two_disturbances_together_are_the_sum_of_each_part() -> None:
+    one = Disturbance(gust=series(1, 2, 3), thrust=jnp.full(TICKS, 0.4), rate=50.0)
+    two = Disturbance(
+        gust=series(4, 5, 6),
+        force=series(1, 0, 2),
+        thrust=jnp.full(TICKS, 0.5),
+        moment=series(7, 8, 9),
+    )
+    both = Disturbance(
+        gust=series(5, 7, 9),
+        force=series(1, 0, 2),
+        thrust=jnp.full(TICKS, 0.9),
+        moment=series(7, 8, 9),
+        rate=50.0,
+    )
+    assert apart(one.plus(two), both) < 1e-15
+    assert one.plus(two).rate == both.rate
+    assert apart(replace(two, rate=50.0).plus(one), both) < 1e-15
+
+
 @eqx.filter_jit
 def flown(around: Environment) -> Rollout:
     craft = vehicle()

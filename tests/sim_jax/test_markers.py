@@ -55,6 +55,7 @@ def test_a_start_is_where_the_markers_say():
     start = markers.start(seen, None, jnp.zeros(())).motion
     np.testing.assert_allclose(start.position.stacked(), motion().position.stacked(), atol=1e-14)
     np.testing.assert_allclose(start.attitude.stacked(), motion().attitude.stacked(), atol=1e-14)
+    np.testing.assert_array_equal(start.velocity.stacked(), motion().velocity.stacked())
     rests = markers.start(seen, jnp.asarray(True), jnp.zeros(())).motion.attitude
     assert float(rests.z_axis().z) == 1.0
 

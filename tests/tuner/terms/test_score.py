@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.terms.linearisation import Linear, lost_by_sections
-from tuner.terms.score import Score, _Gain, row_of, score, surviving
+from tuner.terms.score import Score, _Gain, chance_of_gusts, row_of, score, surviving
 from tuner.vehicle.selection_table import SelectionCode
 
 MODEL, FIRST, SECOND, COPY = (np.array([i]) for i in range(4))
@@ -303,6 +303,14 @@ def by_flight(linear, column):
             [np.tile(np.arange(len(others)), (len(linear.flight), 1)), 3 + linear.flight]
         ),
     )
+
+
+def test_flights_that_differ_by_noise_alone_are_as_likely_as_is_said():
+    begin, group = np.zeros(3 + FLIGHTS), np.arange(3, 3 + FLIGHTS)
+    fits = (by_flight(linear_fit(0.0, seed=seed), 1) for seed in range(200))
+    chances = np.array([chance_of_gusts(fit, MODEL, group, begin) for fit in fits])
+    for level in (0.1, 0.2, 0.5):
+        assert np.mean(chances < level) == pytest.approx(level, abs=0.07)
 
 
 def dense(linear):
