@@ -43,7 +43,7 @@ def motion():
 
 def test_a_start_is_where_the_markers_say():
     markers = Markers(
-        Vec3.of(jnp.asarray([0.01, 0.02, 0.03])), rotation(Vec3.of(jnp.ones(3) * 0.02))
+        Vec3.of(jnp.asarray([0.03, -0.02, 0.01])), rotation(Vec3.of(jnp.ones(3) * 0.02))
     )
     position, attitude = markers.recorded(motion())
     seen = Start(

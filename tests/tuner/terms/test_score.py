@@ -313,6 +313,15 @@ def test_flights_that_differ_by_noise_alone_are_as_likely_as_is_said():
         assert np.mean(chances < level) == pytest.approx(level, abs=0.07)
 
 
+def test_longer_stretches_are_as_long_as_asked_and_say_the_same_together():
+    linear = linear_fit(0.5)
+    longer = linear.stretches(FIRST, np.zeros(4), 8.0)
+    assert longer.score.shape == (3 * FLIGHTS, 1)  # of twelve times two seconds
+    np.testing.assert_allclose(longer.score.sum(axis=0), linear.score.sum(axis=0)[FIRST])
+    whole = linear.information()[np.ix_(FIRST, FIRST)]
+    np.testing.assert_allclose(longer.information.sum(axis=0), whole)
+
+
 def dense(linear):
     """Return the same loss where every stretch sees every column, most of them for nothing."""
     count, wide = len(linear.flight), len(linear.scaled)
