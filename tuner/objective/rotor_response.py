@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from lanes import Argument, program_of
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Array
+from tuner.objective.simulation import CODE
 
 
 @dataclass(frozen=True)
@@ -54,22 +57,26 @@ def rotor_speeds(command: Array, step: float, motor: Motor, lags: Lags) -> Array
     total = np.column_stack([np.interp(late, time, column) for column in held.T])
     total += np.minimum(late, 0.0)[:, None] * command[0]
     mean = np.diff(total, axis=0) / step
-    return np.asarray(_followed(mean, motor, lags.up, lags.down, step))
-
-
-@jax.jit
-def _followed(command: Array, motor: Motor, up: float, down: float, step: float) -> jax.Array:
     lagging = eqx.tree_at(
-        lambda m: (m.time_constant_up, m.time_constant_down),
-        motor,
-        (jnp.asarray(up), jnp.asarray(down)),
+        lambda m: (m.time_constant_up, m.time_constant_down), motor, (lags.up, lags.down)
     )
-    lag = Lag.over(lagging, step)
-    asked = jax.vmap(lambda row: reference_speed(motor, row))(jnp.asarray(command))
+    given = (jax.tree.map(np.asarray, (lagging, float(step))), mean)
+    arguments = (
+        jax.tree.map(partial(Argument.of, lanes=False), given[0]),
+        Argument(("turns",), float, lanes=True),
+    )
+    program = program_of(_followed, arguments, name="rotor speeds", made_of=Lag, packages=CODE)
+    begun, speeds = program(given, lanes=mean.shape[1], turns=len(mean)).values
+    return np.column_stack([begun, speeds]).T
 
-    def advance(speed: Any, reference: Any) -> tuple[Any, Any]:
-        after, _ = lag.advance(speed, reference)
+
+def _followed(given: Any, _: Mapping[str, int]) -> tuple[jax.Array, jax.Array]:
+    """Return the speed that one rotor's first command asks for, and (turns,) those that follow."""
+    (motor, step), command = given
+    lag, begun = Lag.over(motor, step), reference_speed(motor, command[0])
+
+    def advance(speed: Any, command: Any) -> tuple[Any, Any]:
+        after, _ = lag.advance(speed, reference_speed(motor, command))
         return after, after
 
-    speeds: jax.Array = jax.lax.scan(advance, asked[0], asked)[1]
-    return jnp.concatenate([asked[:1], speeds])
+    return begun, jax.lax.scan(advance, begun, command)[1]
