@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from tuner.config import JobFile, Settings
@@ -54,10 +55,13 @@ from tuner.vehicle import (
 
 STAGES = slice(-3, None)
 """Of the search: whole flights, then the polish in the weights that what is missing leaves."""
+POLISH = -2
+"""Of the search: the stage from which it goes on where moments of inertia have to stay."""
+MOMENTS = frozenset(name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia")
 LEFT = 1e-4
 """Share of the loss that may be left to gain: half as much of how far off the flights are. With a
-hundredth a laboratory's attitude would be missed by 6.1 degrees instead of 3.6: steps in the long
-valley that a lacking model leaves gain half of that each."""
+hundredth a moment constant ends a quarter off: steps in the long valley that a lacking model leaves
+gain half of that each."""
 LAWS = "other laws"
 """What a simulator lacks that no coefficient says."""
 FOLDER = "effective"
@@ -183,54 +187,71 @@ def fitted_in(
     """Return a simulator's vehicle fitted to a run's flights, and whether the fit converged.
 
     What was known of its coefficients beforehand is about the vehicle, not about a simulator that
-    lacks terms: each is held weakly at its start.
+    lacks terms: each is held weakly at its start. Where the moments of inertia end as no rigid
+    body's, they stay as they began, and the others go on from where they ended.
     """
     settings, recordings = recorded
     begins = run.vehicle if simulator.start is None else simulator.start(run.vehicle)
     start = simulator.flown(begins)
-    movable = free_in(run, simulator, start)
-    without_inertia = [name for name in movable if COEFFICIENTS[name].place[0] != "inertia"]
+    free = free_in(run, simulator, start)
+    if not free:
+        return start, True
     conditions = {n for flight in run.result.flights for n in flight.conditions if n not in lost}
-    for free in filter(None, (movable, without_inertia)):
-        job = JobFile(
-            free=tuple(free),
-            ties=tuple(t for t in simulator.ties or settings.job.ties if set(t) <= set(free)),
-            terms=tuple(sorted(conditions)) or "none",
-            disturbances="none",
-            coefficients=_bounds(run, start, free),
-            channels=settings.job.channels,
-            weights=settings.job.weights,
-            flights=settings.job.flights,
-            search=settings.job.search.replace(method="gradient", starts=1),
-            holdout=tuple(r.flight.name for r in recordings if r.holdout),
+    job = JobFile(
+        free=tuple(free),
+        ties=tuple(t for t in simulator.ties or settings.job.ties if set(t) <= set(free)),
+        terms=tuple(sorted(conditions)) or "none",
+        disturbances="none",
+        coefficients=_bounds(run, start, free),
+        channels=settings.job.channels,
+        weights=settings.job.weights,
+        flights=settings.job.flights,
+        search=settings.job.search.replace(method="gradient", starts=1),
+        holdout=tuple(r.flight.name for r in recordings if r.holdout),
+    )
+    problem = job_of(replace(settings, vehicle=start, job=job, bench=None), recordings)
+    stages = stages_of(problem, problem.objective)
+    stages = tuple(
+        replace(
+            stage,
+            name=f"for {simulator.title}, {stage.name}",
+            tolerance=max(stage.tolerance, LEFT),
+            rough=True,
         )
-        problem = job_of(replace(settings, vehicle=start, job=job, bench=None), recordings)
-        stages = stages_of(problem, problem.objective)
-        begun = _as_it_ended(run, problem, lost)
-        progress = grow(
+        for stage in (stages[STAGES] if simulator.start is None else stages)
+    )
+    space, begun = problem.space, _as_it_ended(run, problem, lost)
+
+    def ended(progress: Progress, moves: NDArray[np.bool_]) -> Progress:
+        none = np.zeros(begun.points.offsets.shape[1:], bool)
+        return grow(
             problem.objective,
-            tuple(
-                replace(
-                    stage,
-                    name=f"for {simulator.title}, {stage.name}",
-                    tolerance=max(stage.tolerance, LEFT),
-                    rough=True,
-                )
-                for stage in (stages[STAGES] if simulator.start is None else stages)
-            ),
-            begun,
-            free=Free(
-                np.ones(len(problem.space), bool), np.zeros(begun.points.offsets.shape[1:], bool)
-            ),
+            stages,
+            progress,
+            free=Free(moves, none),
             undecided=(),
             on_progress=on_progress,
         )
-        try:
-            values = problem.space.numbers(progress.best_point.coefficients)
-            return simulator.flown(with_values(start, values)), progress.converged
-        except ConfigError:  # together the moments are no rigid body's
-            continue
-    return start, True
+
+    def vehicle(progress: Progress) -> VehicleFile:
+        values = space.numbers(progress.best_point.coefficients)
+        return simulator.flown(with_values(start, values))
+
+    progress = ended(begun, np.ones(len(space), bool))
+    with suppress(ConfigError):  # together the moments are no rigid body's
+        return vehicle(progress), progress.converged
+    moves = np.array([not MOMENTS.intersection(p.ratios) for p in space.parameters])
+    at_start = np.where(moves, progress.points.coefficients, space.initial)
+    again = replace(
+        begun,
+        stage=len(stages) + POLISH,
+        points=replace(progress.points, coefficients=at_start),
+        scales=progress.scales,
+        iterations=progress.iterations,
+        evaluations=progress.evaluations,
+    )
+    progress = ended(again, moves)
+    return vehicle(progress), progress.converged
 
 
 def _bounds(run: Run, start: VehicleFile, free: Sequence[str]) -> dict[str, CoefficientSettings]:
