@@ -70,7 +70,7 @@ def rotor_speeds(command: Array, step: float, motor: Motor, lags: Lags) -> Array
     return np.column_stack([begun, speeds]).T
 
 
-def _followed(given: Any, _: Mapping[str, int]) -> tuple[jax.Array, jax.Array]:
+def _followed(given: Any, _: Mapping[str, int]) -> tuple[Any, Any]:
     """Return the speed that one rotor's first command asks for, and (turns,) those that follow."""
     (motor, step), command = given
     lag, begun = Lag.over(motor, step), reference_speed(motor, command[0])
