@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
-from tuner.core.numerics import Z95, Array
+from tuner.core.numerics import Array
 from tuner.equation_error.measured import Mask, measured_with, with_rotors
 from tuner.equation_error.regression import MEMORY, convolved, whitening_filter
 from tuner.objective.inlets import INLETS
@@ -32,6 +32,8 @@ GRID = np.arange(-24, 25) * 0.0025
 """s of lateness that are tried: five samples at 100 Hz, and as much again for a rotor's lag."""
 KNOWN = 0.003
 """s of standard deviation up to which a lateness is believed."""
+SURE = 2.81
+"""Standard deviations that a lateness must differ by: by chance one flight of 200 does."""
 ENDS = 10
 """Ticks at either end of a flight, where its derivatives are worse."""
 ROUNDS = 3
@@ -55,10 +57,10 @@ def with_inputs_on_time(
 ) -> tuple[Recording, ...]:
     """Return recordings with the lateness of what is fed in, where it can be told.
 
-    Rotor speeds are late by themselves; commands are by what their flight's lateness differs from
-    the others', for what these have in common is the vehicle's own lag. What may be chance, or the
-    loop's answer to what disturbs the vehicle, is no lateness. A flight that does not tell has the
-    mean of the others' rotor speeds, and so have those held out: nothing is fitted to them.
+    Rotor speeds are late by themselves, unless that may be chance, or the loop's answer to what
+    disturbs the vehicle; commands are by what their flight's lateness differs from the flights'
+    mean, which is the vehicle's own lag. A flight that does not tell has the mean of the others,
+    and so have flights that are held out: nothing is fitted to them.
     """
     late: dict[str, float] = {}
     for inlet in {recording.inlet for recording in recordings}:
@@ -75,56 +77,53 @@ def with_inputs_on_time(
         ]
         if not lags:
             continue
-        own = 0.0 if is_measured else _common(lags, signal, vehicle)
         told = {
-            flight.name: lag.seconds - own if _is_later(flight, signal, vehicle, lag, own) else 0.0
+            flight.name: lag.seconds if not is_measured or _is_late(flight, vehicle, lag) else 0.0
             for flight, lag in lags
         }
         mean = float(np.mean(list(told.values())))
-        none = 0.0 if is_measured else mean
-        late |= {r.flight.name: told.get(r.flight.name, mean) - none for r in same}
+        own = 0.0 if is_measured else mean
+        late |= {r.flight.name: told.get(r.flight.name, mean) - own for r in same}
     return tuple(
         replace(r, input_late=late.get(r.flight.name, r.input_late)) if r.time_offset is None else r
         for r in recordings
     )
 
 
-def _common(lags: Sequence[tuple[Flight, Lag]], signal: str, vehicle: VehicleFile) -> float:
-    """Return the lateness, of the least, the middle and the largest, that all flights like best."""
-    at = np.quantile([lag.seconds for _, lag in lags], (0.0, 0.5, 1.0))
-    likelihood = sum(_of_turning(flight, signal, vehicle, at) for flight, _ in lags)
-    return float(at[int(np.argmax(likelihood))])
+def _is_late(flight: Flight, vehicle: VehicleFile, lag: Lag) -> bool:
+    """Return whether rotor speeds are stamped late or early, chance and answers apart.
 
-
-def _is_later(flight: Flight, signal: str, vehicle: VehicleFile, lag: Lag, than: float) -> bool:
-    """Return whether inputs are late by more or less than so many s, chance and answers apart."""
-    if abs(lag.seconds - than) <= Z95 * lag.sd:
+    Innovations are those of steps, within which rotors answer, too: less of a lateness may be what
+    they like, none, or a part of it. Then it is not believed.
+    """
+    if abs(lag.seconds) <= SURE * lag.sd:
         return False
-    late, on_time = _of_turning(flight, signal, vehicle, (lag.seconds, than))
-    return bool(late - on_time > 0.5 * Z95**2)
+    late, *others = _of_turning(flight, vehicle, (lag.seconds, 0.5 * lag.seconds, 0.0))
+    return late - max(others) > 0.5 * SURE**2
 
 
-def _of_turning(
-    flight: Flight, signal: str, vehicle: VehicleFile, at: Sequence[float] | Array
-) -> Array:
+def _of_turning(flight: Flight, vehicle: VehicleFile, at: Sequence[float]) -> list[float]:
     """Return the log-likelihood of the turning's innovations at each of some latenesses in s.
 
     Of the turning alone: the velocity, of which forces are, is filtered.
     """
-    inputs = flight.series[signal]
-    there = np.isfinite(inputs.values).all(axis=1)
-    rotors = Series(inputs.time[there], _speed_like(inputs.values[there], signal, vehicle))
+    rotors = flight.series["rotor_speed"]
+    there = np.isfinite(rotors.values).all(axis=1)
+    rotors = Series(rotors.time[there], rotors.values[there])
     steps = measured_with(flight, rotors, noise=0.0)
     if steps is None:
-        return np.zeros(len(at))
+        return [0.0] * len(at)
     parts = [with_rotors(steps, Series(rotors.time - late, rotors.values)) for late in at]
     known = np.all([part.known for part in parts], axis=0)
-    order, likelihood = max(1, round(MEMORY / steps.step)), np.zeros(len(at))
-    for place, part in enumerate(parts):
-        for axis, columns in enumerate(regressors(part, vehicle)):
-            new = _innovation(steps.accelerations[:, 3 + axis], columns, known, order)
-            likelihood[place] -= 0.5 * known.sum() * np.log(new)
-    return likelihood
+    order = max(1, round(MEMORY / steps.step))
+    new = [
+        [
+            _innovation(steps.accelerations[:, 3 + axis], columns, known, order)
+            for axis, columns in enumerate(regressors(part, vehicle))
+        ]
+        for part in parts
+    ]
+    return [-0.5 * float(known.sum() * np.log(of_axes).sum()) for of_axes in new]
 
 
 def _innovation(answer: Array, columns: Array, known: Mask, order: int) -> float:
@@ -135,6 +134,8 @@ def _innovation(answer: Array, columns: Array, known: Mask, order: int) -> float
         weights = np.linalg.lstsq(filtered[:, 1:], filtered[:, 0], rcond=None)[0]
         kernel = whitening_filter(answer - columns @ weights, known, order)
         filtered = convolved(rows, known, kernel)
+        if not len(filtered):  # gaps everywhere
+            return 1.0
     left, _ = _left(filtered[:, 1:], filtered[:, 0])
     return left / len(filtered)
 
@@ -176,7 +177,7 @@ def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
             for column in rows.values.T
         ]
     )
-    thrust = _speed_like(inputs, signal, vehicle) ** 2
+    thrust = _thrust_like(inputs, signal, vehicle)
     place = np.array([rotor.position for rotor in vehicle.rotors])
     spin = np.array([1.0 if rotor.spin == "ccw" else -1.0 for rotor in vehicle.rotors])
     driven = np.column_stack(
@@ -200,11 +201,12 @@ def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
     return _peak(of_axes / INDEPENDENT)
 
 
-def _speed_like(inputs: Array, signal: str, vehicle: VehicleFile) -> Array:
-    """Return what goes with the rotors' speed (n, 4)."""
-    if signal == "rotor_speed":
-        return inputs
-    return vehicle.motor.zero_position_armed + vehicle.motor.input_scaling * inputs
+def _thrust_like(inputs: Array, signal: str, vehicle: VehicleFile) -> Array:
+    """Return what goes with the rotors' thrust (n, 4)."""
+    if signal == "command":
+        motor = vehicle.motor
+        inputs = motor.zero_position_armed + motor.input_scaling * inputs
+    return inputs**2
 
 
 def _likelihoods(answer: Array, driven: Array, damping: Array, rate: float) -> Array:
