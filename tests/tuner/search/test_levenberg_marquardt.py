@@ -9,7 +9,7 @@ import pytest
 from tuner.objective.criterion import Point
 from tuner.objective.normal import NormalEquations
 from tuner.search import levenberg_marquardt
-from tuner.search.levenberg_marquardt import advance, begin
+from tuner.search.levenberg_marquardt import NEAR, advance, begin
 
 END = np.array([1.0, 1.0])
 START = np.array([-1.2, 1.0])
@@ -108,3 +108,24 @@ def test_what_is_no_number_is_never_better(advanced):
     *_, last = advanced([START, [np.nan, 0.0]], 3)
     assert np.isfinite(last.loss[0])
     assert not last.accepted[1]
+
+
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize("gain", [0.009, 0.011])
+@pytest.mark.parametrize("accepted", [False, True])
+@pytest.mark.parametrize("worst", [0.9 * NEAR, 1.1 * NEAR])
+def test_a_stage_ends_before_a_small_step_where_the_fit_is_near_and_the_last_was_better(
+    last, gain, accepted, worst
+):
+    stage = SimpleNamespace(tolerance=1e-4, rough=False, enough=0.0)
+    segments = SimpleNamespace(windowed=False)
+    problem = SimpleNamespace(stage=stage, last=last, objective=SimpleNamespace(segments=segments))
+    step = SimpleNamespace(
+        predicted_reduction=np.array([gain]),
+        accepted=np.array([accepted]),
+        loss=np.array([1.0]),
+        still=np.array([False]),
+        sums=SimpleNamespace(compared=np.array([1000.0])),
+    )
+    ended = levenberg_marquardt._has_converged(problem, step, np.array([worst]), [step.loss])
+    assert ended is (not last and gain < 0.01 and accepted and worst < NEAR)
