@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import scaled_inverse, scaled_solve, symmetric_eigen, unit_diagonal
+from tuner.core.numerics import scaled_solve, symmetric_eigen, unit_diagonal
 from tuner.objective.information import BLOCK
 from tuner.terms.linearisation import RIDGE, SECTIONS, Columns, Linear
 from tuner.uncertainty.covariance import STRETCH
@@ -203,8 +203,8 @@ def score(
     Of a flight that is alone sections are left out, too: it has to predict itself in time.
 
     Where sections, or no flights for sure, speak for a group, a gust during one manoeuvre might do
-    what it would; so the stretches that scatter most are all that chance is judged by. What a
-    recorded signal says a gust does not know.
+    what it would; so chance must not explain it whichever section is left out. What a recorded
+    signal says a gust does not know.
 
     Parameters
     ----------
@@ -245,12 +245,11 @@ def score(
         by_section = _held_out(linear, columns, (without, begin), linear.section)
         if by_section.is_sure(material):
             held_out, reason = by_section, SelectionCode.PREDICTS_SECTIONS
-    minima, limit = (alone, with_group), SIGNIFICANCE / max(candidates, 1)
-    chance = _chance(linear, model, group, minima)
+    limit = SIGNIFICANCE / max(candidates, 1)
     stays = inside and held_out.share > -patience * held_out.scatter  # nothing contradicts it
     of_few = reason is SelectionCode.PREDICTS_SECTIONS or (stays and not held_out.is_sure(material))
-    if of_few and not no_gust:
-        chance = max(chance, _chance(linear, model, group, minima, every_stretch_counts=False))
+    gusty = of_few and by_flight and not no_gust
+    chance = _chance(linear, model, group, (alone, with_group), one_section_may_err=gusty)
     if not by_flight:
         chance = max(chance, chance_of_gusts(linear, model, group, without))
     if not _is_determined(linear, model, group):
@@ -452,7 +451,7 @@ def _chance(
     group: Columns,
     minima: tuple[NDArray[np.float64], NDArray[np.float64]],
     *,
-    every_stretch_counts: bool = True,
+    one_section_may_err: bool = False,
 ) -> float:
     """Return the probability of such a score if the group were neutral, by Hotelling's T².
 
@@ -467,35 +466,41 @@ def _chance(
         The changes (K,) that lead to the minimum without and with the group. The score of the
         group's coefficients, the model's following them, is that of the first; how much it scatters
         from stretch to stretch is seen at the second, where only what is no such term is left.
-    every_stretch_counts
-        Whether the scatter is known as well as so many stretches let it be: else as well as those
-        do that scatter most, which may be one manoeuvre's.
+    one_section_may_err
+        Whether the others have to speak for the group whichever section is left out.
     """
     total = linear.information() + linear.prior
     follow = scaled_solve(total[np.ix_(model, model)], total[np.ix_(model, group)])
     without, with_group = (
         (at := linear.slopes(change))[:, group] - at[:, model] @ follow for change in minima
     )
-    size, seen = len(group), with_group[np.any(linear.diagonals[:, group] > 0.0, axis=1)]
-    unit = 1.0 / np.sqrt(np.maximum((seen**2).sum(axis=0), 1e-300))
-    count = float(len(seen)) if every_stretch_counts else _effective_count(seen * unit)
+    seen = np.any(linear.diagonals[:, group] > 0.0, axis=1)
+    parts = [seen]
+    if one_section_may_err:
+        parts += [seen & ~out for out in linear.folds(_sections(linear.flight))]
+    called = without - with_group
+    return max(_chance_in(part, called, with_group, linear.flight) for part in parts)
+
+
+def _chance_in(
+    part: NDArray[np.bool_],
+    called: NDArray[np.float64],
+    scores: NDArray[np.float64],
+    flight: NDArray[np.intp],
+) -> float:
+    """Return Hotelling's probability of a sum (S, L) over a part (S,), by how scores scatter there.
+
+    A stretch outside it lies between its neighbours all the same.
+    """
+    count, size = float(part.sum()), scores.shape[1]
     if count <= size + 1:
         return 1.0
-    sum_of_scores = (without - with_group).sum(axis=0)
-    spread = long_run(with_group * unit, linear.flight) * count / (count - 1.0)
-    along = sum_of_scores * unit
+    scores = scores * part[:, None]
+    unit = 1.0 / np.sqrt(np.maximum((scores**2).sum(axis=0), 1e-300))
+    spread = long_run(scores * unit, flight) * count / (count - 1.0)
+    along = called[part].sum(axis=0) * unit
     hotelling = max(float(along @ scaled_solve(spread + RIDGE * np.eye(size), along)), 0.0)
     return float(fdtrc(size, count - size, hotelling * (count - size) / (size * (count - 1.0))))
-
-
-def _effective_count(scores: NDArray[np.float64]) -> float:
-    """Return how many stretches of equal scatter would know as much of it as these (S, L) do.
-
-    Where a few scatter most, as those of one manoeuvre, few are all that its estimate rests on.
-    """
-    square = scores.T @ scores + RIDGE * np.eye(scores.shape[1])
-    shares = np.einsum("sp,sp->s", scores @ scaled_inverse(square), scores)
-    return float(shares.sum() ** 2 / max((shares**2).sum(), 1e-300))
 
 
 def long_run(scores: NDArray[np.float64], flight: NDArray[np.intp]) -> NDArray[np.float64]:
