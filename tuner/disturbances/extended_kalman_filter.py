@@ -138,7 +138,9 @@ def _undelayed(schedule: Schedule) -> Schedule:
     return replace(schedule, longest_estimate_latency=0.0, pose_rate=None)
 
 
-def _shortly_delayed(schedule: Schedule, expected: Expected) -> tuple[Schedule, int]:
+def _shortly_delayed(
+    schedule: Schedule, expected: Expected, latency: float = 0.0
+) -> tuple[Schedule, int]:
     """Return a schedule whose delay line of commands is no longer than needed.
 
     And how many commands are on their way to the motors when a step begins: to correct each of them
@@ -146,12 +148,19 @@ def _shortly_delayed(schedule: Schedule, expected: Expected) -> tuple[Schedule, 
     """
     if schedule.longest_actuator_latency == 0.0:
         return schedule, 0
-    latency = float(expected.coefficients["actuator_latency"])
+    latency = max(float(expected.coefficients["actuator_latency"]), latency)
     count = max(int(np.ceil(latency / schedule.step - 1e-9)), 1)
     return replace(schedule, longest_actuator_latency=count * schedule.step), count
 
 
-def filtered(schedule: Schedule, feed: Feed, expected: Expected, *, gains: bool = True) -> Filtered:
+def filtered(
+    schedule: Schedule,
+    feed: Feed,
+    expected: Expected,
+    *,
+    gains: bool = True,
+    latency: float = 0.0,
+) -> Filtered:
     """Return the Kalman gains, the innovations, and how likely they are.
 
     Parameters
@@ -160,8 +169,11 @@ def filtered(schedule: Schedule, feed: Feed, expected: Expected, *, gains: bool 
         Of the simulation, the recordings, and what is taken for true.
     gains
         Whether gains are kept, which take most of the memory.
+    latency
+        s that commands took at most before. Those that have arrived change nothing: with as many on
+        their way as then, one program filters again.
     """
-    short, in_flight = _shortly_delayed(_undelayed(schedule), expected)
+    short, in_flight = _shortly_delayed(_undelayed(schedule), expected, latency)
     wanted = (*[True] * 3, *[gains] * 2)
     *rows, gain, factors = _run((short, in_flight), _given(feed, expected), wanted).values
     white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)

@@ -83,6 +83,8 @@ class Predictor:
         Channel -> factor on the samples' standard deviations.
     computed
         Terms that are flown even where a model lacks them, so that one program serves all models.
+    latency
+        s that commands were on their way at most, at any point so far.
     found
         What the filter makes of the recordings: None before it has run.
     """
@@ -93,6 +95,7 @@ class Predictor:
     strengths: Array
     noise: Mapping[str, float]
     computed: tuple[str, ...] = ()
+    latency: float = 0.0
     found: Filtered | None = None
 
     @staticmethod
@@ -154,7 +157,7 @@ class Predictor:
         """
         laid = Predictor.of(objective, point, flights, self.computed)
         assert laid is not None
-        return replace(laid, strengths=self.strengths, noise=self.noise)
+        return replace(laid, strengths=self.strengths, noise=self.noise, latency=self.latency)
 
     def slopes(self, objective: Objective, point: Point) -> Slopes:
         """Return how the likelihood changes with the strengths; innovations lie on ticks.
@@ -193,7 +196,7 @@ class Predictor:
                 replace(feed, samples=samples),
             )
             expected = self._expected(objective, point, np.repeat(some, count, axis=-1))
-            found = filtered(self.schedule, tiled, expected, gains=False)
+            found = filtered(self.schedule, tiled, expected, gains=False, latency=self.latency)
             for number in range(some.shape[1]):
                 segments = slice(number * count, (number + 1) * count)
                 yield found.first(ticks, segments)
@@ -258,8 +261,10 @@ class Predictor:
     def at(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor once its filter has run at a point."""
         feed = self._fed(point)
-        found = filtered(self.schedule, feed, self._expected(objective, point))
-        return replace(self, feed=feed, found=found)
+        expected = self._expected(objective, point)
+        latency = max(float(expected.coefficients["actuator_latency"]), self.latency)
+        found = filtered(self.schedule, feed, expected, latency=latency)
+        return replace(self, feed=feed, found=found, latency=latency)
 
     @property
     def ticks(self) -> int:

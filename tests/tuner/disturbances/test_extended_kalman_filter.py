@@ -102,6 +102,18 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.usefixtures("folder")
+def test_commands_that_once_took_longer_change_nothing() -> None:
+    """Only how many are corrected on their way: one more is one that has reached the motors."""
+    schedule, feed, expected = hovering()
+    latencies = 0.0, 2.5 * schedule.step
+    counts = [ekf._shortly_delayed(schedule, expected, each)[1] for each in latencies]
+    assert counts == [1, 3]
+    short, long = (ekf.filtered(schedule, feed, expected, latency=each) for each in latencies)
+    np.testing.assert_allclose(long.white, short.white, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(long.loss, short.loss, rtol=1e-9)
+
+
+@pytest.mark.usefixtures("folder")
 def test_innovations_are_those_of_a_filter_in_matrices() -> None:
     schedule, feed, expected = hovering()
     white = told(schedule, feed, expected)[0][..., 0]
