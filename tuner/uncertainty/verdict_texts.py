@@ -50,14 +50,15 @@ def reason_in_words(reason: Reason) -> str:
 def half_width_in_words(
     interval: tuple[float | None, float | None] | None, value: float, unit: str
 ) -> str:
-    """Return half a 95 % interval, as it stands beside a column of units.
+    """Return the longer side of a 95 % interval, as it stands beside a column of units.
 
-    A time is in ms; else it is a share of its value, or a plain number where that is smaller.
+    Half of one that a bound cuts off would leave out values that it holds. A time is in ms; else
+    it is a share of its value, or a plain number where that is smaller.
     """
     if interval is None or None in interval:
         return ""
     low, high = interval
-    half = ((high or 0.0) - (low or 0.0)) / 2.0
+    half = max((high or 0.0) - value, value - (low or 0.0))
     if unit == "s" or abs(value) < half:
         return f"±{quantity(half, unit if unit == 's' else '')}"
     return f"±{percent(half / abs(value))}"

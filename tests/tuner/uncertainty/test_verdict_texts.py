@@ -130,3 +130,7 @@ def test_half_an_interval_is_a_share_a_time_or_a_plain_number_beside_its_unit() 
     assert half_width_in_words((0.011, 0.013), 0.012, "s") == "±1 ms"
     assert half_width_in_words((-1.0, 2.0), 0.5, "N s²/(rad m)") == "±1.5"
     assert half_width_in_words((None, 2.0), 0.5, "m") == ""
+
+
+def test_an_interval_that_a_bound_cuts_off_is_shown_by_its_longer_side() -> None:
+    assert half_width_in_words((0.0, 0.0022), 0.0007, "s") == "±1.5 ms"

@@ -51,8 +51,8 @@ def coefficients(contents: Contents) -> Section | None:
     else:
         return None
     note = (
-        "± 95 % is half the 95 % interval: it holds the true value in 95 of 100 such experiments, "
-        f"if the model is right. {calibration_in_words(calibration())}"
+        "± 95 % is the longer side of the 95 % interval: that holds the true value in 95 of 100 "
+        f"such experiments, if the model is right. {calibration_in_words(calibration())}"
     )
     return Section("coefficients", "Coefficients", tables=tables, charts=charts, note=note)
 
