@@ -93,6 +93,19 @@ def test_any_number_of_columns_is_laid_side_by_side(columns, lanes):
     np.testing.assert_allclose(got, want, rtol=1e-12, atol=1e-13)
 
 
+def test_a_choice_between_multiples_of_one_number_is_that_number_by_the_chosen_factor():
+    x, which = read(), ir.Constant(ir.IntType(1), ir.Undefined)
+    chosen = tangent("select_n", which, tangent("mul", x, factor()), tangent("mul", x, factor()))
+    assert operations(Graph([chosen])) == 1
+
+    def function(x, _):
+        return jnp.where(x > 0, jnp.sqrt(x), jnp.where(x > -1, 3.0 * x, -x))
+
+    got, want = flown(function, 9, 2)
+    assert np.isfinite(got).all()
+    np.testing.assert_allclose(got, want, rtol=1e-12)
+
+
 def test_what_is_not_chosen_may_be_no_number():
     def function(x, _):
         size = jnp.sqrt(jnp.sum((x - x) ** 2))

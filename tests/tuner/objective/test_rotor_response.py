@@ -32,6 +32,14 @@ def test_a_step_of_the_command_is_followed_late_and_with_its_own_lag(low, high, 
     np.testing.assert_allclose(speeds[:, 0], speeds[0, 0], rtol=1e-12)
 
 
+def test_rotors_begin_settled_at_the_first_command_alone(motor):
+    command = np.full((10, 4), 0.6)
+    command[0] = 0.3
+    speeds = rotor_speeds(command, STEP, motor, Lags(up=0.02, down=0.05, late=0.0))
+    np.testing.assert_allclose(speeds[0], motor.input_scaling * 0.3 + motor.zero_position_armed)
+    assert (np.diff(speeds[1:], axis=0) > 0.0).all()
+
+
 def test_a_flight_of_another_length_is_the_same_program(motor):
     rotor_speeds(np.full((30, 4), 0.5), STEP, motor, LAGS)
     before = _program_of.cache_info().misses

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from tuner.objective.criterion import Point
-from tuner.objective.segments import OFFSETS
+from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search import continuation
-from tuner.search.progress import Free
+from tuner.search.progress import Free, criterion_of
+from tuner.search.stages import Stage
 
 FLIGHTS, POSE = 3, 0
 KNOWN, ALONE = 1e4, 10.0
@@ -52,3 +53,9 @@ def stays(monkeypatch, late):
 )
 def test_clocks_stay_late_only_where_nothing_else_explains_it(monkeypatch, late, stay):
     assert stays(monkeypatch, late) == stay
+
+
+def test_commands_are_read_exactly_at_the_clocks_in_seconds():
+    offsets = np.full((5, 3), 2.0)  # of 10 ms each, as a `Point` has them
+    criterion = criterion_of(Stage("polish", 100), {}, offsets)
+    np.testing.assert_allclose(criterion.reference_offset, np.full((len(CLOCKS), 3), 0.02))

@@ -13,7 +13,7 @@ from tuner.findings.findings import Code
 from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
-from tuner.search.input_lag import input_lag, with_inputs_on_time
+from tuner.search.input_lag import Lag, _is_late, input_lag, with_inputs_on_time
 from tuner.search.job_flights import Recording, read_usable
 
 RATE = 500.0
@@ -77,6 +77,12 @@ def test_lateness_is_found_to_a_fraction_of_a_sample(broadband, updated, seconds
     assert lag is not None
     assert lag.seconds == pytest.approx(seconds, abs=0.003)
     assert lag.sd < 0.0015
+
+
+def test_a_lateness_that_may_be_chance_is_not_believed(broadband, updated):
+    flight = late_by(broadband, 0.01)
+    assert _is_late(flight, updated, Lag(0.01, 0.001))
+    assert not _is_late(flight, updated, Lag(0.01, 0.005))
 
 
 def test_noise_alone_tells_nothing(broadband, updated):
