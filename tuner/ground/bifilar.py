@@ -12,13 +12,17 @@ from scipy.optimize import least_squares
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
-from tuner.ground.measurement import Curve, Measurement, Remark
+from tuner.ground.measurement import Curve, Measurement, Remark, rotor_radius
+from tuner.ground.plan import Bifilar
+from tuner.vehicle import VehicleFile
 
 FEWEST_SWINGS = 5.0
 LARGE_SWING = math.radians(20)
 """Amplitude beyond which the law's small angles are wrong by more than the correction knows."""
 BEAT = 0.15
 """Share of the amplitude that a second frequency may have before the swing is called a beat."""
+GYRATION = (0.05, 3.0)
+"""Radius of gyration over the rotors' distance from the centre, beyond which units are wrong."""
 
 
 def bifilar_inertia(
@@ -33,17 +37,7 @@ def bifilar_inertia(
 
 
 def bifilar(
-    name: str,
-    path: str,
-    samples: Mapping[str, Array],
-    *,
-    axis: str,
-    mass: float,
-    wire_distance: float,
-    wire_length: float,
-    mass_error: float,
-    wire_distance_error: float,
-    wire_length_error: float,
+    name: str, path: str, samples: Mapping[str, Array], given: Bifilar, vehicle: VehicleFile
 ) -> Measurement:
     """Return the moment of inertia of one axis.
 
@@ -54,16 +48,17 @@ def bifilar(
     ----------
     samples
         ``time`` s and ``angle`` rad.
-    axis
-        ``x``, ``y`` or ``z``: the body axis that hung vertical.
-    mass, wire_distance, wire_length
-        kg, m and m; each with its standard error, which enters the result's.
+    given
+        Axis, mass and wires, whose standard errors enter the result's.
+    vehicle
+        Its mass hung where no other is given; its size says whether units are right.
 
     Raises
     ------
     RecordingError
-        Too few oscillations, too wide ones, or none.
+        Too few oscillations, too wide ones, or none; or an inertia that no such vehicle has.
     """
+    mass, distance, length = given.mass or vehicle.mass, given.wire_distance, given.wire_length
     time, angle = samples["time"] - samples["time"][0], samples["angle"]
     known = np.isfinite(angle)
     time, angle = time[known], angle[known]
@@ -85,14 +80,17 @@ def bifilar(
         raise RecordingError(path, "shows no damped oscillation", "check the angle's column")
     frequency = math.hypot(phase_rate, decay / (2 * math.pi))
     error = _frequency_error(solution, residual)
-    inertia = bifilar_inertia(
-        frequency, mass=mass, wire_distance=wire_distance, wire_length=wire_length
-    )
+    inertia = bifilar_inertia(frequency, mass=mass, wire_distance=distance, wire_length=length)
+    gyration = math.sqrt(inertia / mass)
+    low, high = (share * rotor_radius(vehicle) for share in GYRATION)
+    if not low < gyration < high:
+        what = f"gives a radius of gyration of {gyration:.3g} m, not one of {low:.2g} to {high:.2g}"
+        raise RecordingError(path, what, "check mass (kg), wires (m) and time (s)")
     variance = (
         (2 * error / frequency) ** 2
-        + (mass_error / mass) ** 2
-        + (2 * wire_distance_error / wire_distance) ** 2
-        + (wire_length_error / wire_length) ** 2
+        + given.mass_error**2
+        + (2 * given.wire_distance_error / distance) ** 2
+        + (given.wire_length_error / length) ** 2
     )
     remarks = [
         Remark("swing", {"oscillations": swings, "amplitude": amplitude, "frequency": frequency})
@@ -104,11 +102,11 @@ def bifilar(
     if drift > 0.2 * amplitude:
         remarks.append(Remark("drift", {"drift": drift}))
     dense = np.linspace(0.0, time[-1], 2000)
-    titles = (f"Swing about {axis}", "time, s", "angle, rad")
+    titles = (f"Swing about {given.axis}", "time, s", "angle, rad")
     curve = Curve.of(titles, (time, angle), (dense, _swing(solution.x, dense)))
     return Measurement(
         name,
-        ({f"inertia_{axis}{axis}": 1.0},),
+        ({f"inertia_{given.axis * 2}": 1.0},),
         np.array([math.log(inertia)]),
         np.array([[variance]]),
         tuple(remarks),

@@ -7,22 +7,27 @@ docstring names the slip.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
-from tuner.core.errors import ConfigError
-from tuner.ground.measurement import Curve, Measurement, Remark
+from tuner.core.errors import ConfigError, RecordingError
+from tuner.ground.measurement import Curve, Measurement, Remark, rotor_radius
+from tuner.ground.plan import FASTEST_SPIN, SLOWEST_SPIN, HoverWeights, YawSpin
+from tuner.ground.rig_data import place_of, steady_flight
+from tuner.vehicle import VehicleFile
 
 
-def hover_motor_constant(mass: float, rotor_speed: float, rotors: int = 4) -> float:
+def hover_motor_constant(
+    mass: NDArray[np.float64] | float, rotor_speed: NDArray[np.float64] | float, rotors: int = 4
+) -> NDArray[np.float64]:
     """Return the motor constant, N s²/rad², of a vehicle that hovers: m g = n k Ω² (6.4.1).
 
     Mass in kg, the rotors' common speed in rad/s. Two such hovers are Eq. 6.10.
     """
-    return mass * GRAVITY / (rotors * rotor_speed**2)
+    return np.asarray(mass * GRAVITY / (rotors * np.square(rotor_speed)))
 
 
 def fast_pair_speed(
@@ -56,51 +61,55 @@ def spin_drag_over_torque(
 
 
 def hover_weights(
-    name: str,
-    points: Sequence[tuple[float, float]],
-    *,
-    rotors: int,
-    mass_error: float,
-    rotor_speed_error: float,
+    name: str, given: HoverWeights, vehicle: VehicleFile, folder: Path
 ) -> Measurement:
-    """Return the motor constant from hovers of (mass kg, rotor speed rad/s): m g = n k Ω² (6.4.1).
+    """Return the motor constant from hovers of mass m and rotor speed Ω: m g = n k Ω² (6.4.1).
 
     Parameters
     ----------
-    mass_error, rotor_speed_error
-        Standard errors of one point, kg and rad/s; where three and more points scatter by more,
-        their scatter counts.
+    given
+        The hovers, and the standard errors of one; where three and more scatter by more, their
+        scatter counts.
+    vehicle
+        How many rotors carry it.
+    folder
+        From which paths of recordings count.
+
+    Raises
+    ------
+    RecordingError
+        A recording cannot be read, or shows no steady hover.
     """
-    mass, speed = (np.array(column, float) for column in zip(*points, strict=True))
-    values = np.log([hover_motor_constant(m, w, rotors) for m, w in points])
-    variance = (mass_error / mass) ** 2 + (2 * rotor_speed_error / speed) ** 2
+    speeds, curves, rotors = list[float](), list[Curve](), len(vehicle.rotors)
+    for point in given.points:
+        if point.rotor_speed is not None:
+            speeds.append(point.rotor_speed)
+            continue
+        flight = steady_flight(place_of(folder, point.recording))
+        speeds.append(float(np.sqrt(np.mean(flight.rotor_speed**2))))  # thrust goes with the square
+        curves.append(flight.curve)
+    mass, speed = np.array([point.mass for point in given.points]), np.array(speeds)
+    values = np.log(hover_motor_constant(mass, speed, rotors))
+    variance = (given.mass_error / mass) ** 2 + (2 * given.rotor_speed_error / speed) ** 2
     weight = 1.0 / variance
     mean = float(weight @ values / weight.sum())
     error2 = 1.0 / float(weight.sum())
-    freedom = len(points) - 1
+    freedom = len(values) - 1
     if freedom >= 2:
         birge = float(weight @ (values - mean) ** 2) / freedom
         error2 *= max(1.0, birge)
     weights = np.linspace(0.95 * mass.min(), 1.05 * mass.max(), 50)
-    speeds = np.sqrt(weights * GRAVITY / (rotors * math.exp(mean)))
+    law = np.sqrt(weights * GRAVITY / (rotors * math.exp(mean)))
     titles = ("Hover", "mass, kg", "rotor speed, rad/s")
-    curve = Curve.of(titles, (mass, speed), (weights, speeds))
+    curve = Curve.of(titles, (mass, speed), (weights, law))
     return Measurement(
         name, ({"motor_constant": 1.0},), np.array([mean]), np.array([[error2]]),
-        (Remark("points", {"points": len(points)}),), (curve,),
+        (Remark("points", {"points": len(values)}),), (curve, *curves),
     )  # fmt: skip
 
 
-def yaw_spin(
-    name: str,
-    points: Sequence[tuple[float, float, float | None]],
-    *,
-    mass: float,
-    radius: float,
-    motor_constant: float,
-    rotor_speed_error: float,
-) -> Measurement:
-    """Return the relation of rotor drag to torque from spins of (yaw rate, slow pair, fast pair).
+def yaw_spin(name: str, given: YawSpin, vehicle: VehicleFile, folder: Path) -> Measurement:
+    """Return the relation of rotor drag to torque from spins: yaw rate, slow pair, fast pair.
 
     rotor_drag_coefficient / (moment_constant · motor_constant) = (Ω_fast - Ω_slow)/(ω r²)
     (Eq. 8.3, see `spin_drag_over_torque`). Where the fast pair was not measured it follows from
@@ -108,20 +117,36 @@ def yaw_spin(
 
     Parameters
     ----------
-    points
-        Yaw rate rad/s, speed of the slow pair rad/s, and of the fast pair or None.
-    mass, radius
-        kg, and m from the yaw axis to each rotor.
-    motor_constant
-        N s²/rad², where the fast pair's speed is linearised.
-    rotor_speed_error
-        Standard error of one speed, rad/s.
+    given
+        The spins, and the standard error of one speed.
+    vehicle
+        Its mass and rotors, and the motor constant at which the fast pair's speed is linearised.
+    folder
+        From which paths of recordings count.
 
     Raises
     ------
     ConfigError
-        The fast pair is slower than the slow one.
+        The vehicle has more rotors than four, or the fast pair is slower than the slow one.
+    RecordingError
+        A recording cannot be read, or shows no steady spin.
     """
+    if not vehicle.is_quad:
+        raise ConfigError(name, "needs a vehicle of four rotors", "leave it out")
+    points, curves = list[tuple[float, float, float | None]](), list[Curve]()
+    for point in given.points:
+        if point.yaw_rate is not None and point.rotor_speed_slow is not None:
+            points.append((point.yaw_rate, point.rotor_speed_slow, point.rotor_speed_fast))
+            continue
+        path = place_of(folder, point.recording)
+        flight = steady_flight(path)
+        if not SLOWEST_SPIN <= abs(flight.yaw_rate) <= FASTEST_SPIN:
+            raise RecordingError(path, "does not yaw, or has no body rate", "spin it steadily")
+        pairs = sorted((flight.rotor_speed[:2].mean(), flight.rotor_speed[2:].mean()))
+        points.append((flight.yaw_rate, float(pairs[0]), float(pairs[1])))
+        curves.append(flight.curve)
+    mass, radius = vehicle.mass, rotor_radius(vehicle)
+    motor_constant = vehicle.aerodynamics.motor_constant
     rows, values, variances = [], [], []
     for rate, slow, fast in points:
         weighed = fast is None
@@ -149,7 +174,7 @@ def yaw_spin(
             }
         )
         values.append(value - follows * math.log(motor_constant))
-        variances.append((spread * rotor_speed_error / (quick - slow)) ** 2)
+        variances.append((spread * given.rotor_speed_error / (quick - slow)) ** 2)
     rates = np.array([abs(point[0]) for point in points])
     ratios = np.array([
         math.exp(v + (-1 - r["motor_constant"]) * math.log(motor_constant))
@@ -160,5 +185,5 @@ def yaw_spin(
     curve = Curve.of(titles, (rates, ratios), (rates, np.full(len(points), mean)))
     return Measurement(
         name, tuple(rows), np.array(values), np.diag(variances),
-        (Remark("points", {"points": len(points)}),), (curve,),
+        (Remark("points", {"points": len(points)}),), (curve, *curves),
     )  # fmt: skip

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Array
-from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle import COEFFICIENTS, VehicleFile
 
 MOST_DRAWN = 800
 """Samples of a curve that are kept."""
@@ -122,6 +122,12 @@ class Measurement:
     def names(self) -> tuple[str, ...]:
         """The coefficients that the experiment speaks of, in the order of first mention."""
         return tuple(dict.fromkeys(name for row in self.rows for name in row))
+
+
+def rotor_radius(vehicle: VehicleFile) -> float:
+    """Return the rotors' root mean square distance, m, from the yaw axis."""
+    squares = [rotor.position[0] ** 2 + rotor.position[1] ** 2 for rotor in vehicle.rotors]
+    return math.sqrt(sum(squares) / len(squares))
 
 
 def scaled_of(name: str, value: float) -> float:

@@ -10,6 +10,8 @@ import numpy as np
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
 from tuner.ground.measurement import Curve, Measurement, Remark
+from tuner.ground.plan import Propeller
+from tuner.ground.rig_data import place_of
 
 THEORY = 0.4
 """Standard deviation of the logarithm by which a table's propeller on a vehicle differs from it."""
@@ -70,28 +72,36 @@ def read_static_table(path: Path) -> Array:
     return table
 
 
-def propeller(name: str, table: Array, *, diameter: float, air_density: float) -> Measurement:
-    """Return motor and moment constant of a propeller from (n, 3) RPM, C_T, C_P.
+def propeller(name: str, given: Propeller, folder: Path) -> Measurement:
+    """Return motor and moment constant of a propeller from C_T and C_P, of a table the medians.
 
     Parameters
     ----------
-    table
-        One row a speed; the median counts.
-    diameter, air_density
-        m and kg/m³.
+    folder
+        From which a table's path counts.
+
+    Raises
+    ------
+    RecordingError
+        The table cannot be read, or is none.
     """
-    thrust, power = (float(np.median(table[:, column])) for column in (1, 2))
+    curves: tuple[Curve, ...] = ()
+    thrust, power = given.thrust_coefficient, given.power_coefficient
+    if thrust is None or power is None:
+        speeds, *columns = read_static_table(place_of(folder, given.table)).T
+        thrust, power = (float(np.median(column)) for column in columns)
+        titles = ("Propeller table", "RPM", "thrust coefficient")
+        curve = Curve.of(titles, (speeds, columns[0]), (speeds, np.full(len(speeds), thrust)))
+        curves = (curve,)
     values = np.log([
-        propeller_motor_constant(thrust, diameter=diameter, density=air_density),
-        propeller_moment_constant(thrust, power, diameter=diameter),
+        propeller_motor_constant(thrust, diameter=given.diameter, density=given.air_density),
+        propeller_moment_constant(thrust, power, diameter=given.diameter),
     ])  # fmt: skip
-    titles, speeds = ("Propeller table", "RPM", "thrust coefficient"), table[:, 0]
-    curve = Curve.of(titles, (speeds, table[:, 1]), (speeds, np.full(len(table), thrust)))
     return Measurement(
         name,
         ({"motor_constant": 1.0}, {"moment_constant": 1.0}),
         values,
         np.diag([THEORY**2, TORQUE_THEORY**2]),
         (Remark("theory", {"thrust_coefficient": thrust, "power_coefficient": power}),),
-        (curve,),
+        curves,
     )

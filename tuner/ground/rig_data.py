@@ -200,9 +200,15 @@ SHORTEST = 3.0
 STEP = 0.05
 """Change of the mean rotor speed, relative to its median, beyond which flight is not steady."""
 TABLES = (".csv", ".tsv", ".txt", ".parquet")
+ATTITUDE = ("qw", "qx", "qy", "qz")
 AXES = ("x", "y", "z")
 VERTICAL = 0.9
 """Least cosine between the body axis that hangs vertical and the vertical."""
+
+
+def place_of(folder: Path, recording: str | None) -> Path:
+    """Return the path of a recording, or of a table, that ``bench.yaml`` names."""
+    return folder / Path(recording or "").expanduser()
 
 
 def open_table(path: Path) -> TabularRecording:
@@ -318,16 +324,28 @@ class SteadyFlight:
     curve: Curve
 
 
-def attitude_of(path: Path) -> tuple[Array, Array]:
-    """Return times (n,) s and attitudes (n, 4) w, x, y, z of any recording that `tune` reads.
+def swing_of(path: Path, axis: str) -> dict[str, Array]:
+    """Return ``time`` s and ``angle`` rad about the vertical: of a table, or of any recording.
+
+    Parameters
+    ----------
+    axis
+        The body axis that ought to hang vertical, where an attitude was recorded.
 
     Raises
     ------
     RecordingError
-        It cannot be read or holds no pose.
+        It cannot be read, holds neither angle nor attitude, or hangs by another axis.
     """
-    series = _content(path).series["attitude"]
-    return series.time - series.time[0], series.values
+    if path.suffix.lower() not in TABLES:
+        series = _content(path).series["attitude"]
+        angle = angle_of_attitude(str(path), series.values, axis)
+        return {"time": series.time - series.time[0], "angle": angle}
+    if "qw" not in open_table(path).columns:
+        return read_columns(path, ("angle",))
+    samples = read_columns(path, ATTITUDE)
+    quaternion = np.column_stack([samples.pop(part) for part in ATTITUDE])
+    return samples | {"angle": angle_of_attitude(str(path), quaternion, axis)}
 
 
 def steady_flight(path: Path) -> SteadyFlight:

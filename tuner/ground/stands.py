@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array, scaled_inverse
 from tuner.ground.measurement import Curve, Measurement, Remark
+from tuner.ground.plan import RpmCurve, ThrustStand, TorqueStand
 from tuner.ground.rig_data import kept_levels, mean_and_error, widened
+from tuner.vehicle import VehicleFile
 
 SHORTEST = 1.0
 """s below which a level of the rotor speed is a transient."""
@@ -23,6 +26,8 @@ FEWEST = 4
 """Levels without which slope, offset and drift cannot be told apart."""
 LEAST_SPEED_RATIO = 1.3
 """Ratio of the fastest to the slowest level without which an offset looks like another slope."""
+LIFT = (0.05, 20.0)
+"""Largest thrust of all rotors over the weight, beyond which a unit or lever is wrong."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +48,8 @@ def stand(
     name: str,
     path: str,
     samples: Mapping[str, Array],
-    row: Mapping[str, float],
-    *,
-    rotors: int,
-    lever: float,
-    lever_error: float,
+    given: ThrustStand | TorqueStand,
+    vehicle: VehicleFile,
 ) -> Measurement:
     """Return a constant of the rotors from F · lever = n k Ω² (Eq. 6.8, 7.3.2) and an offset.
 
@@ -55,17 +57,22 @@ def stand(
     ----------
     samples
         ``time`` s, ``rotor_speed`` rad/s, ``force`` N.
-    row
-        What k is: `THRUST` or `TORQUE`.
-    lever, lever_error
-        Thrust over the force that the sensor reads, or torque over it in m, and the relative
-        standard error.
+    given
+        Which stand, how many rotors turned, and its lever with the relative standard error.
+    vehicle
+        What the rotors have to carry.
 
     Raises
     ------
     RecordingError
-        There are too few steps, they are too short, or the force does not grow with the speed.
+        There are too few steps, they are too short, the force does not grow with the speed, or the
+        thrust is none that carries the vehicle.
     """
+    title, row, lever, lever_error = (
+        ("Thrust stand", THRUST, given.lever_ratio, given.lever_ratio_error)
+        if isinstance(given, ThrustStand)
+        else ("Torque stand", TORQUE, given.lever_arm, given.lever_arm_error)
+    )
     time, speed, force = samples["time"], samples["rotor_speed"], samples["force"]
     levels, used, dropped = _levels(time, speed, force)
     if len(levels) < FEWEST:
@@ -97,7 +104,6 @@ def stand(
         remarks.append(Remark("not_quadratic", {"deviation": bend / bend_error}))
     squares = design[:, 0]
     order = np.argsort(squares)
-    title = "Thrust stand" if row == THRUST else "Torque stand"
     curves = (
         Curve.of(
             ("Rotor speed", "time, s", "rotor speed, rad/s"),
@@ -112,10 +118,15 @@ def stand(
             (squares[order], fit[order]),
         ),
     )
-    value = math.log(slope * lever / rotors)
+    constant, top = slope * lever / given.rotors, float(np.nanquantile(speed, 0.95))
+    thrust = len(vehicle.rotors) * constant * top**2
+    lifts = LIFT[0] < thrust / (vehicle.mass * GRAVITY) < LIFT[1]
+    if row == THRUST and not lifts:
+        what = f"gives {thrust:.3g} N of thrust at {top:.0f} rad/s to a vehicle of {vehicle.mass:g}"
+        raise RecordingError(path, f"{what} kg", "check the force (N) and the lever ratio")
     variance = covariance[0, 0] / slope**2 + lever_error**2
     return Measurement(
-        name, (row,), np.array([value]), np.array([[variance]]), tuple(remarks), curves
+        name, (row,), np.log([constant]), np.array([[variance]]), tuple(remarks), curves
     )
 
 
@@ -165,9 +176,7 @@ QUADRATIC_THRESHOLD = 3.0
 """Standard errors from which a quadratic term is believed."""
 
 
-def rpm_curve(
-    name: str, path: str, samples: Mapping[str, Array], *, reference_voltage: float | None
-) -> Measurement:
+def rpm_curve(name: str, path: str, samples: Mapping[str, Array], given: RpmCurve) -> Measurement:
     """Return input scaling, zero position and, if the data ask for them, curvature and exponent.
 
     Ω = (a u + b u² + c) (V/V_ref)^γ (Eq. 4.2, 4.4.1), one point for the middle of every step.
@@ -176,8 +185,8 @@ def rpm_curve(
     ----------
     samples
         ``time`` s, ``command`` 0..1, ``rotor_speed`` rad/s, and ``voltage`` V if it was recorded.
-    reference_voltage
-        V_ref in V; None takes the highest that was recorded.
+    given
+        With V_ref; else it is the highest that was recorded.
 
     Raises
     ------
@@ -204,7 +213,7 @@ def rpm_curve(
         raise RecordingError(path, "has a rotor speed that does not follow the command",
                              "check the columns")  # fmt: skip
     error = np.maximum(error, 0.5 * np.median(error))
-    reference = float(volts.max()) if reference_voltage is None else reference_voltage
+    reference = given.reference_voltage or float(volts.max())
     sags = "voltage" in samples and float(volts.max() / volts.min()) > VOLTAGE_RANGE
     ratio = volts / reference if "voltage" in samples else np.ones_like(u)
     straight = _fit(u, omega, error, ratio, quadratic=False, sags=sags)

@@ -1,44 +1,65 @@
 """The truth lies in the 95 % intervals of simulated rigs as often as it should."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 
 from tests.tuner.ground import rigs
+from tuner.core.shipped import configs_folder
 from tuner.ground.bench_json import combine
 from tuner.ground.bifilar import bifilar
 from tuner.ground.hovers import hover_weights, yaw_spin
 from tuner.ground.measurement import scaled_of
+from tuner.ground.plan import Experiment
 from tuner.ground.propeller import propeller
-from tuner.ground.stands import THRUST, TORQUE, rpm_curve, stand
+from tuner.ground.stands import rpm_curve, stand
 from tuner.ground.step_response import step_response
+from tuner.vehicle import read_vehicle, with_values
 
 TRUTH = rigs.TRUTH
 LEVER, ARM = 1.4231, 0.37
+QUAD = with_values(
+    read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml"),
+    {"mass": 2.243, "motor_constant": TRUTH["motor_constant"]},
+)
+
+
+def plan(kind, **keys):
+    """Return an experiment as ``bench.yaml`` has it."""
+    needs = {"thrust_stand", "torque_stand", "rpm_curve", "bifilar"}
+    recording = {"recording": "x.csv"} if kind in needs else {}
+    return TypeAdapter(Experiment).validate_python({"kind": kind, **recording, **keys})
 
 
 def swing(random):
     samples, ruler = rigs.swing(random)
-    errors = {"mass_error": 0.002, "wire_distance_error": 0.0005, "wire_length_error": 0.002}
-    return bifilar("bifilar x", "x.csv", samples, axis="x", **ruler, **errors)
+    errors = {"mass_error": 0.002 / ruler["mass"]}
+    return bifilar(
+        "bifilar x", "x.csv", samples, plan("bifilar", axis="x", **ruler, **errors), QUAD
+    )
 
 
-def thrust(random):
+def thrust(random, lever=None):
     samples = rigs.stand(random, slope=4 * TRUTH["motor_constant"], lever=LEVER)
-    lever = LEVER * (1 + random.normal(0, 0.005))
-    return stand("thrust", "t.csv", samples, THRUST, rotors=4, lever=lever, lever_error=0.005)
+    lever = lever or LEVER * (1 + random.normal(0, 0.005))
+    return stand(
+        "thrust", "t.csv", samples, plan("thrust_stand", rotors=4, lever_ratio=lever), QUAD
+    )
 
 
 def torque(random):
     slope = 2 * TRUTH["moment_constant"] * TRUTH["motor_constant"]
     samples = rigs.stand(random, slope=slope, lever=ARM, noise=0.02)
     arm = ARM * (1 + random.normal(0, 0.005))
-    return stand("torque", "t.csv", samples, TORQUE, rotors=2, lever=arm, lever_error=0.005)
+    return stand("torque", "t.csv", samples, plan("torque_stand", rotors=2, lever_arm=arm), QUAD)
 
 
 def curve(random):
-    return rpm_curve("rpm", "r.csv", rigs.steps_of_command(random), reference_voltage=16.4)
+    given = plan("rpm_curve", reference_voltage=16.4)
+    return rpm_curve("rpm", "r.csv", rigs.steps_of_command(random), given)
 
 
 def steps(random):
@@ -46,19 +67,14 @@ def steps(random):
 
 
 def hover(random):
-    points = rigs.hovers(random)
-    return hover_weights("hover", points, rotors=4, mass_error=0.001, rotor_speed_error=3.0)
+    points = [{"mass": mass, "rotor_speed": speed} for mass, speed in rigs.hovers(random)]
+    return hover_weights("hover", plan("hover_weights", points=points), QUAD, Path())
 
 
 def spin(random):
-    return yaw_spin(
-        "spin",
-        rigs.spins(random),
-        mass=2.243,
-        radius=0.25,
-        motor_constant=TRUTH["motor_constant"],
-        rotor_speed_error=1.0,
-    )
+    names = ("yaw_rate", "rotor_speed_slow", "rotor_speed_fast")
+    points = [dict(zip(names, point, strict=True)) for point in rigs.spins(random)]
+    return yaw_spin("spin", plan("yaw_spin", points=points), QUAD, Path())
 
 
 def table(random):
@@ -66,8 +82,9 @@ def table(random):
     diameter, density = 0.2794, 1.225
     force = TRUTH["motor_constant"] * (2 * math.pi) ** 2 / (density * diameter**4) * scatter[0]
     power = TRUTH["moment_constant"] * 2 * math.pi * force / diameter * scatter[1]
-    rows = np.array([[3000.0, force, power], [5000.0, force, power]])
-    return propeller("propeller", rows, diameter=diameter, air_density=density)
+    numbers = {"thrust_coefficient": force, "power_coefficient": power}
+    given = plan("propeller", diameter=diameter, air_density=density, **numbers)
+    return propeller("propeller", given, Path())
 
 
 RIGS = (swing, thrust, torque, curve, steps, hover, spin, table)
@@ -126,8 +143,7 @@ def test_a_speed_that_reacts_before_its_commands_stamp_leaves_the_time_constants
 
 def test_a_wrong_lever_ratio_conflicts_with_the_hovers():
     random = np.random.default_rng(3)
-    samples = rigs.stand(random, slope=4 * TRUTH["motor_constant"], lever=LEVER)
-    wrong = stand("thrust", "t.csv", samples, THRUST, rotors=4, lever=1.0, lever_error=0.005)
+    wrong = thrust(random, lever=1.0)
     known = {name: scaled_of(name, value) for name, value in TRUTH.items() if name in KNOWN}
     together = combine([wrong, hover(random)], known)
     assert together.p_value < 1e-6
