@@ -277,6 +277,17 @@ def test_bag_that_was_never_closed(short: Path, tmp_path: Path, clean: Flight) -
     assert damage.bytes_lost == 0
 
 
+def test_a_record_that_is_cut_is_lost(short: Path, tmp_path: Path, clean: Flight) -> None:
+    path = tmp_path / "cut_index.bag"
+    path.write_bytes(short.read_bytes()[:-10])
+    got = load_flight(path)
+    near(got, clean, position=1e-5)
+    (damage,) = got.damage
+    assert damage.cause is Cause.INDEX_DAMAGED
+    assert damage.bytes_lost is not None
+    assert 0 < damage.bytes_lost < 1000
+
+
 def test_damaged_chunk_costs_that_chunk_only(short: Path, tmp_path: Path, clean: Flight) -> None:
     path = tmp_path / "holed.bag"
     raw = bytearray(making.rewrite(short, path, chunk=1 << 16).read_bytes())

@@ -13,7 +13,7 @@ import contextlib
 import re
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +32,8 @@ from tuner.recordings.ros.container import (
     DamagedError,
     Entries,
     FileBytes,
+    Found,
+    Record,
     unsigned,
 )
 from tuner.recordings.ros.messages import Block, Bytes, Index
@@ -88,18 +90,6 @@ class Bag1(ChunkedFile):
             counts.update(info["held"])
         self._count(counts)
 
-    def _walk(self, data: FileBytes, first: int, cause: Cause) -> None:
-        """Learn connections and chunks from front to end, as far as records can be followed."""
-        self._chunks, self.connections = [], {}
-        reached, unread = first, 0
-        with contextlib.suppress(DamagedError):
-            for _, header, begin, end in _records(data, first):
-                behind = min(end, len(data))
-                if header.get(b"op") == bytes([CHUNK]):
-                    unread += self._add(data, _chunk(header, begin, behind))
-                reached = behind
-        self._salvaged(cause, len(data) - reached + unread)
-
     def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
         entries, at = {}, chunk.position + chunk.length
         for _ in chunk.held:
@@ -107,20 +97,21 @@ class Bag1(ChunkedFile):
             entries[_number(header, b"conn", 4)] = _entries(content)
         return entries
 
-    def _scan(self, content: bytes) -> tuple[Mapping[int, list[tuple[int, int]]], int]:
-        messages: dict[int, list[tuple[int, int]]] = {}
-        read = 0
-        for at, header, begin, end in _records(content, 0):
-            if end > len(content):
-                break
-            if header.get(b"op") == bytes([CONNECTION]):
-                record = _connection(header, content[begin:end])
-                self.connections.setdefault(record.id, record)
-            elif header.get(b"op") == bytes([MESSAGE]):
-                time = _time(header.get(b"time", b""))
-                messages.setdefault(_number(header, b"conn", 4), []).append((time, at))
-            read = end
-        return messages, read
+    def _records(self, data: Content, at: int) -> Iterator[Record]:
+        with contextlib.suppress(DamagedError):
+            while at < len(data):
+                header, begin, end = _record(data, at)
+                found: Found = None
+                kind = header.get(b"op")
+                if kind == bytes([CHUNK]):
+                    found = _chunk(header, begin, min(end, len(data)))
+                elif kind == bytes([MESSAGE]):
+                    found = _number(header, b"conn", 4), _time(header.get(b"time", b""))
+                elif kind == bytes([CONNECTION]) and end <= min(len(data), begin + LONGEST_DATA):
+                    known = _connection(header, data[begin:end])
+                    self.connections.setdefault(known.id, known)
+                yield at, end, found
+                at = end
 
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
         length = len(content)
@@ -157,18 +148,6 @@ def _whole(data: Content, at: int, op: int) -> tuple[Header, bytes, int]:
     if len(content) < end - begin:
         raise DamagedError("a record is absurdly long")
     return header, content, end
-
-
-def _records(data: Content, at: int) -> Iterator[tuple[int, Header, int, int]]:
-    """Yield where records begin, their headers, and where their data begin and end.
-
-    As far as they can be followed; the last may be cut.
-    """
-    with contextlib.suppress(DamagedError):
-        while at < len(data):
-            header, begin, end = _record(data, at)
-            yield at, header, begin, end
-            at = end
 
 
 def _length(data: Content, at: int) -> int:

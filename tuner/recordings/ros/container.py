@@ -21,6 +21,8 @@ from tuner.recordings.ros.messages import Block, Bytes, Index
 
 #: The largest chunk that is unpacked: cameras and lidars stay far below it.
 LARGEST_CHUNK = 128 << 20
+#: Messages outside of chunks that are read together.
+AT_ONCE = 4096
 #: Wanted pieces of an uncompressed chunk that lie this near are read in one go, in bytes.
 NEAR = 1 << 16
 
@@ -192,9 +194,18 @@ class Chunk:
         )
 
 
+Found = Chunk | tuple[int, int] | None
+"""What a record is: a chunk, a message (its connection, and ns), or something else."""
+Record = tuple[int, int, Found]
+"""Where a record begins and ends, and what it is."""
+
+
 @dataclass
 class ChunkedFile(Container):
-    """A container of chunks: read by its indexes, or walked from the front where they are lost."""
+    """A container of chunks: read by its indexes, or walked from the front where they are lost.
+
+    Messages outside of chunks count as chunks of some thousands.
+    """
 
     _chunks: list[Chunk] = field(default_factory=list)
 
@@ -203,8 +214,11 @@ class ChunkedFile(Container):
         """Return the messages of a chunk as the index behind it has them."""
 
     @abstractmethod
-    def _scan(self, content: bytes) -> tuple[Mapping[int, list[tuple[int, int]]], int]:
-        """Learn the connections in a chunk; return its messages, and how many bytes make sense."""
+    def _records(self, data: Content, at: int) -> Iterator[Record]:
+        """Yield records from a place on, as far as they can be followed; the last may be cut.
+
+        Connections are learnt from theirs.
+        """
 
     @abstractmethod
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
@@ -253,25 +267,43 @@ class ChunkedFile(Container):
 
     def _walked(self, data: FileBytes, chunk: Chunk) -> tuple[Chunk, int]:
         """Return a chunk with what walking it finds in it, and how many bytes make no sense."""
-        content = _unpacked(data, chunk)
-        rows, read = self._scan(content)
+        content, rows, read = _unpacked(data, chunk), dict[int, list[tuple[int, int]]](), 0
+        for at, end, found in self._records(content, 0):
+            if end > len(content):
+                break
+            if isinstance(found, tuple):
+                rows.setdefault(found[0], []).append((found[1], at))
+            read = end
         return chunk.holding(rows), len(content) - read
 
-    def _add(self, data: FileBytes, chunk: Chunk) -> int:
-        """Add a chunk that a walk came upon; return how many bytes of it make no sense."""
-        missed = chunk.length
-        with contextlib.suppress(DamagedError):
-            chunk, missed = self._walked(data, chunk)
-        self._chunks.append(chunk)
-        return 0 if chunk.packed else missed  # of the file, not unpacked
-
-    def _salvaged(self, cause: Cause, lost: int) -> None:
-        """Count what a walk found, and note the damage."""
+    def _walk(self, data: FileBytes, first: int, cause: Cause) -> None:
+        """Learn connections and chunks from front to end, count them, and note the damage."""
+        self._chunks, self.connections = [], {}
+        loose: dict[int, list[tuple[int, int]]] = {}
+        reached, lost = first, 0
+        for at, end, found in self._records(data, first):
+            if end > len(data) and not isinstance(found, Chunk):
+                break
+            if loose and (isinstance(found, Chunk) or sum(map(len, loose.values())) >= AT_ONCE):
+                self._chunks.append(Chunk(0, reached).holding(loose))
+                loose = {}
+            if isinstance(found, tuple):
+                loose.setdefault(found[0], []).append((found[1], at))
+            elif found is not None:
+                chunk, missed = found, found.length
+                with contextlib.suppress(DamagedError):
+                    chunk, missed = self._walked(data, chunk)
+                self._chunks.append(chunk)
+                lost += 0 if chunk.packed else missed  # of the file, not unpacked
+            reached = min(end, len(data))
+        if loose:
+            self._chunks.append(Chunk(0, reached).holding(loose))
         counts: Counter[int] = Counter()
         for chunk in self._chunks:
             counts.update(chunk.held)
         start = max((chunk.end for chunk in self._chunks if chunk.end is not None), default=None)
         self._count(counts)
+        lost += len(data) - reached
         self.damage.append(
             Damage(cause, salvaged=sum(counts.values()), bytes_lost=lost, start=start)
         )

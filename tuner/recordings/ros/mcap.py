@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -29,6 +29,8 @@ from tuner.recordings.ros.container import (
     DamagedError,
     Entries,
     FileBytes,
+    Found,
+    Record,
     unsigned,
 )
 from tuner.recordings.ros.messages import Block, Bytes, Index
@@ -38,8 +40,6 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, CHUNK_INDEX, STATISTICS, DATA_EN
     0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x0B, 0x0F,
 )  # fmt: skip
 
-#: Messages outside of chunks that are read together.
-AT_ONCE = 4096
 #: Bytes of a message record before its payload: op, length, channel, sequence, two times.
 BEFORE_PAYLOAD = 9 + 22
 #: Channel, sequence and time of a message. No true time is beyond 2^63: read with a sign, as in the
@@ -57,8 +57,7 @@ _FORMATS = {
 class Mcap(ChunkedFile):
     """An MCAP file with ROS messages.
 
-    In its chunks ``held`` says where the index of a channel's messages lies. Messages outside of
-    chunks count as chunks of some thousands.
+    In its chunks ``held`` says where the index of a channel's messages lies.
     """
 
     _schemas: dict[int, tuple[str, MessageDefinition]] = field(default_factory=dict)
@@ -71,7 +70,7 @@ class Mcap(ChunkedFile):
             try:
                 self._read_summary(data)
             except DamagedError as err:
-                self._walk(data, err.cause)
+                self._walk(data, len(MAGIC), err.cause)
         if not self.connections:
             raise RecordingError(self.path, "holds no ROS messages", "record it again")
 
@@ -100,44 +99,21 @@ class Mcap(ChunkedFile):
             raise DamagedError("its summary names no chunks")
         self._count(counts)
 
-    def _walk(self, data: FileBytes, cause: Cause) -> None:
-        """Learn channels and messages from front to end, as far as records can be followed."""
-        self._chunks, self.connections = [], {}
-        loose: dict[int, list[tuple[int, int]]] = {}
-        reached, unread = len(MAGIC), 0
-        for op, begin, end in records(data, reached):
-            if op in (0, FOOTER, DATA_END) or (end > len(data) and op != CHUNK):
-                break
-            if loose and (op != MESSAGE or sum(map(len, loose.values())) >= AT_ONCE):
-                self._chunks.append(Chunk(0, reached).holding(loose))
-                loose = {}
+    def _records(self, data: Content, at: int) -> Iterator[Record]:
+        for op, begin, end in records(data, at):
+            found: Found = None
+            whole = end <= len(data)
+            if op in (0, FOOTER, DATA_END):
+                return
             if op == CHUNK:
-                unread += self._add(data, _chunk(data, begin, min(end, len(data))))
-            elif op == MESSAGE and end - begin >= _HEAD.size + 8:
+                found = _chunk(data, begin, min(end, len(data)))
+            elif op == MESSAGE and whole and end - begin >= _HEAD.size + 8:
                 number, _, time = _HEAD.unpack(data[begin : begin + _HEAD.size])
-                loose.setdefault(number, []).append((time, begin - 9))
-            elif op in (SCHEMA, CHANNEL) and end - begin < LARGEST_CHUNK:
+                found = number, time
+            elif op in (SCHEMA, CHANNEL) and whole and end - begin < LARGEST_CHUNK:
                 with contextlib.suppress(DamagedError):
                     self._learn(op, data[begin:end])
-            reached = end
-        if loose:
-            self._chunks.append(Chunk(0, reached).holding(loose))
-        self._salvaged(cause, max(len(data) - reached, 0) + unread)
-
-    def _scan(self, content: bytes) -> tuple[Mapping[int, list[tuple[int, int]]], int]:
-        messages: dict[int, list[tuple[int, int]]] = {}
-        read = 0
-        for op, begin, end in records(content, 0):
-            if end > len(content):
-                break
-            read = end
-            if op == MESSAGE and end - begin >= _HEAD.size + 8:
-                number, _, time = _HEAD.unpack_from(content, begin)
-                messages.setdefault(number, []).append((time, begin - 9))
-            elif op in (SCHEMA, CHANNEL):
-                with contextlib.suppress(DamagedError):
-                    self._learn(op, content[begin:end])
-        return messages, read
+            yield begin - 9, end, found
 
     def _learn(self, op: int, content: bytes) -> None:
         """Take in a schema or a channel."""
@@ -190,7 +166,7 @@ def _string(content: bytes, at: int) -> tuple[str, int]:
     return content[at + 4 : at + 4 + length].decode(errors="replace"), at + 4 + length
 
 
-def _chunk(data: FileBytes, begin: int, end: int) -> Chunk:
+def _chunk(data: Content, begin: int, end: int) -> Chunk:
     """Return a chunk by the head of its record's content, of which the end may be missing."""
     head = data[begin : begin + 40 + 16]
     try:
