@@ -211,22 +211,23 @@ def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
     moving, velocity = _velocities(series, clock)
     if min(rms(moving), rms(velocity)) < LEAST_SPEED:
         return None, None
-    fit = correlation(moving, velocity)
-    if fit > 0.8:
-        return None, None
     measured = series["velocity"]
     at_samples = on_clock(series, "attitude", measured.time)
-
-    in_body = Reading("in body axes", lambda _: rotate(at_samples, measured.values))
-    ned = Reading("in NED axes", lambda v: to_enu_flu(v, "velocity"))
-    fits = {
-        in_body: correlation(moving, rotate(on_clock(series, "attitude", clock), velocity)),
-        ned: correlation(moving, to_enu_flu(velocity, "velocity")),
+    readings = {
+        Reading("in body axes", lambda _: rotate(at_samples, measured.values)): rotate(
+            on_clock(series, "attitude", clock), velocity
+        ),
+        Reading("in NED axes", lambda v: to_enu_flu(v, "velocity")): to_enu_flu(
+            velocity, "velocity"
+        ),
     }
-    best = max(fits, key=lambda r: fits[r])
-    if fits[best] > max(0.8, fit + 0.15):
+    best = min(readings, key=lambda r: _residual_share(moving, readings[r]))
+    there, here = _residual_share(moving, readings[best]), _residual_share(moving, velocity)
+    if there < GOOD_AGREEMENT and there < here / 2:
         return best, None
-    return None, Note(NoteCode.VELOCITY_DOUBTED, numbers={"agreement": fit})
+    fit = correlation(moving, velocity)
+    doubt = Note(NoteCode.VELOCITY_DOUBTED, numbers={"agreement": fit})
+    return None, doubt if fit < 0.8 else None
 
 
 def contradiction(series: Mapping[str, Series], missions: Sequence[Mission]) -> Note | None:

@@ -159,11 +159,13 @@ def _numbered(words: set[str], unit: str | None) -> str | None:
 def _along(axis: str, words: set[str]) -> str | None:
     """Return the signal of a column that is called by an axis."""
     single = {word for word in words if "_" not in word}
+    turning = bool(words & {"ang", "angular"})
+    moving = bool(words & (_VELOCITY | {"twist"}))
     rules = (
         ("attitude", axis == "w" or bool(words & _ATTITUDE)),
-        ("body_rate", bool(words & (_RATE - {"angular"})) or {"twist", "angular"} <= words),
-        ("acceleration", bool(words & _FORCE)),
-        ("velocity", bool(words & (_VELOCITY | {"twist"}))),
+        ("body_rate", bool(words & (_RATE - {"angular"})) or (turning and moving)),
+        ("acceleration", bool(words & _FORCE) and not turning),
+        ("velocity", moving),
         ("position", bool(words & _POSITION) or single <= _ESTIMATE | _BODIES),
     )
     return next((signal for signal, holds in rules if holds), None)
@@ -405,7 +407,8 @@ def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tupl
     signals, notes = dict(topics.signals), []
     for signal, source in found.items():
         fields = source.fields or ()
-        if signal not in places and not taken & set(fields):
+        unwanted = topics.signals.get(signal) == ()
+        if signal not in places and not unwanted and not taken & set(fields):
             signals[signal] = (source,)
             notes.append(Note(NoteCode.COLUMNS_TAKEN, "info", names=(signal, *fields)))
     return whole.replace(signals=signals), tuple(notes)

@@ -124,7 +124,7 @@ class TopicMap(Section):
         def as_source(columns: object) -> object:
             if isinstance(columns, str):
                 return {"fields": [columns]}
-            if isinstance(columns, list) and all(isinstance(name, str) for name in columns):
+            if columns and isinstance(columns, list) and all(isinstance(n, str) for n in columns):
                 return {"fields": columns}
             return columns
 

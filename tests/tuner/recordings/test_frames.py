@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1 import Writer as BagWriter
+from scipy.spatial.transform import Rotation
 
 from tests.tuner.recordings import making
 from tuner.cli import main
@@ -160,6 +161,21 @@ def test_a_vehicle_that_leans_by_more_than_60_degrees_is_not_doubted() -> None:
     assert correct_frames(circle(speed=6.2), {})[1] == ()
     (doubt,) = correct_frames(circle(np.pi / 2, speed=6.2), {})[1]
     assert doubt.code is NoteCode.ATTITUDE_DOUBTED
+
+
+@pytest.mark.parametrize("wind", [3.0, 6.0, 12.0])
+def test_a_velocity_in_body_axes_is_turned_into_the_worlds(wind: float) -> None:
+    """Of a vehicle that keeps its heading both are alike, the more so the less it leans."""
+    signals = circle(speed=4.0, wind=wind)
+    world, attitude = signals["velocity"].values, signals["attitude"].values
+    body = Rotation.from_quat(attitude, scalar_first=True).inv().apply(world)
+    noise = 0.05 * np.random.default_rng(1).normal(size=world.shape)
+    signals["velocity"] = Series(TIME, body + noise)
+    fixed, (note,) = correct_frames(signals, {})
+    assert (note.code, note.names) == (NoteCode.FRAME_TURNED, ("velocity", "in body axes"))
+    assert np.allclose(fixed["velocity"].values, world, atol=0.3)
+    signals["velocity"] = Series(TIME, world + noise)
+    assert correct_frames(signals, {})[1] == ()
 
 
 def test_a_moment_is_no_certainty() -> None:

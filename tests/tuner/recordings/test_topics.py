@@ -7,16 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.tuner.recordings import making
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.shipped import configs_folder
+from tuner.recordings.content import ReadOptions, read_signals
 from tuner.recordings.flight import SIGNALS
 from tuner.recordings.formats import READERS
+from tuner.recordings.interpolation import body_rate_of
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode, note_in_words
+from tuner.recordings.sources import recognised
 from tuner.recordings.topics import load_topic_map, read_sidecar, shipped_maps
 from tuner.recordings.unit_detection import UNITS, to_enu_flu
 
@@ -162,6 +166,44 @@ def test_columns_that_the_map_does_not_name_are_said(tmp_path: Path) -> None:
         + ", ".join(spare[:12])
         + ", ..."
     )
+
+
+def test_a_table_as_neurobem_has_it_needs_no_map(tmp_path: Path) -> None:
+    time = np.arange(0.0, 20.0, 0.01)
+    axes, angle = ("x", "y", "z"), 0.5 * np.sin(time)
+    columns = {"t": time}
+    columns |= {f"{of} {axis}": 9.0 + 0.0 * time for of in ("ang acc", "vel") for axis in axes}
+    columns |= {f"ang vel {axis}": 0.0 * time for axis in axes}
+    columns |= {
+        f"acc {axis}": np.full(len(time), value)
+        for axis, value in zip(axes, (0, 0, 9.81), strict=True)
+    }
+    columns |= {f"pos {axis}": 0.0 * time for axis in axes}
+    columns |= {"quat x": np.sin(angle / 2), "quat y": 0.0 * time, "quat z": 0.0 * time}
+    columns |= {"quat w": np.cos(angle / 2), "ang vel x": 0.5 * np.cos(time)}
+    columns |= {"pos y": 9.81 * 0.5 * np.sin(time)}
+    columns |= {f"mot {i}": 1000.0 + 100.0 * i + np.sin(time) for i in range(1, 5)}
+    columns |= {f"dmot {i}": np.cos(time) for i in range(1, 5)}
+    pd.DataFrame(columns).to_csv(tmp_path / "flight.csv", index=False)
+    signals = read_signals(ReadOptions.of(tmp_path / "flight.csv"))
+    assert set(signals.series) == {
+        "position", "attitude", "body_rate", "acceleration", "rotor_speed"
+    }  # fmt: skip
+    # front right, rear left, front left, rear right
+    assert np.round(signals.series["rotor_speed"].values.mean(axis=0), -2).tolist() == [
+        1200, 1300, 1400, 1100
+    ]  # fmt: skip
+    turning = body_rate_of(signals.series["attitude"].values)
+    assert np.allclose(turning[:, 0], signals.series["body_rate"].values[:, 0], atol=0.02)
+
+
+def test_what_turns_is_told_from_what_moves_by_the_columns_names() -> None:
+    kinds = ("angular_vel", "ang_acc", "lin_vel", "acc")
+    _, found = recognised(["t", *(f"{kind}_{axis}" for kind in kinds for axis in "xyz")], {})
+    assert {signal: source.fields[0] for signal, source in found.items() if source.fields} == {
+        "velocity": "lin_vel_x", "body_rate": "angular_vel_x", "acceleration": "acc_x"
+    }  # fmt: skip
+    assert recognised(["t", *(f"ang_acc_{axis}" for axis in "xyz")], {})[1] == {}
 
 
 def test_a_pattern_takes_the_busiest_topic_and_says_so(short: Path, tmp_path: Path) -> None:
