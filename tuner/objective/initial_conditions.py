@@ -248,6 +248,10 @@ def spun_up(
     return Start(start.motion, speeds, start.command, start.rate_integral)
 
 
+RIDGE = 1e-14
+"""Share of the diagonal that is added to it: of a flight that is lost rounding leaves no prior."""
+
+
 def eliminated(
     loss: NDArray[np.float64],
     gradient: NDArray[np.float64],
@@ -273,6 +277,7 @@ def eliminated(
     kept = gradient.shape[1] - begun.shape[1]
     pull = gradient[:, kept:] + begun
     own = hessian[:, kept:, kept:] + np.eye(begun.shape[1])
+    own = own + RIDGE * np.einsum("flk,lk->flk", own, np.eye(begun.shape[1]))
     across = hessian[:, kept:, :kept]
     finite = np.isfinite(own).all(axis=(1, 2))  # a flight that crashed may give none
     follow = np.full((*across.shape[:2], kept + 1), np.nan)

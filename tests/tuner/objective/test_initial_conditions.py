@@ -64,6 +64,14 @@ def test_elimination_is_the_minimum_over_the_start():
         )
 
 
+def test_the_start_of_a_lost_flight_has_a_minimum():
+    own = np.stack([np.eye(2), 1e20 * np.ones((2, 2))])
+    hessian = np.pad(own, ((0, 0), (1, 0), (1, 0)))
+    least, *_, best = eliminated(np.ones(2), np.ones((2, 3)), hessian, np.zeros((2, 2)))
+    assert best[:, 0] == pytest.approx(-0.5)
+    assert np.isfinite(least).all()
+
+
 @pytest.fixture(scope="module")
 def still():
     model = model_of(vehicle_file(), controller_file())
