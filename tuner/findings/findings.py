@@ -365,8 +365,8 @@ class Code(Worded):
     MODEL_UNMATCHED = (
         "model_unmatched",  # unmatched, flights, noise_multiple
         (
-            "It lacks an effect that flights share: the residuals of {unmatched:.0f} of "
-            "{flights:.0f} flights are about {noise_multiple:.0f} times the measurement noise."
+            "It lacks an effect: the residuals of {unmatched:.0f} of {flights:.0f} flights are "
+            "about {noise_multiple:.0f} times the measurement noise."
         ),
         "Judge the fit by held-out flights, not by its intervals.",
     )
@@ -536,7 +536,9 @@ def brief(finding: Finding, width: int) -> str:
     if len(f"{subject}: {what}. {to_do}") > width and to_do:
         to_do = f"{CLAUSE.split(to_do)[0].removesuffix('.')}."
     left = width - len(f"{subject}: . {to_do}")
-    return shorten(f"{subject}: {shorten(what, max(left, 12))}. {to_do}".rstrip(), width)
+    cut = shorten(what, max(left, 12))
+    end = "" if cut.endswith("…") else "."
+    return shorten(f"{subject}: {cut}{end} {to_do}".rstrip(), width)
 
 
 def _worded(text: Text, finding: Finding) -> str:
