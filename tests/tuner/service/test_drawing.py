@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tuner.service.shapes import CoefficientHistory, Point
-from tuner.service.web.comparison import history_bars
+from tuner.service.web.comparison import history_canvas
 
 
 def point(best: float, half: float) -> Point:
@@ -36,10 +36,12 @@ def test_numbers_at_an_axis_differ_and_stand_where_they_belong(
 ) -> None:
     half = best * width
     points = [point(sign * best, half), point(sign * best + moved * half, half)]
-    bars = history_bars(CoefficientHistory(unit="s", points=points))
-    labels = [float(tick.label) for tick in bars.y_ticks]
+    canvas = history_canvas(CoefficientHistory(unit="s", points=points))
+    labels = [float(label) for _, label in canvas.y_ticks]
     assert 2 <= len(set(labels)) == len(labels) <= 6
-    first = bars.bars[0]
-    of_unit = (first.low - first.y) / half
-    for label, tick in zip(labels, bars.y_ticks, strict=True):
-        assert tick.at == pytest.approx(first.y + (sign * best - label) * of_unit, abs=0.6)
+    first = canvas.y(sign * best)
+    of_unit = (canvas.y(sign * best - half) - first) / half
+    for value, label in canvas.y_ticks:
+        assert canvas.y(value) == pytest.approx(
+            first + (sign * best - float(label)) * of_unit, abs=0.6
+        )

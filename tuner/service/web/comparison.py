@@ -16,7 +16,7 @@ from tuner.core.files import MAX_BYTES
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.result import CoefficientResult, ExportRecord, ExportRecords, RunResult
 from tuner.service.errors import NotKnownError, NotNowError
-from tuner.service.shapes import CoefficientHistory, Point
+from tuner.service.shapes import CoefficientHistory
 from tuner.service.tables import JobRow
 from tuner.vehicle.registry import at_mass
 
@@ -145,50 +145,43 @@ MOST_POINTS = 600
 
 
 @dataclass(frozen=True)
-class Tick:
-    """A mark on an axis, and what it says."""
+class Canvas:
+    """Where numbers stand in a chart, and what its axes say.
 
-    at: float
-    label: str
+    Attributes
+    ----------
+    across, up
+        The numbers at both ends of the axes.
+    x_ticks, y_ticks
+        Numbers that are marked, and what is said of them.
+    points
+        Of a curve.
+    """
 
+    across: tuple[float, float]
+    up: tuple[float, float]
+    x_ticks: Sequence[tuple[float, str]]
+    y_ticks: Sequence[tuple[float, str]]
+    points: Sequence[tuple[float, float]] = ()
 
-@dataclass(frozen=True)
-class Curve:
-    """A line over iterations: SVG points, the last one, and ticks of both axes."""
+    def x(self, value: float) -> float:
+        """Return where a number stands along the chart."""
+        (first, last), width = self.across, WIDTH - LEFT - RIGHT
+        return round(LEFT + width * (value - first) / (last - first), 1)
 
-    points: str
-    last: tuple[float, float]
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
-
-
-@dataclass(frozen=True)
-class Bar:
-    """A coefficient with its interval, all in canvas units, and the point it stands for."""
-
-    x: float
-    y: float
-    low: float
-    high: float
-    point: Point
-
-
-@dataclass(frozen=True)
-class Bars:
-    """Points with intervals over time, and ticks of both axes."""
-
-    bars: tuple[Bar, ...]
-    x_ticks: tuple[Tick, ...]
-    y_ticks: tuple[Tick, ...]
+    def y(self, value: float) -> float:
+        """Return where a number stands below the top of the chart."""
+        (low, high), height = self.up, HEIGHT - TOP - BOTTOM
+        return round(HEIGHT - BOTTOM - height * (value - low) / (high - low), 1)
 
 
-def rmse_curve(rmse: Sequence[float]) -> Curve | None:
+def rmse_curve(rmse: Sequence[float]) -> Canvas | None:
     """Return the RMSE (m) of each iteration in turn, on a logarithmic axis in mm.
 
     None where there is nothing to draw yet.
     """
     known = [
-        (number, 1000 * value)
+        (number, math.log10(1000 * value))
         for number, value in enumerate(rmse, start=1)
         if value > 0 and math.isfinite(value)
     ]
@@ -196,50 +189,37 @@ def rmse_curve(rmse: Sequence[float]) -> Curve | None:
         return None
     step = -(-len(known) // MOST_POINTS)
     shown = [*known[:-1:step], known[-1]]
-    logs = [math.log10(value) for _, value in shown]
-    low, high = min(logs), max(logs)
+    low, high = min(y for _, y in shown), max(y for _, y in shown)
     if high - low < 0.3:
         low, high = low - 0.15, high + 0.15
     first, last = shown[0][0], max(shown[-1][0], shown[0][0] + 1)
     whole = range(first, last + 1, max(1, round((last - first) / 5)))
-    places = [
-        (_across(n, first, last), _up(y, low, high)) for (n, _), y in zip(shown, logs, strict=True)
-    ]
-    return Curve(
-        points=" ".join(f"{x:.1f},{y:.1f}" for x, y in places),
-        last=places[-1],
-        x_ticks=tuple(Tick(_across(n, first, last), str(n)) for n in whole),
-        y_ticks=tuple(Tick(_up(math.log10(v), low, high), f"{v:g}") for v in _decades(low, high)),
+    return Canvas(
+        across=(first, last),
+        up=(low, high),
+        x_ticks=[(n, str(n)) for n in whole],
+        y_ticks=[(math.log10(v), f"{v:g}") for v in _decades(low, high)],
+        points=shown,
     )
 
 
-def history_bars(history: CoefficientHistory) -> Bars:
-    """Return a coefficient over the jobs of a vehicle, one place each, in their order."""
+def history_canvas(history: CoefficientHistory) -> Canvas:
+    """Return a canvas for a coefficient over the jobs of a vehicle, one place each, in order.
+
+    The first point stands at 0.5, the next at 1.5.
+    """
     points = history.points
     ends = [value for point in points for value in (point.best, *(point.ci95 or ()))]
     low, high = min(ends), max(ends)
     margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
     low, high = low - margin, high + margin
-    bars = []
-    for number, point in enumerate(points):
-        x = _across(number + 0.5, 0, len(points))
-        bottom, top = point.ci95 or (point.best, point.best)
-        y, under, over = (_up(value, low, high) for value in (point.best, bottom, top))
-        bars.append(Bar(x, y, under, over, point))
-    every = -(-len(points) // 6)
-    days = tuple(
-        Tick(bar.x, (bar.point.flown or bar.point.ended or "")[:10]) for bar in bars[::every]
+    days = [(n + 0.5, (of.flown or of.ended or "")[:10]) for n, of in enumerate(points)]
+    return Canvas(
+        across=(0, len(points)),
+        up=(low, high),
+        x_ticks=days[:: -(-len(points) // 6)],
+        y_ticks=_round_numbers(low, high),
     )
-    values = tuple(Tick(_up(v, low, high), label) for v, label in _round_numbers(low, high))
-    return Bars(tuple(bars), days, values)
-
-
-def _across(value: float, first: float, last: float) -> float:
-    return LEFT + (WIDTH - LEFT - RIGHT) * (value - first) / (last - first)
-
-
-def _up(value: float, low: float, high: float) -> float:
-    return HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * (value - low) / (high - low)
 
 
 def _round_numbers(low: float, high: float) -> list[tuple[float, str]]:

@@ -40,7 +40,7 @@ from tuner.service.settings import size_in_words
 from tuner.service.shapes import API, iso
 from tuner.service.tables import FINISHED, JobRow, RecordingRow, State
 from tuner.service.web import comparison
-from tuner.service.web.comparison import history_bars, rmse_curve
+from tuner.service.web.comparison import history_canvas, rmse_curve
 from tuner.service.words import on_the_web
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
@@ -379,7 +379,7 @@ def list_vehicles(service: Served) -> Response:
 def show_vehicle(service: Served, name: str) -> Response:
     """Show every coefficient of a vehicle over time."""
     found = history(service.database, name)
-    charts = [(key, of, history_bars(of)) for key, of in found.coefficients.items()]
+    charts = [(key, of, history_canvas(of)) for key, of in found.coefficients.items()]
     return render("vehicle.html.jinja", vehicle=name, mass=found.mass, charts=charts)
 
 
