@@ -94,15 +94,19 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     if not rotors:
         raise ExportError(path, "has no motor with a link and a number", "give each motor its own")
     given = {} if params is None else read_parameters(params)
-    whole = composite(model)
     bodies = [*_of_bodies(model)]
-    hover = [*_of_hover(whole, rotors, _speeds(model, rotors, given))]
-    faults = [*bodies, *_of_rotors(rotors, model), *_of_layout(whole, rotors), *hover]
+    faults = [*bodies, *_of_rotors(rotors, model)]
+    mass = sum(body.mass for _, body in inertials(model))
+    if not mass > 0:  # of which nothing else can be judged
+        return Audit(path, mass, tuple(dict.fromkeys(faults)), ())
+    whole, speeds = composite(model), _speeds(model, rotors, given)
+    hover = [*_of_hover(whole, rotors, speeds)]
+    faults += [*_of_layout(whole, rotors), *hover]
     if not bodies and not any("times the weight" in fault for fault in hover):
         faults += _of_whole(whole, rotors)  # which else follows from those
     if params is not None:
         faults += outside_range(given)
-        faults += _of_parameters(given, whole, rotors, _speeds(model, rotors, given))
+        faults += _of_parameters(given, whole, rotors, speeds)
     differences = () if run is None else tuple(_against(run, whole, rotors))
     return Audit(path, whole.mass, tuple(dict.fromkeys(faults)), differences)
 
@@ -248,10 +252,17 @@ def _motor_constant(rotors: list[Rotor]) -> float:
     return sum(rotor.numbers.get("motorConstant", 0.0) for rotor in rotors)
 
 
-def _hover_throttle(whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float]) -> float:
-    """Return the share of the way from no to full command at which rotors carry the weight."""
-    low, high = speeds
-    return (math.sqrt(whole.mass * GRAVITY / _motor_constant(rotors)) - low) / (high - low)
+def _hover_throttle(
+    whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float] | None
+) -> float | None:
+    """Return the share of the way from no to full command at which rotors carry the weight.
+
+    None where speeds or thrust are not known, or there is no way between them.
+    """
+    constant, (low, high) = _motor_constant(rotors), speeds or (0.0, 0.0)
+    if not (constant > 0 and high > low):
+        return None
+    return (math.sqrt(whole.mass * GRAVITY / constant) - low) / (high - low)
 
 
 def _of_hover(
@@ -261,7 +272,8 @@ def _of_hover(
     if speeds is None or any("motorConstant" not in rotor.numbers for rotor in rotors):
         return
     constant, (low, high) = _motor_constant(rotors), speeds
-    if constant <= 0 or high <= low:
+    hover = _hover_throttle(whole, rotors, speeds)
+    if hover is None:
         yield f"motorConstant and speeds of {low:g} to {high:g} rad/s give no thrust"
         return
     weight = whole.mass * GRAVITY
@@ -273,7 +285,6 @@ def _of_hover(
             "are off"
         )
         return
-    hover = _hover_throttle(whole, rotors, speeds)
     if not HOVER[0] <= hover <= HOVER[1]:
         yield (
             f"it hovers at a throttle of {hover:.2f}, with rotors of {low:g} to {high:g} rad/s; "
@@ -304,12 +315,11 @@ def _of_parameters(
     mass = given.get("SIH_MASS")
     if mass is not None and not math.isclose(mass, whole.mass, rel_tol=SAME_SHARE):
         yield f"SIH_MASS is {mass:g} kg, the model weighs {whole.mass:.4g} kg"
-    hover = given.get("MPC_THR_HOVER")
-    of_model = speeds is not None and _motor_constant(rotors) > 0 and "SIH_T_MAX" not in given
-    if hover is not None and speeds is not None and of_model:
-        there = _hover_throttle(whole, rotors, speeds)
-        if abs(hover - there) > SAME_SHARE:
-            yield f"MPC_THR_HOVER is {hover:g}, the model hovers at a throttle of {there:.2f}"
+    hover, there = given.get("MPC_THR_HOVER"), _hover_throttle(whole, rotors, speeds)
+    if hover is None or there is None or "SIH_T_MAX" in given:
+        return
+    if abs(hover - there) > SAME_SHARE:
+        yield f"MPC_THR_HOVER is {hover:g}, the model hovers at a throttle of {there:.2f}"
 
 
 def _against(run: Run, whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:

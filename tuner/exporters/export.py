@@ -299,7 +299,13 @@ def provenance(run: Run, today: date, accepted: str = "") -> str:
     """Return one line that says where the numbers come from."""
     fitted = [flight.name for flight in run.result.flights if flight.split == "fit"]
     line = f"fitted to {', '.join(fitted)}; run {run.folder.resolve().name}; {today.isoformat()}"
-    return f"{line}; exported against a refusal: {accepted}" if accepted else line
+    return _one_line(line, accepted)
+
+
+def _one_line(provenance: str, accepted: str) -> str:
+    """Return where numbers come from, and why in spite of a refusal, for a comment of any file."""
+    line = f"{provenance}; exported against a refusal: {accepted}" if accepted else provenance
+    return " ".join("".join(c if c.isprintable() else " " for c in line).split())
 
 
 def provenance_of_file(
@@ -308,15 +314,13 @@ def provenance_of_file(
     """Return a line on where a vehicle file's numbers come from, and one on each that it says."""
     how = vehicle.source.get("method", "as the vehicle file has it")
     line = f"{file.name}: {how}; no flight was compared; {today.isoformat()}"
-    if accepted:
-        line = f"{line}; exported against a refusal: {accepted}"
     values = values_of(vehicle)
     sources = tuple(
         f"{name} {quantity(values[name], COEFFICIENTS[name])}: {text}"
         for name, text in vehicle.source.items()
         if name in values
     )
-    return " ".join(line.split()), sources
+    return _one_line(line, accepted), sources
 
 
 def _confidence(run: Run, name: str) -> dict[str, JsonValue]:

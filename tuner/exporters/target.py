@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from ast import Assign, Dict, Name, literal_eval, parse
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -86,6 +87,11 @@ def assigned(path: Path) -> dict[str, Any]:
         if isinstance(statement, Assign) and isinstance(statement.targets[0], Name)
         if not isinstance(statement.value, Dict) or None not in statement.value.keys
     }
+
+
+def xml_comment(text: str) -> str:
+    """Return a line as an XML comment may hold it, in a Jinja template too."""
+    return re.sub(r"-(?=-)|\{(?=[{%#])", r"\g<0> ", text)
 
 
 def write(draft: Draft, path: Path, others: Mapping[Path, Path] | None = None) -> None:

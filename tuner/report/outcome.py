@@ -70,7 +70,7 @@ LOOKS = {Usability.USABLE: "well", Usability.WITH_CARE: "weak", Usability.UNUSAB
 
 @dataclass(frozen=True)
 class FlightOutcome:
-    """How closely a flight is flight.
+    """How closely a flight is met.
 
     Attributes
     ----------

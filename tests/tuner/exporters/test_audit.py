@@ -118,6 +118,25 @@ def test_parameters_are_held_against_the_model(vehicle, tmp_path):
         assert any(fault.startswith(name) and expected in fault for fault in faults), faults
 
 
+HOVER, EQUAL = "MPC_THR_HOVER\t0.5\t9", "SIM_GZ_EC_{}1\t500\t6"
+
+
+@pytest.mark.parametrize(
+    ("mass", "parameters", "said"),
+    [
+        (None, (HOVER, EQUAL.format("MIN"), EQUAL.format("MAX")), "speeds of 500 to 500 rad/s"),
+        ("-3", (HOVER,), "its mass -3 kg is not positive"),
+        ("0", (), "its mass 0 kg is not positive"),
+    ],
+)
+def test_what_has_no_hover_is_no_internal_error(mass, parameters, said, tmp_path):
+    model, params = tmp_path / "quad.sdf", tmp_path / "quad.params"
+    text = GZ.read_text()
+    model.write_text(text if mass is None else re.sub(r"<mass>[^<]*<", f"<mass>{mass}<", text))
+    params.write_text("".join(f"1\t1\t{line}\n" for line in parameters))
+    assert said in "\n".join(audit(model, params).faults)
+
+
 def test_coefficients_are_compared_with_a_runs(make_run, capsys):
     run = make_run()
     assert main(["audit", str(CLASSIC), "--run", str(run.folder), "--json"]) == 0

@@ -1,6 +1,7 @@
 import shutil
 from datetime import date
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -128,6 +129,19 @@ def test_a_reason_overrides_and_stands_in_the_file(make_run, bad, _expected):
     done = exported(make_run(**bad), accept="only to look at")
     assert "exported against a refusal: only to look at" in done.path.read_text()
     assert not all(gate.passed for gate in done.gates)
+
+
+@pytest.mark.parametrize("kind", ["sdf", "mujoco", "yaml", "rotorpy"])
+def test_a_reason_of_any_letters_leaves_the_file_readable(make_run, kind, tmp_path):
+    run, model = make_run(**BAD[0][0]), tmp_path / "quad.sdf"
+    shutil.copy(MODELS / "quad_x.sdf", model)
+    into = {"into": model} if kind == "sdf" else {}
+    for _ in range(2):  # and goes into it once more
+        done = exported(run, kind, accept="odd --- it\x07\u2028has {{ c }} and {% if %}", **into)
+    text = done.path.read_text()
+    assert text.count("odd ") == 1
+    if kind in ("sdf", "mujoco"):
+        ElementTree.fromstring(text)
 
 
 def test_a_crash_or_another_rmse_when_flown_again_is_refused(make_run):

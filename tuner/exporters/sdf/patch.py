@@ -31,7 +31,7 @@ from tuner.exporters.simulators import (
     rotor_speed,
     with_speeds_in,
 )
-from tuner.exporters.target import Draft, differences, read_file
+from tuner.exporters.target import Draft, differences, read_file, xml_comment
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
@@ -250,7 +250,7 @@ def _through_variable(edit: Edit) -> Edit:
 
 def _provenance_edit(model: Element, provenance: str) -> Edit:
     """Return the edit of a file that puts our comment first in a model, or for an earlier one."""
-    comment = f"<!-- {PROVENANCE}: {provenance.replace('--', '- -')} -->"
+    comment = f"<!-- {PROVENANCE}: {xml_comment(provenance)} -->"
     earlier = re.search(rf"<!-- {PROVENANCE}: .*?-->", model.source.raw, re.DOTALL)
     if earlier:
         return Edit(model.source, earlier.start(), earlier.end(), comment)

@@ -14,7 +14,7 @@ from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import MUJOCO, drag_at_hover, full_thrust, rotor_speed, thrust_at
-from tuner.exporters.target import Draft, Target, differences, read_file
+from tuner.exporters.target import Draft, Target, differences, read_file, xml_comment
 from tuner.vehicle import VehicleFile
 
 _AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
@@ -51,7 +51,7 @@ def mjcf(vehicle: VehicleFile, provenance: str) -> str:
                 )
     moments = " ".join(map(_number, (inertia.xx, inertia.yy, inertia.zz)))
     size = " ".join(_number(max(abs(r.position[axis]) for r in vehicle.rotors)) for axis in (0, 1))
-    comment = provenance.replace("--", "- -") + _USE
+    comment = xml_comment(provenance) + _USE
     return f"""<mujoco model={quoteattr(vehicle.name)}>
   <!-- {comment.strip()} -->
   <compiler angle="radian" autolimits="true"/>

@@ -11,7 +11,7 @@ from tuner.exporters.sdf.patch import sdf_draft, simulator_of
 from tuner.exporters.sdf.spans import parse
 from tuner.exporters.sdf.tags import values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM, Simulator, gz_unit, with_speeds_in
-from tuner.exporters.target import Draft, Target, differences, read_file
+from tuner.exporters.target import Draft, Target, differences, read_file, xml_comment
 from tuner.vehicle import VehicleFile
 
 TEMPLATE = Path(__file__).parents[1] / "sdf" / "snippet.sdf.jinja"
@@ -62,7 +62,7 @@ def _text(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> str:
         for index in range(len(vehicle.rotors))
     ]
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        provenance=provenance.replace("--", "- -"),
+        provenance=xml_comment(provenance),
         simulator=simulator.name,
         mass=tags.as_text(vehicle.mass),
         ixx=tags.as_text(inertia.xx),
