@@ -16,8 +16,8 @@ import numpy as np
 from benchmarks import fast_flights
 from benchmarks.table import Section, figure
 from tuner.config import Options, settle
-from tuner.equation_error.measured import Measured, measured
-from tuner.equation_error.regression import adding, convolved
+from tuner.equation_error.recorded_accelerations import Measured, measured
+from tuner.equation_error.regression import convolved, summing
 from tuner.job.run import run
 from tuner.recordings.flight import Flight
 from tuner.result import RunResult
@@ -115,7 +115,7 @@ def _regression(
             for axis in range(3)
         ]
         table = np.stack(left, axis=1)
-        off = convolved(table, part.known, adding(part, ahead)[0])
+        off = convolved(table, part.known, summing(part.step, ahead))
         errors.append(float(np.linalg.norm(off, axis=1).mean()))
     return float(np.mean(errors))
 

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from tuner.core.numerics import Array
-from tuner.equation_error.command_accelerations import CommandAccelerations, Commands
-from tuner.equation_error.measured import Mask, Measured
-from tuner.equation_error.model import Accelerations, ModelAccelerations, values_at
+from tuner.equation_error.model_accelerations import ModelAccelerations, values_at
+from tuner.equation_error.recorded_accelerations import Commands, Mask, Measured
 from tuner.equation_error.regression import (
     MEMORY,
     Regression,
-    adding,
     convolved,
-    predicting,
+    minimised,
     regress,
+    summing,
 )
 from tuner.objective.space import Space
 from tuner.vehicle import COEFFICIENTS
@@ -34,7 +33,7 @@ AHEAD = 0.3
 """s over which `GAINS` are fitted to predict: between those at which predictions are compared."""
 HORIZONS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
 """s over which predictions are compared with holding the state."""
-FORCES, TILTING = slice(0, 3), slice(3, 5)
+TILTING = slice(3, 5)
 """Axes of accelerations."""
 
 
@@ -90,63 +89,55 @@ def estimate(
         Where rotors follow these: all, and every second, which tells what is not known of the time
         between two.
     """
-    model = with_terms_computed(model, [n for n in space.free if _may_be_absent(model, n)])
-    parts, noisy = tuple(flights), not commands
-    made: ModelAccelerations = (
-        Accelerations(model, space.parameters, parts)
-        if noisy
-        else CommandAccelerations(model, space.parameters, commands[0], parts)
+    absent = [n for n in space.free if COEFFICIENTS[n].is_effect and n not in model.vehicle.effects]
+    made = ModelAccelerations(
+        with_terms_computed(model, absent), space.parameters, tuple(flights), *commands[:1]
     )
-    names = np.array(space.names)
+    names, quiet = np.array(space.names), made.noiseless
     begin = np.array([p.scaled(p.initial) for p in space.parameters])
-    acts = np.any(
-        [np.any(one.columns != 0.0, axis=(0, 1)) for one in made.at(begin, noise=False)], axis=0
-    )
-    free = acts & ~np.isin(names, GAINS)
+    acts = np.any([np.any(one.columns != 0.0, axis=(0, 1)) for one in quiet.at(begin)], axis=0)
+    is_gain = np.isin(names, GAINS)
+    free = acts & ~is_gain
     groups = {
         group: np.isin(names, members)
         for group, members in candidates.items()
         if np.all(free[np.isin(names, members)])
     }
-    full = regress(made, begin, free=free, noisy=noisy)
+    full = regress(made, begin, free=free)
     rows, out = _selected(full, groups, candidates, begin, free)
     free = free & ~out
-    near = partial(regress, made, free=free, near=True)
-    found = near(np.where(out, begin, full.point), noisy=noisy)
-    halved = near(found.point, memory=0.5 * MEMORY, noisy=noisy)
-    noiseless = near(found.point, noisy=False) if noisy else found
-    coarser = found
+    found = regress(made, np.where(out, begin, full.point), free=free, near=True)
+    again = partial(regress, begin=found.point, free=free, near=True)
+    others = [(1.0, again(made, memory=0.5 * MEMORY))]
+    if made.noisy:
+        others.append((NOISE_KNOWN, again(quiet)))
     if commands:
-        seldom = CommandAccelerations(model, space.parameters, commands[1], parts)
-        coarser = regress(seldom, found.point, free=free, near=True, noisy=False)
+        others.append((1.0, again(replace(made, commands=commands[1]))))
     errors = np.sqrt(
         np.diag(found.covariance)
-        + (halved.point - found.point) ** 2
         + np.where(free, full.point - found.point, 0.0) ** 2
-        + (NOISE_KNOWN * (noiseless.point - found.point)) ** 2
-        + (coarser.point - found.point) ** 2
+        + sum((share * (other.point - found.point)) ** 2 for share, other in others)
     )
-    predicted = predicting(made, found.point, free=acts & np.isin(names, GAINS), seconds=AHEAD)
-    values = values_at(space.parameters, predicted)
-    kept = {name for name, is_in in zip(names, free | np.isin(names, GAINS), strict=True) if is_in}
+    predicted = minimised(
+        quiet,
+        found.point,
+        lambda one: [summing(one.steps.step, AHEAD)] * 6,
+        mean=found.point,
+        free=acts & is_gain,
+    )
+
+    def named(numbers: Array, which: Mask) -> dict[str, float]:
+        rows = zip(space.parameters, numbers, which, strict=True)
+        return {name: float(x) for p, x, is_in in rows if is_in for name in p.ratios}
+
+    values, kept = values_at(space.parameters, predicted), named(errors, free | is_gain)
     return Estimate(
-        values={
-            name: values[name] for p in space.parameters if p.name in kept for name in p.ratios
-        },
-        errors={
-            name: float(error)
-            for p, error, is_in in zip(space.parameters, errors, free, strict=True)
-            if is_in
-            for name in p.ratios
-        },
+        values={name: values[name] for name in kept},
+        errors=named(errors, free),
         rows=rows,
-        explained=_explained(made, found.point),
-        horizon=_horizon(made, predicted),
+        explained=_explained(quiet, found.point),
+        horizon=_horizon(quiet, predicted),
     )
-
-
-def _may_be_absent(model: Model, name: str) -> bool:
-    return COEFFICIENTS[name].is_effect and name not in model.vehicle.effects
 
 
 def _selected(
@@ -169,7 +160,10 @@ def _selected(
             group: _left_out(full, begin, free, out | members) - whole
             for group, members in left.items()
         }
-        worth = {group: (float(g.sum()), _scatter(g)) for group, g in gains.items()}
+        worth = {
+            group: (float(g.sum()), float(np.sqrt(len(g)) * g.std(ddof=1)))
+            for group, g in gains.items()
+        }
         worst = min(worth, key=lambda group: worth[group][0] - worth[group][1])
         gain, scatter = worth[worst]
         if gain > scatter:
@@ -182,19 +176,11 @@ def _selected(
 
 def _left_out(full: Regression, begin: Array, free: Mask, out: Mask) -> Array:
     """Return each unit's (U,) loss with what meets the others, some coordinates at the start."""
-    count = len(full.sums.slope)
     away = np.where(out, begin - full.point, 0.0)
-    losses = []
-    for unit in range(count):
-        others = np.arange(count) != unit
-        change = full.sums.solved(full.prior, full.pull, free=free & ~out, units=others, moved=away)
-        losses.append(full.sums.losses(change, ~others)[0])
-    return np.array(losses)
-
-
-def _scatter(gains: Array) -> float:
-    """Return the standard deviation of a sum over units."""
-    return float(np.sqrt(len(gains)) * gains.std(ddof=1))
+    units = np.eye(len(full.sums.slope), dtype=bool)
+    return np.concatenate(
+        [full.sums.losses(full.sums.solved(free & ~out, ~unit, away), unit) for unit in units]
+    )
 
 
 def _row(
@@ -213,24 +199,28 @@ def _row(
 
 def _explained(made: ModelAccelerations, point: Array) -> Array:
     """Return the shares (6,) of recorded accelerations that are explained."""
-    left, there = [], []
-    for one, part in zip(made.at(point, noise=False), made.flights, strict=True):
-        left.append(one.left[part.known])
-        there.append(part.accelerations[part.known])
-    varies = np.concatenate(there).var(axis=0)
-    return np.asarray(1.0 - np.mean(np.concatenate(left) ** 2, axis=0) / varies)
+    linear = made.at(point)
+    left = np.concatenate([one.left[one.steps.known] for one in linear])
+    there = np.concatenate([one.steps.accelerations[one.steps.known] for one in linear])
+    return np.asarray(1.0 - np.mean(left**2, axis=0) / there.var(axis=0))
 
 
 def _horizon(made: ModelAccelerations, point: Array) -> float | None:
     """Return the s up to which predictions of roll and pitch rate beat holding them."""
-    linear, reached = made.at(point, noise=False), None
+    linear, reached = made.at(point), None
     for seconds in HORIZONS:
-        squares = np.zeros(2)
-        for one, part in zip(linear, made.flights, strict=True):
-            kernel = adding(part, seconds)[0]
-            for place, rows in enumerate((one.left, part.accelerations)):
-                squares[place] += np.sum(convolved(rows[:, TILTING], part.known, kernel) ** 2)
-        if squares[0] >= squares[1]:
+        missed, turned = np.sum(
+            [
+                [
+                    np.sum(convolved(rows[:, TILTING], one.steps.known, kernel) ** 2)
+                    for rows in (one.left, one.steps.accelerations)
+                ]
+                for one in linear
+                for kernel in [summing(one.steps.step, seconds)]
+            ],
+            axis=0,
+        )
+        if missed >= turned:
             break
         reached = seconds
     return reached

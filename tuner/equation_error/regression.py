@@ -16,15 +16,16 @@ Three things spoil a plain regression of accelerations on what recorded rotors m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import Z95, Array, robust_sd
-from tuner.equation_error.measured import Mask, Measured
-from tuner.equation_error.model import Linear, ModelAccelerations
+from tuner.core.numerics import Z95, Array, huber_weights, robust_sd
+from tuner.equation_error.model_accelerations import Linear, ModelAccelerations
+from tuner.equation_error.recorded_accelerations import Mask
 
 MEMORY = 0.1
 """s of errors from which the next one is predicted."""
@@ -39,43 +40,42 @@ FEWEST_UNITS = 3
 ROBUST = 3.0
 """Standard deviations beyond which an error counts linearly."""
 
-Kernels = Sequence[Array]
-"""For each axis, what errors are convolved with before they are weighed."""
-PLAIN: Kernels = (np.ones(1),) * 6
+Filter = Callable[[Linear], Sequence[Array]]
+"""Of a flight: for each axis, what errors are convolved with before they are weighed."""
 
 
 @dataclass(frozen=True)
-class Sums:
+class NormalEquations:
     """Normal equations of U units, flights or parts of them, about a point.
 
     Attributes
     ----------
     information, slope, loss
         (U, K, K), (U, K) and (U,): half the weighed squares are c - s·x + x·A·x / 2 at a change x.
+    prior, pull
+        (K,) information and slope of the priors.
     """
 
     information: Array
     slope: Array
     loss: Array
+    prior: Array
+    pull: Array
 
-    def solved(
-        self, prior: Array, pull: Array, *, free: Mask, units: Mask, moved: Array | None = None
-    ) -> Array:
+    def solved(self, free: Mask, units: Mask | slice, moved: Array | None = None) -> Array:
         """Return the change (K,) that meets some units (U,) best, of coordinates (K,) that move.
 
         Parameters
         ----------
-        prior, pull
-            (K,) information and slope of the priors.
         free, units
             Which coordinates move, and which units are met.
         moved
             (K,) the change of those that do not; none by default.
         """
-        change = np.zeros(len(pull)) if moved is None else np.where(free, 0.0, moved)
-        information = self.information[units].sum(axis=0) + np.diag(prior)
-        slope = self.slope[units].sum(axis=0) + pull - information @ change
-        unit = prior[free] ** -0.5
+        change = np.zeros(len(free)) if moved is None else np.where(free, 0.0, moved)
+        information = self.information[units].sum(axis=0) + np.diag(self.prior)
+        slope = self.slope[units].sum(axis=0) + self.pull - information @ change
+        unit = self.prior[free] ** -0.5
         scaled = information[np.ix_(free, free)] * np.outer(unit, unit)
         change[free] = unit * np.linalg.lstsq(scaled, unit * slope[free], rcond=1e-12)[0]
         return change
@@ -95,16 +95,14 @@ class Regression:
     ----------
     point
         (K,) scaled coordinates.
-    prior, pull
-        (K,) information and slope of the priors there.
+    sums
+        About it.
     covariance
         (K, K) of the coordinates, priors included.
     """
 
     point: Array
-    sums: Sums
-    prior: Array
-    pull: Array
+    sums: NormalEquations
     covariance: Array
 
 
@@ -114,7 +112,6 @@ def regress(
     *,
     free: Mask,
     memory: float = MEMORY,
-    noisy: bool = True,
     near: bool = False,
 ) -> Regression:
     """Return the coordinates that meet recorded accelerations best.
@@ -127,108 +124,82 @@ def regress(
         (K,) which of them move.
     memory
         s, as `MEMORY`.
-    noisy
-        Whether the noise of rotor speeds is taken off.
     near
         Whether it begins near its end, so that errors are filtered from the first step on.
     """
     mean = np.array([p.prior_mean for p in made.parameters])
-    prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
-
-    def whitened(linear: Sequence[Linear]) -> list[Kernels]:
-        pairs = zip(linear, made.flights, strict=True)
-        return [whitening(one, part, memory) for one, part in pairs]
-
+    whitened, quiet = partial(whitening, memory=memory), made.noiseless
+    stages: list[tuple[ModelAccelerations, Filter]] = [(quiet, _plain), (quiet, whitened)]
+    if made.noisy:
+        stages.append((made, whitened))
     point = np.array(begin, float)
-    stages = ((False, False), (True, False), (True, True))[: 3 if noisy else 2]
-    for white, last in stages[-1:] if near else stages:
-        for _ in range(ROUNDS):
-            linear = made.at(point, noise=last)
-            kernels = whitened(linear) if white else [PLAIN] * len(linear)
-            sums = sums_of(linear, made.flights, kernels, noisy=last)
-            point, arrived = _stepped(
-                made, point, sums, pull=prior * (mean - point), prior=prior, free=free
-            )
-            if arrived:
-                break
-    linear = made.at(point, noise=noisy)
-    sums = sums_of(linear, made.flights, whitened(linear), noisy=noisy)
-    pull = prior * (mean - point)
-    return Regression(point, sums, prior, pull, _covariance(sums, prior, pull, free))
+    for source, filters in stages[-1:] if near else stages:
+        point = minimised(source, point, filters, mean=mean, free=free)
+    sums = _sums_at(made, point, whitened, mean)
+    return Regression(point, sums, _covariance(sums, free))
 
 
-def predicting(made: ModelAccelerations, begin: Array, *, free: Mask, seconds: float) -> Array:
-    """Return the coordinates (K,) that predict velocity and body rate best, so many s ahead.
+def minimised(
+    made: ModelAccelerations, begin: Array, filters: Filter, *, mean: Array, free: Mask
+) -> Array:
+    """Return the coordinates (K,) whose filtered errors are the least, by Gauss and Newton's steps.
 
-    Along the recorded motion, which is not simulated: errors are added up over the stretch, as an
-    open loop would. ``begin`` and ``free`` are as of `regress`; priors lie about the beginning.
+    Inside their bounds, with priors about a mean (K,); ``begin`` and ``free`` are as of `regress`.
     """
-    prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
+    unit = np.array([p.usual or 1.0 for p in made.parameters])
+    low = np.array([p.scaled(p.lower) for p in made.parameters])
+    high = np.array([p.scaled(p.upper) for p in made.parameters])
     point = np.array(begin, float)
     for _ in range(ROUNDS):
-        linear = made.at(point, noise=False)
-        kernels = [adding(part, seconds) for part in made.flights]
-        sums = sums_of(linear, made.flights, kernels, noisy=False)
-        point, arrived = _stepped(
-            made, point, sums, pull=prior * (begin - point), prior=prior, free=free
-        )
-        if arrived:
+        change = _sums_at(made, point, filters, mean).solved(free, slice(None))
+        step = np.clip(change, -LONGEST * unit, LONGEST * unit)
+        point = np.clip(point + step, low, high)
+        if np.abs(step / unit).max() < SETTLED:
             break
     return point
 
 
-def adding(part: Measured, seconds: float) -> Kernels:
-    """Return the filter that adds accelerations up to the change over so many s."""
-    return (np.ones(max(1, round(seconds / part.step))) * part.step,) * 6
+def _sums_at(
+    made: ModelAccelerations, point: Array, filters: Filter, mean: Array
+) -> NormalEquations:
+    """Return the normal equations about a point (K,), with priors about a mean (K,)."""
+    prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
+    parts = 1 if len(made.flights) >= FEWEST_UNITS else FEWEST_UNITS
+    sums = [filtered_sums(one, filters(one), parts) for one in made.at(point)]
+    information, slope, loss = (np.concatenate(units) for units in zip(*sums, strict=True))
+    return NormalEquations(information, slope, loss, prior, prior * (mean - point))
 
 
-def _stepped(
-    made: ModelAccelerations, point: Array, sums: Sums, *, pull: Array, prior: Array, free: Mask
-) -> tuple[Array, bool]:
-    """Return the point a step on, inside the bounds, and whether it has arrived there."""
-    unit = np.array([p.usual or 1.0 for p in made.parameters])
-    change = sums.solved(prior, pull, free=free, units=np.ones(len(sums.slope), bool))
-    step = np.clip(change, -LONGEST * unit, LONGEST * unit)
-    low = np.array([p.scaled(p.lower) for p in made.parameters])
-    high = np.array([p.scaled(p.upper) for p in made.parameters])
-    return np.clip(point + step, low, high), bool(np.abs(step / unit).max() < SETTLED)
+def filtered_sums(one: Linear, kernels: Sequence[Array], parts: int) -> tuple[Array, Array, Array]:
+    """Return information (U, K, K), slope (U, K) and loss (U,) of a flight in so many parts.
 
-
-def sums_of(
-    linear: Sequence[Linear],
-    flights: Sequence[Measured],
-    kernels: Sequence[Kernels],
-    *,
-    noisy: bool,
-) -> Sums:
-    """Return the normal equations of errors that are filtered, each axis by a kernel of its own.
-
-    Parameters
-    ----------
-    noisy
-        Whether the noise of rotor speeds is taken off.
+    Of errors that are filtered, each axis by a kernel of its own; the noise of rotor speeds is
+    taken off.
     """
-    parts = 1 if len(flights) >= FEWEST_UNITS else FEWEST_UNITS
-    size = linear[0].columns.shape[-1]
-    information = np.zeros((parts * len(flights), size, size))
-    slope, loss = np.zeros((parts * len(flights), size)), np.zeros(parts * len(flights))
-    for number, (one, part, of_axes) in enumerate(zip(linear, flights, kernels, strict=True)):
-        for axis, kernel in enumerate(of_axes):
-            table = np.column_stack([one.left[:, axis], one.columns[:, axis]])
-            rows = convolved(table, part.known, kernel)
-            if not len(rows):
-                continue
-            sigma = spread(rows[:, 0])
-            of_noise = part.noise**2 * _squares(kernel, part.weights) if noisy else 0.0
-            for unit, stretch in enumerate(np.array_split(rows / sigma, parts), parts * number):
-                errors, columns = stretch[:, 0], stretch[:, 1:]
-                robust = np.minimum(1.0, ROBUST / np.maximum(np.abs(errors), 1e-12))
-                weighed = columns * robust[:, None]
-                loss[unit] += 0.5 * float(np.sum(robust * errors**2))
-                off = robust.sum() * of_noise / sigma**2
-                information[unit] += weighed.T @ columns - off * one.moved[axis]
-                slope[unit] += weighed.T @ errors + off * one.crossed[axis]
-    return Sums(information, slope, loss)
+    size, steps = one.columns.shape[-1], one.steps
+    information, slope, loss = (
+        np.zeros((parts, size, size)),
+        np.zeros((parts, size)),
+        np.zeros(parts),
+    )
+    for axis, kernel in enumerate(kernels):
+        table = np.column_stack([one.left[:, axis], one.columns[:, axis]])
+        rows = convolved(table, steps.known, kernel)
+        if not len(rows):
+            continue
+        sigma = spread(rows[:, 0])
+        of_noise = (steps.noise / sigma) ** 2 * _noise_gain(kernel, steps.weights)
+        for unit, stretch in enumerate(np.array_split(rows / sigma, parts)):
+            errors, columns = stretch[:, 0], stretch[:, 1:]
+            robust = huber_weights(errors, ROBUST)
+            weighed = columns * robust[:, None]
+            loss[unit] += 0.5 * float(np.sum(robust * errors**2))
+            information[unit] += weighed.T @ columns
+            slope[unit] += weighed.T @ errors
+            if steps.noise > 0.0:
+                information[unit] -= robust.sum() * of_noise * one.moved[axis]
+                slope[unit] += robust.sum() * of_noise * one.crossed[axis]
+    return information, slope, loss
 
 
 def convolved(table: Array, known: Mask, kernel: Array) -> Array:
@@ -246,10 +217,19 @@ def spread(values: Array) -> float:
     return max(float(robust_sd(values)), 1e-9)
 
 
-def whitening(one: Linear, part: Measured, memory: float) -> Kernels:
+def summing(step: float, seconds: float) -> Array:
+    """Return the filter that adds accelerations up to the change over so many s."""
+    return np.ones(max(1, round(seconds / step))) * step
+
+
+def _plain(one: Linear) -> Sequence[Array]:
+    return [np.ones(1)] * one.left.shape[1]
+
+
+def whitening(one: Linear, memory: float) -> Sequence[Array]:
     """Return for each axis the filter that leaves of errors what those before do not predict."""
-    order = max(1, round(memory / part.step))
-    return tuple(whitening_filter(errors, part.known, order) for errors in one.left.T)
+    order = max(1, round(memory / one.steps.step))
+    return [whitening_filter(errors, one.steps.known, order) for errors in one.left.T]
 
 
 def whitening_filter(errors: Array, known: Mask, order: int) -> Array:
@@ -262,28 +242,26 @@ def whitening_filter(errors: Array, known: Mask, order: int) -> Array:
     return np.concatenate([[1.0], -predicted[::-1]])
 
 
-def _squares(kernel: Array, weights: Array) -> float:
+def _noise_gain(kernel: Array, weights: Array) -> float:
     """Return the variance of a filtered mean of rotor samples over that of one sample."""
     inside = len(weights) - 1
-    total = np.zeros(inside * len(kernel) + 1)
-    for lag, weight in enumerate(kernel):
-        total[inside * lag : inside * (lag + 1) + 1] += weight * weights
-    return float(total @ total)
+    each = np.zeros(inside * (len(kernel) - 1) + 1)
+    each[::inside] = kernel
+    return float(np.sum(np.convolve(each, weights) ** 2))
 
 
-def _covariance(sums: Sums, prior: Array, pull: Array, free: Mask) -> Array:
+def _covariance(sums: NormalEquations, free: Mask) -> Array:
     """Return the coordinates' covariance: of what is new in errors, or of leaving units out.
 
     The larger of both for each coordinate: errors that are not as their model has them scatter from
     flight to flight, which a few flights tell roughly (Student). What does not move has none.
     """
-    count, unit = len(sums.slope), prior[free] ** -0.5
-    information = sums.information.sum(axis=0) + np.diag(prior)
+    count, unit = len(sums.slope), sums.prior[free] ** -0.5
+    information = sums.information.sum(axis=0) + np.diag(sums.prior)
     inside, covariance = np.ix_(free, free), np.zeros_like(information)
     scaled = information[inside] * np.outer(unit, unit)
     covariance[inside] = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) * np.outer(unit, unit)
-    every = ~np.eye(count, dtype=bool)
-    left_out = np.stack([sums.solved(prior, pull, free=free, units=units) for units in every])
+    left_out = np.stack([sums.solved(free, units) for units in ~np.eye(count, dtype=bool)])
     student = stdtrit(count - 1, 0.975) / Z95
     scatter = student**2 * (count - 1) * left_out.var(axis=0)
     least = np.maximum(np.diag(covariance), 0.0)

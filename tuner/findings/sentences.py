@@ -37,7 +37,7 @@ GOES_WITH: Mapping[str, str] = {
     "rate_squared": "the square of the body rate about it",
     "other_rates": "the product of the other two body rates",
 }
-"""What a force or moment may go with, as of `tuner.equation_error.unexplained`."""
+"""What a force or moment may go with, as of `tuner.equation_error.omitted_laws`."""
 TERMS_LIKE: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("force", "airspeed"): ("rotor_drag_ratio", "linear_drag", "thrust_inflow"),
     ("force", "airspeed_squared"): ("fuselage_drag",),

@@ -13,9 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.errors import ConfigError
-from tuner.equation_error.command_accelerations import Commands, moves_rotors, read_commands
 from tuner.equation_error.estimate import GAINS, Estimate, estimate
-from tuner.equation_error.measured import Measured, measured
+from tuner.equation_error.model_accelerations import moves_rotors
+from tuner.equation_error.recorded_accelerations import (
+    Commands,
+    Measured,
+    measured,
+    read_commands,
+)
 from tuner.findings.findings import Code, Finding
 from tuner.objective.space import extended
 from tuner.search.problem import Job, job_of

@@ -11,8 +11,8 @@ import numpy as np
 from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
-from tuner.equation_error.measured import Measured, measured, rows_of
-from tuner.equation_error.regression import convolved
+from tuner.equation_error.recorded_accelerations import Measured, measured, rows_of
+from tuner.equation_error.regression import convolved, summing
 from tuner.findings.findings import Code, Finding
 from tuner.objective.inlets import INLETS
 from tuner.objective.rotor_signals import Explained, Source, explained, levers, motor_order
@@ -33,7 +33,6 @@ def predicts_turning(flight: Flight, vehicle: VehicleFile) -> bool:
     steps = measured(flight)
     if steps is None:
         return False
-    kernel = np.ones(round(AHEAD / steps.step)) * steps.step
     half, squares = len(steps.rotor_speed) // 2, np.zeros(2)
     for axis in (0, 1):
         columns, turning = regressors(steps, vehicle)[axis], steps.accelerations[:, 3 + axis]
@@ -41,7 +40,9 @@ def predicts_turning(flight: Flight, vehicle: VehicleFile) -> bool:
             inside = fitted & steps.known
             weights = np.linalg.lstsq(columns[inside], turning[inside], rcond=None)[0]
             left = np.stack([turning - columns @ weights, turning], axis=1)[~fitted]
-            squares += np.sum(convolved(left, steps.known[~fitted], kernel) ** 2, axis=0)
+            squares += np.sum(
+                convolved(left, steps.known[~fitted], summing(steps.step, AHEAD)) ** 2, axis=0
+            )
     return bool(squares[0] < squares[1])
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
 from tuner.core.numerics import Array
-from tuner.equation_error.measured import Mask, measured_with, with_rotors
+from tuner.equation_error.recorded_accelerations import Mask, measured_with, with_rotors
 from tuner.equation_error.regression import MEMORY, convolved, whitening_filter
 from tuner.objective.inlets import INLETS
 from tuner.recordings.flight import Flight, Series

@@ -1,9 +1,9 @@
 """Model error: a fit's problem simulated finer, fed otherwise, or with what its model lacks.
 
 By how much coefficients then have to move is a part of their standard errors. What the model lacks
-is seen in the recordings: the laws that `tuner.equation_error.unexplained` finds push the simulated
-flights, each along its recording, and a rate controller that answers otherwise than its file
-(`tuner.equation_error.rate_controller`) flies them so.
+is seen in the recordings: the laws that `tuner.equation_error.omitted_laws` finds push the
+simulated flights, each along its recording, and a rate controller that answers otherwise than its
+file (`tuner.equation_error.rate_controller`) flies them so.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Array
-from tuner.equation_error.measured import FEWEST, Measured, measured
+from tuner.equation_error.omitted_laws import Law, Pair, unexplained
 from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, answers
-from tuner.equation_error.unexplained import Law, Pair, unexplained
+from tuner.equation_error.recorded_accelerations import FEWEST, Measured, measured
 from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import log_voltage_of, read_again
 from tuner.objective.criterion import Point

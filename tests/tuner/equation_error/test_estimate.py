@@ -10,9 +10,12 @@ import pytest
 from benchmarks import fast_flights
 from tuner.config import Options, settle
 from tuner.config.job import Search
-from tuner.equation_error.command_accelerations import read_commands
 from tuner.equation_error.estimate import GAINS
-from tuner.equation_error.measured import measured, without_gaps_of
+from tuner.equation_error.recorded_accelerations import (
+    measured,
+    read_commands,
+    without_gaps_of,
+)
 from tuner.job.accelerations import with_accelerations
 from tuner.recordings.flight import Series
 from tuner.search.inlet_choice import predicts_turning, regressors
@@ -54,6 +57,26 @@ def test_what_rotors_answer_makes_no_vehicle_heavy(begun):
         error = np.log(found.values[name] / racer.values[name])
         assert abs(error) < 0.15
         assert abs(error) < 3.0 * found.errors[name]
+
+
+@pytest.mark.parametrize("flown", [100.0], ids=["100 Hz"], indirect=True)
+def test_errors_hold_tachometers_whose_noise_is_a_quarter_more(flown, begun, monkeypatch):
+    _, settings, recordings = flown
+    found, job = begun[1].accelerations, job_of(settings, recordings)
+    with monkeypatch.context() as known:
+        known.setattr("tuner.equation_error.estimate.NOISE_KNOWN", 0.0)
+        certain = with_accelerations(job)[0].accelerations
+
+    def noisier(flight, **given):
+        steps = measured(flight, **given)
+        return replace(steps, noise=np.sqrt(1.25) * steps.noise)
+
+    monkeypatch.setattr("tuner.job.accelerations.measured", noisier)
+    other = with_accelerations(job)[0].accelerations
+    for name in TILTING:
+        moved = abs(np.log(other.values[name] / found.values[name]))
+        part = np.sqrt(found.errors[name] ** 2 - certain.errors[name] ** 2)
+        assert 0.01 < moved < 1.5 * part, (name, moved, part)
 
 
 @pytest.fixture(scope="module", params=[400.0, 100.0], ids=["400 Hz", "100 Hz"])

@@ -20,8 +20,8 @@ from sim_jax.inlet import ReferenceInlet
 from sim_jax.state import AIRBORNE, hover
 from tests.tuner.uncertainty import making
 from tuner.config import JobFile
+from tuner.equation_error.omitted_laws import _likeliest
 from tuner.equation_error.rate_controller import Answer
-from tuner.equation_error.unexplained import _likeliest
 from tuner.findings.findings import Code
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments

@@ -1,4 +1,4 @@
-"""What recorded accelerations hold that a fitted model does not explain, told without a name.
+"""Laws of force and moment that a fitted model lacks, by what it leaves of accelerations.
 
 The accelerations of a fitted model, along the recorded motion, leave errors. What of them no change
 of the fitted coefficients can explain is regressed on a dictionary of what forces and moments may
@@ -26,9 +26,9 @@ from typing import NamedTuple
 import numpy as np
 
 from tuner.core.numerics import Array
-from tuner.equation_error.measured import Measured, rows_of
-from tuner.equation_error.model import Accelerations, Linear
-from tuner.equation_error.regression import ROBUST, convolved, spread, whitening
+from tuner.equation_error.model_accelerations import Linear, ModelAccelerations
+from tuner.equation_error.recorded_accelerations import Measured, rows_of
+from tuner.equation_error.regression import filtered_sums, whitening
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model
 
@@ -183,36 +183,25 @@ def unexplained(
         Of the fit: what does not move, its K parameters, and their scaled coordinates.
     """
     recorded, simulated, driven = zip(*flights, strict=True)
-    along = Accelerations(model, tuple(parameters), tuple(simulated)).at(point, noise=False)
+    along = ModelAccelerations(model, tuple(parameters), simulated).noiseless.at(point)
     moved = [other for part in simulated for other in _moved(part)]
-    made = Accelerations(model, (), (*recorded, *moved)).at(np.zeros(0), noise=False)
-    shifts = [
-        np.stack([(one.left - other.left) / MOVED for other in made[at : at + SHIFTS]], 2)
-        for one, at in zip(along, range(len(recorded), len(made), SHIFTS), strict=True)
-    ]
+    made = ModelAccelerations(model, (), (*recorded, *moved)).noiseless.at(np.zeros(0))
     mean = float(np.mean([part.rotor_speed.mean() for part in simulated]))
-    motions = [_motion(part, one, mean) for part, one in zip(simulated, along, strict=True)]
     names = [*((axis, name) for axis, features in FEATURES.items() for name in features), LATE]
-    tables = [
-        np.concatenate([_features(motion), _late(shift) * (not of_commands)], axis=2)
-        for motion, shift, of_commands in zip(motions, shifts, driven, strict=True)
-    ]
-    columns = [
-        np.concatenate(
-            [
-                one.columns,
-                _nuisances(part, motion, (number, len(motions)), of_commands),
-                shift * of_commands,
-                table,
-            ],
-            axis=2,
-        )
-        for number, (part, one, motion, shift, table, of_commands) in enumerate(
-            zip(simulated, along, motions, shifts, tables, driven, strict=True)
-        )
-    ]
-    first = columns[0].shape[2] - len(names)
-    information, score = _sums(recorded, made[: len(recorded)], columns)
+    motions, tables, sums = list[_Motion](), list[Array](), []
+    for number, (one, real, of_commands) in enumerate(zip(along, made, driven, strict=False)):
+        ends = made[len(recorded) + SHIFTS * number :][:SHIFTS]
+        shift = np.stack([(one.left - end.left) / MOVED for end in ends], 2)
+        motion = _motion(one, mean)
+        nuisances = _nuisances(one.steps, motion, (number, len(along)), of_commands)
+        table = np.concatenate([_features(motion), _late(shift) * (not of_commands)], axis=2)
+        columns = np.concatenate([one.columns, nuisances, shift * of_commands, table], axis=2)
+        units = len(columns) // max(1, round(STRETCH / real.steps.step))
+        sums.append(filtered_sums(replace(real, columns=columns), whitening(real, MEMORY), units))
+        motions.append(motion)
+        tables.append(table)
+    first = sums[0][1].shape[1] - len(names)
+    information, score, _ = (np.concatenate(parts) for parts in zip(*sums, strict=True))
     model_columns, told = list(range(first)), list[tuple[int, float]]()
     late = _likeliest(information, score, model_columns, [first + len(names) - 1])
     if late is not None:  # no law: it is judged by itself, and first
@@ -250,13 +239,13 @@ def _moved(part: Measured) -> list[Measured]:
     return [replace(part, rotor_speed=speed + MOVED * way) for way in ways]
 
 
-def _motion(part: Measured, one: Linear, mean: float) -> _Motion:
-    through = part.motion.attitude.to_body(part.motion.velocity)
+def _motion(one: Linear, mean: float) -> _Motion:
+    motion = one.steps.motion
     return _Motion(
-        v=rows_of(through),
-        w=rows_of(part.motion.body_rate),
-        faster=part.rotor_speed.mean(axis=1) / mean - 1.0,
-        modelled=part.accelerations - one.left,
+        v=rows_of(motion.attitude.to_body(motion.velocity)),
+        w=rows_of(motion.body_rate),
+        faster=one.steps.rotor_speed.mean(axis=1) / mean - 1.0,
+        modelled=one.steps.accelerations - one.left,
     )
 
 
@@ -298,36 +287,6 @@ def _nuisances(part: Measured, motion: _Motion, place: tuple[int, int], of_comma
         columns = 6 * flights + 6 + 3 * axis + np.arange(3)
         table[:, axis, columns] = tilted
     return table
-
-
-def _sums(
-    flights: Sequence[Measured], linear: Sequence[Linear], columns: Sequence[Array]
-) -> tuple[Array, Array]:
-    """Return information (U, P, P) and score (U, P) of U stretches of filtered errors."""
-    information, score = [], []
-    for part, one, table in zip(flights, linear, columns, strict=True):
-        kernels = whitening(one, part, MEMORY)
-        length, size = max(1, round(STRETCH / part.step)), table.shape[2]
-        units = len(part.rotor_speed) // length
-        bend, slope = np.zeros((units, size, size)), np.zeros((units, size))
-        for axis, kernel in enumerate(kernels):
-            acts = np.any(table[:, axis] != 0.0, axis=0)
-            rows = convolved(
-                np.column_stack([one.left[:, axis], table[:, axis, acts]]), part.known, kernel
-            )
-            if not len(rows):
-                continue
-            sigma = spread(rows[:, 0])
-            rows = rows / sigma
-            for unit, stretch in enumerate(np.array_split(rows, units)):
-                errors, those = stretch[:, 0], stretch[:, 1:]
-                robust = np.minimum(1.0, ROBUST / np.maximum(np.abs(errors), 1e-12))
-                weighed = those * robust[:, None]
-                bend[unit][np.ix_(acts, acts)] += weighed.T @ those
-                slope[unit, acts] += weighed.T @ errors
-        information.append(bend)
-        score.append(slope)
-    return np.concatenate(information), np.concatenate(score)
 
 
 def _solved(total: Array, inside: Sequence[int], right: Array) -> Array:

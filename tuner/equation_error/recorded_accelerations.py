@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,9 +12,12 @@ from sim_jax.constants import GRAVITY
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
 from tuner.core.numerics import Array
+from tuner.objective.inlets import MISSED, linear_interpolation, zero_order_hold
 from tuner.objective.noise import white_noise
+from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import filtered, states_at
+from tuner.vehicle.model import Model
 
 Mask = NDArray[np.bool_]
 
@@ -25,6 +28,9 @@ GAP = 2.5
 """Gaps between samples beyond which a signal is unknown."""
 FEWEST = 100
 """Steps below which nothing is said."""
+
+Commands = tuple[Series, ...]
+"""Of each flight."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +112,8 @@ def measured_with(flight: Flight, rotors: Series, *, noise: float) -> Measured |
     weights[[0, -1]] *= 0.5
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import, seldom needed)
 
-    state = states_at(series, middle)
-    velocity, turned = (
-        _velocity(series, edges),
-        Rotation.from_quat(state.attitude, scalar_first=True),
-    )
+    state, velocity = states_at(series, middle), _velocity(series, edges)
+    turned = Rotation.from_quat(state.attitude, scalar_first=True)
     pull = np.diff(velocity, axis=0) * rate + np.array([0.0, 0.0, GRAVITY])
     turning = np.diff(_read(gyro, edges), axis=0) * rate
     accelerations = np.hstack([turned.inv().apply(pull), turning])
@@ -153,6 +156,53 @@ def without_gaps_of(series: Series, part: Measured) -> Measured:
     """Return the steps, of which those in a signal's gaps are unknown."""
     known = np.isfinite(_read(series, part.time)).all(axis=1, keepdims=True)
     return replace(part, accelerations=np.where(known, part.accelerations, np.nan))
+
+
+def read_commands(
+    model: Model, flights: Sequence[tuple[Flight, float]], rate: float
+) -> tuple[tuple[Measured, ...], tuple[Commands, Commands]] | None:
+    """Return the steps of some flights; their commands, and the same of every second sample.
+
+    None where a flight says too little.
+
+    Parameters
+    ----------
+    model
+        Whose motors follow the commands.
+    flights
+        Each with the s by which its commands are stamped late.
+    rate
+        Hz of the loop that computes commands.
+    """
+    steps, commands, coarser = list[Measured](), list[Series](), list[Series]()
+    for flight, late in flights:
+        command = flight.series["command"]
+        recorded = Series(command.time - late, command.values)
+        every, second = (_held(flight, recorded, rate, count) for count in (1, 2))
+        part = measured_with(flight, rotor_response(model, every), noise=0.0)
+        if part is None:
+            return None
+        steps.append(without_gaps_of(recorded, part))
+        commands.append(every)
+        coarser.append(second)
+    return tuple(steps), (tuple(commands), tuple(coarser))
+
+
+def rotor_response(model: Model, command: Series) -> Series:
+    """Return the rotor speeds (n, 4) that follow commands on a clock."""
+    motor, late = model.vehicle.motor, float(model.vehicle.setup.actuator_latency)
+    lags = Lags(float(motor.time_constant_up), float(motor.time_constant_down), late)
+    step = float(command.time[1] - command.time[0])
+    return Series(command.time, rotor_speeds(command.values, step, motor, lags))
+
+
+def _held(flight: Flight, recorded: Series, rate: float, every: int) -> Series:
+    """Return one of so many recorded commands of a flight, on the loop's clock or their own."""
+    taken = Series(recorded.time[::every], recorded.values[::every])
+    read = zero_order_hold if taken.rate * MISSED > rate else linear_interpolation
+    rate = max(rate, recorded.rate)
+    clock = np.arange(int(flight.duration * rate)) / rate
+    return Series(clock, read(taken, clock))
 
 
 def rows_of(vector: Vec3) -> Array:
