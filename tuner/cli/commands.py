@@ -316,7 +316,7 @@ def bench(
     out
         Write into this result folder. Default: runs/ and the time.
     """
-    from tuner.job.ground import bench as run_bench
+    from tuner.job.bench import bench as run_bench
 
     result = run_bench(file, out=out, command=TYPED.get())
     if not quiet:

@@ -17,7 +17,7 @@ from tuner.report.section import Cell, Section, Table
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from tuner.job.ground import BenchResult
+    from tuner.job.bench import BenchResult
     from tuner.job.sensitivity import SensitivityResult
     from tuner.result import ExportRecord, RunResult
     from tuner.search.iteration import PointEstimate

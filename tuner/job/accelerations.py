@@ -25,8 +25,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.space import extended
 from tuner.search.problem import Job, job_of
 from tuner.terms.candidates import candidate_groups, start_of
-from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, with_values
-from tuner.vehicle.selection_table import Groups
+from tuner.vehicle import COEFFICIENTS, initial_values, with_values
 
 ENOUGH = 0.9
 """Share of roll's and pitch's angular acceleration from which simulations tell inertia as well."""
@@ -50,7 +49,9 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     steps = _steps(job)
     if steps is None:
         return job, ()
-    candidates = _candidates(job)
+    candidates = dict(candidate_groups(job))
+    if INFLOW not in (*job.space.free, *own.fixed):
+        candidates[INFLOW] = (INFLOW,)
     names = [name for group in candidates.values() for name in group]
     effects = start_of([n for n in (*names, *GAINS) if COEFFICIENTS[n].is_effect])
     given = initial_values(settings.vehicle, settings.controller, names)
@@ -59,9 +60,7 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     if found.turning >= ENOUGH:
         return job, ()
     begun = _begun(job, found)
-    if begun is None:
-        return job, ()
-    return begun, (_finding(found),)
+    return (job, ()) if begun is None else (begun, (_finding(found),))
 
 
 def _steps(job: Job) -> tuple[tuple[Measured, ...], tuple[Commands, ...]] | None:
@@ -81,13 +80,6 @@ def _steps(job: Job) -> tuple[tuple[Measured, ...], tuple[Commands, ...]] | None
     )
 
 
-def _candidates(job: Job) -> Groups:
-    groups = dict(candidate_groups(job))
-    if INFLOW not in (*job.space.free, *job.settings.job.fixed):
-        groups[INFLOW] = (INFLOW,)
-    return groups
-
-
 def _begun(job: Job, found: Estimate) -> Job | None:
     """Return the job with its search's coefficients, start and windows; None for no rigid body."""
     settings = job.settings
@@ -96,19 +88,12 @@ def _begun(job: Job, found: Estimate) -> Job | None:
         vehicle = with_values(settings.vehicle, found.values)
     except ConfigError:
         return None
-    if not _is_rigid(vehicle):
-        return None
     search = settings.job.search
     if search.window is None and found.horizon is not None:
         search = search.model_copy(update={"window": found.horizon})
     changed = settings.job.model_copy(update={"free": moving, "fixed": (), "search": search})
     begun = job_of(replace(settings, vehicle=vehicle, job=changed), job.recordings)
     return replace(begun, asked=job.settings, accelerations=found)
-
-
-def _is_rigid(vehicle: VehicleFile) -> bool:
-    moments = (vehicle.inertia.xx, vehicle.inertia.yy, vehicle.inertia.zz)
-    return 2.0 * max(moments) <= sum(moments)
 
 
 def _finding(found: Estimate) -> Finding:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
 from sim_jax.control.mixer import ROTORS
@@ -218,7 +217,7 @@ def _starts_on_bounds(job: Job) -> Iterator[Finding]:
             yield Finding(Code.START_ON_BOUND, "info", parameter.name, numbers)
 
 
-def information(job: Job) -> NDArray[np.float64]:
+def information(job: Job) -> Array:
     """Return the Fisher information (K, K) at the start, in the scaled coordinates."""
     objective = job.objective
     rate = float(objective.schedule.log_rate)
@@ -246,17 +245,13 @@ def check_information(job: Job) -> Iterator[Finding]:
         yield Finding(Code.NO_EFFECT, "warning", names[index])
     alive = np.flatnonzero(~dead)
     for direction in singular_directions(at_start[np.ix_(alive, alive)]):
-        members = tuple(names[alive[index]] for index in _members(direction))
+        share = np.abs(direction) / np.abs(direction).max()
+        members = tuple(names[alive[i]] for i in np.argsort(-share) if share[i] > SHARE)
         yield Finding(Code.SINGULAR_DIRECTION, "warning", "coefficients", names=members)
 
 
-def singular_directions(information: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+def singular_directions(information: Array) -> list[Array]:
     """Return the directions (K,) in scaled coordinates about which the data say nothing."""
     unit = unit_diagonal(information)
     values, vectors = symmetric_eigen(information * np.outer(unit, unit))
     return [vectors[:, i] * unit for i in range(len(values)) if values[i] < SINGULAR * values[-1]]
-
-
-def _members(direction: NDArray[np.float64]) -> Sequence[int]:
-    share = np.abs(direction) / np.abs(direction).max()
-    return [int(i) for i in np.argsort(-share) if share[i] > SHARE]

@@ -6,11 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tuner.config import Options, Settings, settle
+from tuner.core.errors import InputError
 from tuner.core.phrases import listed
+from tuner.findings.findings import Code, sentence
 from tuner.recordings.cache import cached, digest, recalled, source_version
 from tuner.recordings.inspection import Inspection
 from tuner.recordings.topics import read_sidecar
 from tuner.recordings.ulog import Advice, advice_of, parameters_of, settings_in_words
+from tuner.vehicle import COEFFICIENTS
 
 
 @dataclass(frozen=True)
@@ -81,15 +84,37 @@ def _decided(path: Path, settings: Settings) -> Verdict:
     maps = [digest(file) for file in (job.topics,) if file is not None and file.exists()]
     key = (digest(path), path.name, source_version(), *map(repr, (*inputs, *maps)))
 
-    def found() -> Verdict:
-        from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
+    found = recalled(Verdict, cached("verdict", *key), lambda: _simulatable(path, settings))
+    return replace(found, path=str(path))
 
-        configure()
-        from tuner.job.recording_decision import decide  # noqa: PLC0415
 
-        return decide(path, settings)
+def _simulatable(path: Path, settings: Settings) -> Verdict:
+    """Return whether and how the only recording of some settings would be fitted, and why."""
+    from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
 
-    return replace(recalled(Verdict, cached("verdict", *key), found), path=str(path))
+    configure()
+    from tuner.objective.inlets import bypassed_by  # noqa: PLC0415
+    from tuner.search.job_flights import as_logged, read_usable, without_pose  # noqa: PLC0415
+
+    settings, logged = as_logged(settings)
+    gains = tuple(g for f in logged if f.code is Code.LOGGED_GAINS for g in f.names)
+    try:
+        bare, _ = without_pose(settings)
+        if bare:
+            seconds = sum(end - begin for flight in bare for begin, end in flight.flying)
+            seen = (
+                f"No pose was recorded: body rate and specific force of {seconds:.0f} s in the air "
+                "are fitted, from the motor commands."
+            )
+            return Verdict(str(path), True, ("none",), (seen,))
+        recordings, findings = read_usable(settings, holdout=(), fits=False)
+    except InputError as error:
+        return Verdict(str(path), False, why=(f"{error.what}; {error.remedy}",))
+    inlets = [recording.inlet for recording in recordings]
+    bypassed = bypassed_by(inlets, [recording.flight for recording in recordings])
+    why = tuple(dict.fromkeys(map(sentence, findings)))
+    hidden = tuple(n for n in COEFFICIENTS if n in bypassed and not COEFFICIENTS[n].is_effect)
+    return Verdict(str(path), True, tuple(inlets), why, hidden, gains)
 
 
 def in_words(verdict: Verdict) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import JsonValue
@@ -84,6 +84,8 @@ def result_of(
     ``uncertainty`` is None where it was not examined, or not yet.
     """
     settings = job.settings
+    # of each clock in s, and of each gyro axis in rad/s
+    table = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
     return RunResult(
         status=Status.CONVERGED if fitted.converged else Status.STOPPED,
         seed=settings.job.search.seed,
@@ -96,7 +98,10 @@ def result_of(
             "origin": dict(settings.origin),
             "noise": dict(fitted.noise),
             "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
-            "offsets": offsets_by_flight(job, fitted),
+            "offsets": {
+                flight.name: dict(zip(OFFSETS, offsets.tolist(), strict=True))
+                for flight, offsets in zip(job.fitted, table.T, strict=True)
+            },
             "window_starts": starts_moved(fitted),
             "starts": [
                 {"origin": outcome.origin, "cost": outcome.loss} for outcome in fitted.outcomes
@@ -129,15 +134,6 @@ def _loss_at_start(job: Job, fitted: Fitted) -> float:
     sums = objective.sums(start, criterion, derivatives=False)
     loss, _, _ = normal_equations(objective, start, criterion, sums)
     return float(loss)
-
-
-def offsets_by_flight(job: Job, fitted: Fitted) -> dict[str, JsonValue]:
-    """Return flight -> offset of each clock in s and of each gyro axis in rad/s."""
-    table = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
-    return {
-        flight.name: dict(zip(OFFSETS, table[:, number].tolist(), strict=True))
-        for number, flight in enumerate(job.fitted)
-    }
 
 
 def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
@@ -184,21 +180,17 @@ def _coefficients(
         ):
             coefficients[name] = regressed
             continue
-        lower, upper = bounds[name]
-        verdict, reason = judgements[name]
+        (lower, upper), (verdict, reason) = bounds[name], judgements[name]
+        more: dict[str, Any] = {"fitted": True, "lower": lower, "upper": upper}
+        if estimate is not None:
+            more |= {
+                "std_error": estimate.std_error,
+                "std_error_parts": estimate.parts,
+                "ci95": estimate.ci95 if np.isfinite(estimate.ci95).all() else None,
+                "identifiable": reason.identifiable,
+            }
         coefficients[name] = CoefficientResult.judged(
-            name,
-            initial,
-            best[name],
-            verdict,
-            reason,
-            fitted=True,
-            lower=lower,
-            upper=upper,
-            std_error=None if estimate is None else estimate.std_error,
-            std_error_parts=None if estimate is None else estimate.parts,
-            ci95=None if estimate is None else _interval(estimate.ci95),
-            identifiable=None if estimate is None else reason.identifiable,
+            name, initial, best[name], verdict, reason, **more
         )
     return coefficients
 
@@ -248,12 +240,10 @@ def _regressed(
 ) -> CoefficientResult:
     """Return a coefficient by regression of accelerations, its error that of the scaled number."""
     row = COEFFICIENTS[name]
+    std_error, interval = error, (best - Z95 * error, best + Z95 * error)
     if row.scale == "log":
         std_error = best * error
         interval = (best * float(np.exp(-Z95 * error)), best * float(np.exp(Z95 * error)))
-    else:
-        std_error = error
-        interval = (best - Z95 * error, best + Z95 * error)
     verdict, reason = judge_regressed(std_error, best, row.unit, relative=row.scale == "log")
     return CoefficientResult.judged(
         name,
@@ -265,11 +255,6 @@ def _regressed(
         ci95=(max(interval[0], min(bounds[0], best)), min(interval[1], max(bounds[1], best))),
         identifiable=reason.identifiable,
     )
-
-
-def _interval(pair: tuple[float, float]) -> tuple[float, float] | None:
-    low, high = pair
-    return (low, high) if np.isfinite(low) and np.isfinite(high) else None
 
 
 def _flight(job: Job, fitted: Fitted, recording: Recording, validation: Validation) -> FlightResult:

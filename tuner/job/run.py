@@ -8,7 +8,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from math import nan
 from pathlib import Path
@@ -105,7 +105,7 @@ def run(
     findings = (*logged, *findings)
     explanation = Explanation(listener.on_message)
     _check(findings, explanation, force=options.force)
-    found, (selected, fitted, examination) = _fitted(
+    found, validation, (selected, fitted, examination) = _fitted(
         job,
         findings,
         folder,
@@ -119,8 +119,8 @@ def run(
     fitted, examination, inertia = _balanced(selected, fitted, examination, explanation, listener)
     explanation.tell(fitted.findings)
     vehicle = vehicle_fitted(job, fitted)
-    is_found = job is found.job and fitted is found.fitted
-    validation = found.validation if is_found else _flown(job, fitted, vehicle, listener)
+    if job is not found.job or fitted is not found.fitted:
+        validation = _flown(job, fitted, vehicle, listener)
     explanation.notice(_of_flights(job, validation, inertia))
     explanation.notice(voltage_taken(settings.vehicle, vehicle))
     sources = _known(fitted, examination, explanation)
@@ -180,15 +180,6 @@ def run(
     return folder, result
 
 
-@dataclass(frozen=True)
-class _Found:
-    """Where the search of a job ended, and how the flights are met there."""
-
-    job: Job
-    fitted: Fitted
-    validation: Validation
-
-
 def prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
     """Return the job of some settings, and what there is to say of it before it is simulated."""
     with span("reading"):
@@ -211,8 +202,8 @@ def _fitted(
     command: str,
     resume: bool,
     force: bool,
-) -> tuple[_Found, Examined]:
-    """Return where the search of a job ends, the fit that is reported, and how well it is known.
+) -> tuple[Selected, Validation, Examined]:
+    """Return where the search of a job ends, how it meets the flights, and how well that is known.
 
     What was found is written before it is examined.
     """
@@ -223,7 +214,7 @@ def _fitted(
     make_folder(folder)
     on_progress = _keeping_best(folder, listener)
     try:
-        selected = search_with_terms(
+        found = search_with_terms(
             job,
             folder,
             resume=resume,
@@ -238,20 +229,13 @@ def _fitted(
             f"Continue the search with --out {folder} --resume."
         )
         raise
-    found = _written_as_found(folder, selected, listener, command)
-    return found, examined(selected, on_progress, listener.on_message, explanation)
-
-
-def _written_as_found(folder: Path, selected: Selected, listener: Listener, command: str) -> _Found:
-    """Write where the search ended, and how the flights are met there, nothing explained yet."""
-    job, fitted = selected.job, selected.fitted
-    vehicle = vehicle_fitted(job, fitted)
-    validation = _flown(job, fitted, vehicle, listener)
-    rows = selected.rows_given(fitted.held)
-    result = result_of(job, fitted, None, validation, command=command, selection=rows)
+    vehicle = vehicle_fitted(found.job, found.fitted)
+    validation = _flown(found.job, found.fitted, vehicle, listener)
+    rows = found.rows_given(found.fitted.held)
+    result = result_of(found.job, found.fitted, None, validation, command=command, selection=rows)
     with span("results"):
-        write_folder(folder, result, vehicle, job)
-    return _Found(job, fitted, validation)
+        write_folder(folder, result, vehicle, found.job)
+    return found, validation, examined(found, on_progress, listener.on_message, explanation)
 
 
 def _flown(job: Job, fitted: Fitted, vehicle: VehicleFile, listener: Listener) -> Validation:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuner.config import Settings, settle
 from tuner.core.disk import folder_for, make_folder
@@ -18,7 +17,6 @@ from tuner.design.ranking import Arena
 from tuner.evaluate.held_out import comparison_of
 from tuner.findings.findings import Code, Finding
 from tuner.job.results import write_knowledge, write_next_flight
-from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective, misfit, root_mean_squares, sums_at
 from tuner.options import ExaminationOptions
 from tuner.report import render
@@ -42,61 +40,44 @@ def unfitted(job: Job) -> Fitted:
 
     What is undecided of the loop is tried both ways.
     """
-    space, configured = job.space, loop_of(job.objective)
-    start = initial_values(job.settings.vehicle, job.settings.controller, space.free)
-    vector = space.vector_of(start)
+    configured = loop_of(job.objective)
     loops = [configured, *map(configured.switched, job.undecided(job.objective))]
-    matches = [_match(with_loop(job.objective, loop), vector) for loop in loops]
-    match = min(matches, key=lambda match: match.loss)
-    if matches[0].loss <= SWITCH_GAIN * match.loss:
-        match = matches[0]
-    names = [flight.name for flight in job.fitted]
+    tried = [_simulated(job, with_loop(job.objective, loop)) for loop in loops]
+    best = min(tried, key=lambda fitted: fitted.loss_best)
+    if tried[0].loss_best <= SWITCH_GAIN * best.loss_best:
+        best = tried[0]
+    findings = (*loop_findings(job, loop_of(best.objective), "info"), *_poorly_met(best.scales))
+    return replace(best, evaluations=len(tried), findings=findings)
+
+
+def _simulated(job: Job, objective: Objective) -> Fitted:
+    """Return a problem at the job's vehicle, its noise scaled to residuals that are larger."""
+    start = initial_values(job.settings.vehicle, job.settings.controller, job.space.free)
+    vector = job.space.vector_of(start)
+    points = beginning(objective, vector[None]).points
+    unscaled = plain_criterion(objective, objective.samples)
+    sums = sums_at(objective, points, unscaled, derivatives=False)
+    residual = root_mean_squares(objective, sums)
+    scale = misfit({name: of_starts[0] for name, of_starts in residual.items()})
     return Fitted(
-        objective=match.objective,
-        point=match.point,
-        criterion=match.criterion,
+        objective=objective,
+        point=objective.start(vector),
+        criterion=plain_criterion(objective, objective.samples, scale),
         noise=job.noise,
-        scales=by_flight(match.scale, job.fitted),
+        scales=by_flight(scale, job.fitted),
         iterations=(),
         outcomes=(),
         method="none",
-        evaluations=len(matches),
+        evaluations=1,
         wall_time=0.0,
-        loss_best=match.loss,
+        loss_best=float(np.sum(np.asarray(sums.loss))),
         converged=True,
-        findings=(
-            *loop_findings(job, loop_of(match.objective), "info"),
-            *_findings(match.scale, names),
-        ),
     )
 
 
-@dataclass(frozen=True)
-class _Match:
-    """How closely a simulation matches the recordings: the problem, weighed accordingly."""
-
-    objective: Objective
-    point: Point
-    criterion: Criterion
-    scale: dict[str, NDArray[np.float64]]
-    loss: float
-
-
-def _match(objective: Objective, vector: NDArray[np.float64]) -> _Match:
-    """Return a problem whose noise is scaled to the residuals where these are larger."""
-    point, start = objective.start(vector), beginning(objective, vector[None])
-    unscaled = plain_criterion(objective, objective.samples)
-    sums = sums_at(objective, start.points, unscaled, derivatives=False)
-    residual = root_mean_squares(objective, sums)
-    scale = misfit({name: of_starts[0] for name, of_starts in residual.items()})
-    criterion = plain_criterion(objective, objective.samples, scale)
-    return _Match(objective, point, criterion, scale, float(np.sum(np.asarray(sums.loss))))
-
-
-def _findings(scale: Mapping[str, NDArray[np.float64]], names: Sequence[str]) -> Iterator[Finding]:
-    for index, name in enumerate(names):
-        worst = max(scale, key=lambda channel: scale[channel][index])
-        multiple = float(scale[worst][index])
+def _poorly_met(scales: Mapping[str, Mapping[str, float]]) -> Iterator[Finding]:
+    for name, of_channels in scales.items():
+        worst, multiple = max(of_channels.items(), key=lambda item: item[1])
         if multiple > UNMATCHED:
             yield Finding(Code.POORLY_MET, "warning", name, {"noise_multiple": multiple}, (worst,))
 

@@ -19,7 +19,7 @@ from tuner.ground.measurement import Measurement, value_of
 from tuner.inertial.measurement import agreeing, measure_inertial
 from tuner.inertial.prediction import RateErrors, rate_errors
 from tuner.inertial.signals import stretches_of
-from tuner.job.ground import BenchResult, conflicts_of, known_of, vehicle_of, written
+from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.job.listener import SILENT, Listener
 from tuner.recordings.loader import InertialFlight
 from tuner.search.job_flights import left_out_of

@@ -13,7 +13,7 @@ from tuner.cli import main
 from tuner.config import TrajectorySettings
 from tuner.exporters.effective import refly
 from tuner.exporters.export import export
-from tuner.job.ground import bench
+from tuner.job.bench import bench
 from tuner.options import ExportOptions
 from tuner.report import render
 from tuner.result import read_run

@@ -15,7 +15,7 @@ from tuner.findings.findings import Code, one_line
 from tuner.ground.bench_json import Combination
 from tuner.inertial.prediction import rate_errors
 from tuner.inertial.signals import stretches_of
-from tuner.job.ground import least_noticed, vehicle_of
+from tuner.job.bench import least_noticed, vehicle_of
 from tuner.job.without_pose import fit_without_pose
 from tuner.options import SimulationOptions
 from tuner.recordings.inspection import inspect_recordings

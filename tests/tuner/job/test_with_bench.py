@@ -7,7 +7,7 @@ import yaml
 
 from tuner.config import Options
 from tuner.findings.findings import Code
-from tuner.job.ground import bench
+from tuner.job.bench import bench
 from tuner.job.run import run
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"

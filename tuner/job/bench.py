@@ -87,13 +87,10 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
         The result folder cannot be written to.
     """
     began = time.perf_counter()
-    plan = read_bench(path)
-    base = path.parent
-    given = read_vehicle(find_config("vehicles", plan.vehicle, base))
+    plan, folder = read_bench(path), folder_for(out)
+    given = read_vehicle(find_config("vehicles", plan.vehicle, path.parent))
     start = given if plan.weighed_mass is None else given.replace(mass=plan.weighed_mass)
-    folder = folder_for(out)
     measurements, combination, vehicle = _estimate(path, plan, start)
-    header = f"From the ground measurements of {path.name}; the rest as in {start.name}."
     return written(
         folder,
         given,
@@ -103,7 +100,7 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
         findings=conflicts_of(combination),
         settings={"command": command, "bench": plan.model_dump(mode="json")},
         source={"bench": path.name},
-        header=header,
+        header=f"From the ground measurements of {path.name}; the rest as in {start.name}.",
         began=began,
     )
 
@@ -168,24 +165,19 @@ def _estimate(
     path: Path, plan: BenchFile, start: VehicleFile
 ) -> tuple[tuple[Measurement, ...], Combination, VehicleFile]:
     """Return each measurement, what they say together, and the vehicle that follows."""
-    names, base = names_of(plan.experiments), path.parent
-    known = known_of(start)
+    experiments = dict(zip(names_of(plan.experiments), plan.experiments, strict=True))
+    spins = {name: spin for name, spin in experiments.items() if isinstance(spin, YawSpin)}
+    known, base, vehicle = known_of(start), path.parent, start
     measured = {
         name: measure(name, experiment, start, base)
-        for name, experiment in zip(names, plan.experiments, strict=True)
-        if not isinstance(experiment, YawSpin)
+        for name, experiment in experiments.items()
+        if name not in spins
     }
-    spins = {
-        name: experiment
-        for name, experiment in zip(names, plan.experiments, strict=True)
-        if isinstance(experiment, YawSpin)
-    }
-    vehicle = start
-    for _ in range(1 if not spins else RELINEARISATIONS):
+    for _ in range(RELINEARISATIONS if spins else 1):
         if measured:
             vehicle = vehicle_of(path, start, combine(tuple(measured.values()), known))
         measured |= {name: measure(name, spin, vehicle, base) for name, spin in spins.items()}
-    measurements = tuple(measured[name] for name in names)
+    measurements = tuple(measured[name] for name in experiments)
     combination = combine(measurements, known)
     return measurements, combination, vehicle_of(path, start, combination)
 
@@ -216,13 +208,14 @@ def vehicle_of(path: Path, start: VehicleFile, combination: Combination) -> Vehi
         for name, scaled in zip(combination.names, combination.scaled, strict=True)
     }
     values |= {n: max(v, 0.0) for n, v in values.items() if COEFFICIENTS[n].unit == "s"}
-    moments = [name for name in values if COEFFICIENTS[name].place[0] == "inertia"]
     try:
         return with_values(start, values)
     except ConfigError as error:
-        if not moments:
-            raise ConfigError(path, error.what, error.remedy) from None
-        remedy = "check which axis hung vertical in each pendulum, and hang the axes not measured"
+        remedy = error.remedy
+        if any(COEFFICIENTS[name].place[0] == "inertia" for name in values):
+            remedy = (
+                "check which axis hung vertical in each pendulum, and hang the axes not measured"
+            )
         raise ConfigError(path, error.what, remedy) from None
 
 
