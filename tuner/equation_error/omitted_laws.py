@@ -74,14 +74,11 @@ class Law:
     share
         The size of its part of the accelerations over that of all that is modelled there (root mean
         squares about the mean), with the sign of its coefficient.
-    deviation
-        Its score in standard deviations.
     """
 
     axis: str
     feature: str
     share: float
-    deviation: float
 
 
 @dataclass(frozen=True)
@@ -202,32 +199,26 @@ def unexplained(
         tables.append(table)
     first = sums[0][1].shape[1] - len(names)
     information, score, _ = (np.concatenate(parts) for parts in zip(*sums, strict=True))
-    model_columns, told = list(range(first)), list[tuple[int, float]]()
-    late = _likeliest(information, score, model_columns, [first + len(names) - 1])
-    if late is not None:  # no law: it is judged by itself, and first
-        told.append(late)
-        model_columns.append(late[0])
+    # lateness is no law: it is judged by itself, and first
+    told = _likeliest(information, score, range(first), [first + len(names) - 1])
     while len(told) < MOST:
-        rest = [i for i in range(first, first + len(names) - 1) if i not in model_columns]
-        likeliest = _likeliest(information, score, model_columns, rest)
-        if likeliest is None:
+        rest = [i for i in range(first, first + len(names) - 1) if i not in told]
+        likeliest = _likeliest(information, score, [*range(first), *told], rest)
+        if not likeliest:
             break
-        told.append(likeliest)
-        model_columns.append(likeliest[0])
+        told += likeliest
     sizes = np.zeros(len(names))
     if told:
-        solved = _solved(information.sum(axis=0), model_columns, score.sum(axis=0))
-        sizes[[column - first for column, _ in told]] = solved[first:]
+        inside = [*range(first), *told]
+        solved = _solved(information.sum(axis=0), inside, score.sum(axis=0))
+        sizes[np.array(told) - first] = solved[first:]
     modelled = np.concatenate([motion.modelled for motion in motions]).std(axis=0)
-    parts = np.concatenate(tables).std(axis=0)
-    laws = []
-    for column, deviation in told:
-        axis, name = names[column - first]
-        if (axis, name) == LATE:
-            continue
-        row = AXES.index(axis)
-        size = parts[row, column - first] * sizes[column - first] / modelled[row]
-        laws.append(Law(axis, name, float(size), deviation))
+    parts, laws = np.concatenate(tables).std(axis=0), []
+    for number in (column - first for column in told):
+        axis, name = names[number]
+        if (axis, name) != LATE:
+            row = AXES.index(axis)
+            laws.append(Law(axis, name, float(parts[row, number] * sizes[number] / modelled[row])))
     made_of_laws = tuple(table[..., :-1] @ sizes[:-1] for table in tables)
     return Unexplained(tuple(laws), made_of_laws, float(sizes[-1]))
 
@@ -300,23 +291,21 @@ def _solved(total: Array, inside: Sequence[int], right: Array) -> Array:
 
 def _likeliest(
     information: Array, score: Array, model: Sequence[int], rest: Sequence[int]
-) -> tuple[int, float] | None:
-    """Return the column whose efficient score is the largest, and its size; None by chance."""
-    total = information.sum(axis=0)
+) -> list[int]:
+    """Return the column whose efficient score is the largest; none where that may be chance."""
+    total, model, rest = information.sum(axis=0), list(model), list(rest)
     estimate = _solved(total, model, score.sum(axis=0))
-    follow = _solved(total, model, total[:, list(rest)])
-    left = score - information[:, :, list(model)] @ estimate
-    efficient = left[:, list(rest)] - left[:, list(model)] @ follow
-    own = np.diag(total)[list(rest)]
-    alone = own - np.einsum("mr,mr->r", total[np.ix_(list(model), list(rest))], follow)
+    follow = _solved(total, model, total[:, rest])
+    left = score - information[:, :, model] @ estimate
+    efficient = left[:, rest] - left[:, model] @ follow
+    own = np.diag(total)[rest]
+    alone = own - np.einsum("mr,mr->r", total[np.ix_(model, rest)], follow)
     tells = alone > OWN * own
     if not tells.any():
-        return None
-    sd = np.sqrt(np.sum(efficient**2, axis=0))
-    size = np.where(tells, efficient.sum(axis=0) / np.maximum(sd, 1e-300), 0.0)
+        return []
+    sd = np.maximum(np.sqrt(np.sum(efficient**2, axis=0)), 1e-300)
+    size = np.where(tells, np.abs(efficient.sum(axis=0)) / sd, 0.0)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (SIGNS, len(efficient)))
-    chance = np.abs(signs @ efficient / np.maximum(sd, 1e-300))[:, tells].max(axis=1)
-    best = int(np.argmax(np.abs(size)))
-    if abs(size[best]) <= np.quantile(chance, 1.0 - LEVEL):
-        return None
-    return rest[best], float(size[best])
+    chance = np.abs(signs @ efficient / sd)[:, tells].max(axis=1)
+    best = int(np.argmax(size))
+    return [rest[best]] if size[best] > np.quantile(chance, 1.0 - LEVEL) else []

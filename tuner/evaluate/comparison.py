@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 
 from sim_jax.state import AIRBORNE
@@ -102,27 +101,20 @@ class Comparison:
             for inlet, members in by_inlet.items()
         ]
 
-    def fly_from_fitted_starts(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
-        """Return what `fly` does of flights in windows, but from the likeliest starts and trims.
-
-        These are fitted to each window: how well the vehicle can meet it, not how well it predicts.
-        """
-        errors: dict[str, FlightErrors] = {}
-        for group in self._groups:
-            if group.windowed:
-                errors |= group.fly(vehicle, fitted_starts=True)
-        return {name: errors[name] for name in self._names if name in errors}
-
     def fly(
         self,
         vehicle: VehicleFile,
         *,
+        fitted_starts: bool = False,
         flier: Callable[..., Flown] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name to its errors with a vehicle, in the recordings' order.
 
         Parameters
         ----------
+        fitted_starts
+            Of flights in windows alone, from the likeliest starts and trims, which are fitted to
+            each window: how well the vehicle can meet it, not how well it predicts.
         flier
             What flies segments: another simulator than this project's.
 
@@ -133,8 +125,9 @@ class Comparison:
         """
         errors: dict[str, FlightErrors] = {}
         for group in self._groups:
-            errors |= group.fly(vehicle, flier=flier)
-        return {name: errors[name] for name in self._names}
+            if group.windowed or not fitted_starts:
+                errors |= group.fly(vehicle, fitted_starts=fitted_starts, flier=flier)
+        return {name: errors[name] for name in self._names if name in errors}
 
 
 class _Group:
@@ -317,8 +310,7 @@ class _Group:
         lag = 0.5 * (motor.time_constant_up + motor.time_constant_down)
         pieces = [window.flight for windows in self._windows for window in windows]
         turning = np.stack([recent_command(piece, lag) for piece in pieces], axis=-1)
-        segments: Segments = eqx.tree_at(lambda s: s.turning, self._segments, turning)
-        return segments
+        return replace(self._segments, turning=turning)
 
     def _likeliest_starts(self, model: Model, segments: Segments) -> Array:
         """Return the likeliest starts (L, F), in the segments' standard deviations.

@@ -46,9 +46,9 @@ def vehicle_fitted(job: Job, fitted: Fitted) -> VehicleFile:
 
 def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
     """Return each free coefficient's reported value: fitted, or initial for one that is held."""
-    initial = initial_of(job)
-    held = {*impossible_inertia(job, fitted), *_held(job, fitted)}
-    values = job.space.numbers(fitted.point.coefficients)
+    initial, values = initial_of(job), job.space.numbers(fitted.point.coefficients)
+    tied = (p.ratios for p in job.space.parameters if p.name in fitted.held.values())
+    held = {*impossible_inertia(job, fitted), *(name for ratios in tied for name in ratios)}
     return {name: initial[name] if name in held else v for name, v in values.items()}
 
 
@@ -66,13 +66,6 @@ def point_estimates(job: Job, fitted: Fitted) -> tuple[PointEstimate, ...]:
 def initial_of(job: Job) -> dict[str, float]:
     """Return every coefficient's initial value."""
     return initial_values(job.settings.vehicle, job.settings.controller, job.space.free)
-
-
-def _held(job: Job, fitted: Fitted) -> frozenset[str]:
-    """Return the coefficients that were held at their initial values, tied ones too."""
-    held = set(fitted.held.values())
-    groups = (p.ratios for p in job.space.parameters if p.name in held)
-    return frozenset(name for ratios in groups for name in ratios)
 
 
 def impossible_inertia(job: Job, fitted: Fitted) -> tuple[str, ...]:
@@ -160,7 +153,7 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
     return Validation(
         initial=comparison.fly(initial),
         best=comparison.fly(vehicle),
-        fitted_starts=comparison.fly_from_fitted_starts(vehicle),
+        fitted_starts=comparison.fly(vehicle, fitted_starts=True),
         predicted_initial=_errors(_predictions(job, fitted, initial)),
         predicted_best=_errors(predictions),
         predicted_holding=_errors(held),

@@ -88,51 +88,29 @@ def predict(
     RecordingError
         The flight never holds so many s of pose and input.
     """
-    segments, begins = starts_of(
-        flight,
-        inlet,
-        schedule_of(controller),
-        seconds=seconds,
-        stride=1.0 / flight.rate if stride is None else stride,
-        lag=0.5 * (vehicle.motor.time_constant_up + vehicle.motor.time_constant_down),
-        input_late=input_late,
-    )
-    model = model_of(with_reference_voltage(vehicle, [flight]), controller)
-    steps = round(seconds * flight.rate)
-    ahead = np.arange(1, steps + 1) / flight.rate
-    reached = _simulated(model, segments, schedule_of(controller), ahead)
-    recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
-    errors = errors_of(reached, recorded, (steps, len(begins)))
-    followed = INLETS[inlet].silences
-    predicted = {name: distances for name, distances in errors.items() if name not in followed}
-    return Predictions(begins, ahead, predicted)
-
-
-def starts_of(
-    flight: Flight,
-    inlet: InletName,
-    schedule: Schedule,
-    *,
-    seconds: float,
-    stride: float,
-    lag: float,
-    input_late: float = 0.0,
-) -> tuple[Segments, Array]:
-    """Return the recorded states of a flight that are so many s from its end, and their times."""
+    motor, schedule = vehicle.motor, schedule_of(controller)
     segments = window_segments(
         [flight],
         inlets=[inlet],
         seconds=seconds,
         schedule=schedule,
-        lag=lag,
+        lag=0.5 * (motor.time_constant_up + motor.time_constant_down),
         noise={},
-        stride=stride,
+        stride=1.0 / flight.rate if stride is None else stride,
         free_starts=False,
         input_late={flight.name: input_late},
     )
-    begins = segments.begins
-    whole = np.flatnonzero(begins + seconds <= flight.duration + 1e-9)
-    return _taken(segments, whole), begins[whole]
+    whole = np.flatnonzero(segments.begins + seconds <= flight.duration + 1e-9)
+    begins = segments.begins[whole]
+    model = model_of(with_reference_voltage(vehicle, [flight]), controller)
+    steps = round(seconds * flight.rate)
+    ahead = np.arange(1, steps + 1) / flight.rate
+    reached = _simulated(model, _taken(segments, whole), schedule, ahead)
+    recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
+    errors = errors_of(reached, recorded, (steps, len(begins)))
+    followed = INLETS[inlet].silences
+    predicted = {name: distances for name, distances in errors.items() if name not in followed}
+    return Predictions(begins, ahead, predicted)
 
 
 def errors_of(
@@ -154,21 +132,6 @@ def _simulated(
     model: Model, segments: Segments, schedule: Schedule, ahead: Array
 ) -> dict[str, Array]:
     """Return quantity -> (S, n, k) that the simulations reach so many s (S,) ahead."""
-    samples = int(np.ceil(ahead[-1] * schedule.log_rate - 1e-6)) + 2
-    parts = []
-    for first in range(0, segments.count, AT_ONCE):
-        chosen = np.arange(first, min(first + AT_ONCE, segments.count))
-        parts.append(_reached(model, _taken(segments, chosen), ahead, schedule, samples))
-    return {name: np.concatenate([part[name] for part in parts], axis=1) for name in PREDICTED}
-
-
-def _reached(
-    model: Model, segments: Segments, ahead: Array, schedule: Schedule, samples: int
-) -> dict[str, Array]:
-    channels = ("position", "attitude", MOTION)
-    flown = fly(
-        model, segments, schedule, samples=samples, limits=AIRBORNE, channels=channels
-    ).channels
     place = ahead * schedule.log_rate
     below = np.floor(place + 1e-6).astype(int)
     share = (place - below)[:, None, None]
@@ -177,13 +140,26 @@ def _reached(
         before, after = np.moveaxis(logged[:, below], 0, 1), np.moveaxis(logged[:, below + 1], 0, 1)
         return np.asarray(before + share * (after - before))
 
-    turned = at(flown["attitude"])
-    return {
-        "position": at(flown["position"]),
-        "velocity": at(flown[MOTION][..., 3:6]),
-        "attitude": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
-        "body_rate": at(flown[MOTION][..., 6:9]),
-    }
+    parts = []
+    for first in range(0, segments.count, AT_ONCE):
+        flown = fly(
+            model,
+            _taken(segments, np.arange(first, min(first + AT_ONCE, segments.count))),
+            schedule,
+            samples=int(np.ceil(place[-1] - 1e-6)) + 2,
+            limits=AIRBORNE,
+            channels=("position", "attitude", MOTION),
+        ).channels
+        turned, motion = at(flown["attitude"]), at(flown[MOTION])
+        parts.append(
+            {
+                "position": at(flown["position"]),
+                "velocity": motion[..., 3:6],
+                "attitude": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
+                "body_rate": motion[..., 6:9],
+            }
+        )
+    return {name: np.concatenate([part[name] for part in parts], axis=1) for name in PREDICTED}
 
 
 def _taken(segments: Segments, chosen: NDArray[np.intp]) -> Segments:

@@ -182,13 +182,13 @@ class _Weighing:
     target: Array
 
     @staticmethod
-    def of(
-        kernel: Array, prior: Array, still: Sequence[Array], measured: Sequence[Array]
-    ) -> _Weighing:
-        table = np.vstack([_filter(still, kernel), np.diag(np.sqrt(prior))])
+    def of(problem: _Problem, name: str, kernel: Array, gain: float | None = None) -> _Weighing:
+        """Return the weighing of an output; ``gain`` of what flew, once known."""
+        prior = _prior(problem, name, gain)
+        table = np.vstack([_filter(problem.still[name], kernel), np.diag(np.sqrt(prior))])
         size = np.sqrt((table * table).sum(axis=0)) + TINY
         basis = np.linalg.qr(table / size)[0]
-        target = np.concatenate([_filter(measured, kernel), np.zeros(len(prior))])
+        target = np.concatenate([_filter(problem.measured[name], kernel), np.zeros(len(prior))])
         return _Weighing(kernel, prior, basis, target - basis @ (basis.T @ target))
 
     def left(self, moving: Sequence[Array]) -> Array:
@@ -198,6 +198,16 @@ class _Weighing:
         table = table - self.basis @ (self.basis.T @ table)
         found = scaled_solve(table.T @ table, table.T @ self.target, RIDGE)
         return np.asarray(self.target - table @ found)
+
+    def solved(
+        self, columns: Sequence[Array], measured: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
+        """Return the best coefficients (k,), the filtered columns (n, k), and the errors (n,)."""
+        table, seen = _filter(columns, self.kernel), _filter(measured, self.kernel)
+        prior = np.zeros(table.shape[1])
+        prior[-len(self.prior) :] = self.prior
+        found = scaled_solve(table.T @ table + np.diag(prior), table.T @ seen, RIDGE)
+        return found, table, seen - table @ found
 
 
 def fit_response(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Response:
@@ -227,7 +237,7 @@ def _numbers(response: Response) -> Array:
 
 def _fit(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Response:
     problem = _problem_of(stretches, vehicle)
-    weighings = {name: _unweighted(problem, name) for name in OUTPUTS}
+    weighings = {name: _Weighing.of(problem, name, np.ones(1)) for name in OUTPUTS}
     place = problem.begin
     for _ in range(ROUNDS):
         weighings = _reweight(problem, place, weighings)
@@ -294,12 +304,6 @@ def _places(vehicle: VehicleFile) -> Array:
     return np.asarray(places - [value.get(f"center_of_mass_{axis}") or 0.0 for axis in "xyz"])
 
 
-def _unweighted(problem: _Problem, name: str) -> _Weighing:
-    """Return plain least squares."""
-    still, measured = problem.still[name], problem.measured[name]
-    return _Weighing.of(np.ones(1), _prior(problem, name, None), still, measured)
-
-
 def _prior(problem: _Problem, name: str, gain: float | None) -> Array:
     """Return the information (k,) about what no lag moves; ``gain`` of what flew, once known."""
     prior = np.zeros(problem.still[name][0].shape[1])
@@ -326,13 +330,6 @@ def _filter(tables: Sequence[Array], kernel: Array) -> Array:
     return np.concatenate(parts)
 
 
-def _solve(weighing: _Weighing, table: Array, measured: Array) -> Array:
-    """Return the best coefficients (k,) of a filtered table (n, k), moved columns first."""
-    moved = table.shape[1] - len(weighing.prior)
-    prior = np.concatenate([np.zeros(moved), weighing.prior])
-    return scaled_solve(table.T @ table + np.diag(prior), table.T @ measured, RIDGE)
-
-
 def _columns(problem: _Problem, name: str, moving: Tables) -> list[Array]:
     pairs = zip(moving[name], problem.still[name], strict=True)
     return [np.hstack(pair) for pair in pairs]
@@ -345,12 +342,8 @@ def _reweight(
     moving, order = _lag_columns(problem, place), max(1, round(NOISE_MEMORY / problem.step))
     renewed = {}
     for name in OUTPUTS:
-        old, columns, measured = (
-            weighings[name],
-            _columns(problem, name, moving),
-            problem.measured[name],
-        )
-        found = _solve(old, _filter(columns, old.kernel), _filter(measured, old.kernel))
+        columns, measured = _columns(problem, name, moving), problem.measured[name]
+        found, *_ = weighings[name].solved(columns, measured)
         alike = np.zeros(order + 1)
         for table, values in zip(columns, measured, strict=True):
             errors = values - table @ found
@@ -365,8 +358,7 @@ def _reweight(
         ahead = linalg.solve_toeplitz(alike[:-1], alike[1:])
         new = np.sqrt(max(alike[0] - ahead @ alike[1:], 1e-300))
         kernel = np.concatenate([[1.0], -ahead]) / new
-        prior = _prior(problem, name, float(found[0]))
-        renewed[name] = _Weighing.of(kernel, prior, problem.still[name], measured)
+        renewed[name] = _Weighing.of(problem, name, kernel, float(found[0]))
     return renewed
 
 
@@ -407,30 +399,27 @@ def _search_lags(
 
 def _response(problem: _Problem, place: Array, weighings: Mapping[str, _Weighing]) -> Response:
     """Return what is found at a place, and how surely."""
-    moving = _lag_columns(problem, place)
-    slopes = _slopes(problem, place)
+    moving, slopes = _lag_columns(problem, place), _slopes(problem, place)
     found, tables, errors, curves = {}, {}, {}, {}
     for name in OUTPUTS:
         weighing, columns = weighings[name], _columns(problem, name, moving)
-        measured = problem.measured[name]
-        table = _filter(columns, weighing.kernel)
-        found[name] = _solve(weighing, table, _filter(measured, weighing.kernel))
-        errors[name] = _filter(measured, weighing.kernel) - table @ found[name]
-        count = moving[name][0].shape[1]
-        by_lags = [
-            _filter([part @ found[name][:count] for part in slope[name]], weighing.kernel)
-            for slope in slopes
-        ]
+        found[name], table, errors[name] = weighing.solved(columns, problem.measured[name])
+        gains = found[name][: moving[name][0].shape[1]]
+        by_lags = [_filter([part @ gains for part in s[name]], weighing.kernel) for s in slopes]
         tables[name] = np.column_stack([*by_lags, table])
         modelled = [table @ found[name] for table in columns]
-        curves[name] = _curves(measured, modelled, problem.step)
-    firsts, covariance = _covariance(problem, weighings, tables, errors)
+        seen, made = (
+            np.concatenate([smoothed(part[:, None], problem.step)[:, 0] for part in parts])
+            for parts in (problem.measured[name], modelled)
+        )
+        curves[name] = seen, made
+    covariance = _covariance(problem, weighings, tables, errors)
     covariance += _air_covariance(problem, moving, found)
     return Response(
         lags=Lags.at(place),
         gains={name: float(solution[0]) for name, solution in found.items()},
         steady={
-            name: float(found[output][firsts[output] + CONSTANT])
+            name: float(found[output][moving[output][0].shape[1] + CONSTANT])
             for name, output in zip(STEADY, OUTPUTS, strict=False)
         },
         covariance=covariance,
@@ -447,31 +436,17 @@ def _slopes(problem: _Problem, place: Array) -> list[Tables]:
     """Return the derivatives of the moving columns by each of the lags' coordinates."""
     slopes = []
     for number, nudge in enumerate(NUDGE):
-        ends = []
-        for sign in (1.0, -1.0):
-            at = place.copy()
-            at[number] = np.clip(at[number] + sign * nudge, *BOUNDS[number])
-            ends.append((at[number], _lag_columns(problem, at)))
-        (above, high), (below, low) = ends
+        ends = np.array([place, place])
+        ends[:, number] = np.clip(place[number] + nudge * np.array([1.0, -1.0]), *BOUNDS[number])
+        span = ends[0, number] - ends[1, number]
+        high, low = (_lag_columns(problem, end) for end in ends)
         slopes.append(
             {
-                name: [
-                    (a - b) / (above - below) for a, b in zip(high[name], low[name], strict=True)
-                ]
+                name: [(a - b) / span for a, b in zip(high[name], low[name], strict=True)]
                 for name in OUTPUTS
             }
         )
     return slopes
-
-
-def _curves(
-    measured: Sequence[Array], modelled: Sequence[Array], step: float
-) -> tuple[Array, Array]:
-    seen, made = (
-        np.concatenate([smoothed(part[:, None], step)[:, 0] for part in parts])
-        for parts in (measured, modelled)
-    )
-    return seen, made
 
 
 def _covariance(
@@ -479,8 +454,8 @@ def _covariance(
     weighings: Mapping[str, _Weighing],
     tables: Mapping[str, Array],
     errors: Mapping[str, Array],
-) -> tuple[dict[str, int], Array]:
-    """Return where each output's constant stands, and the covariance of the numbers (10, 10).
+) -> Array:
+    """Return the covariance of the numbers (10, 10).
 
     Of what is new in errors, or of how blocks of them scatter (sandwich): the larger of both.
     """
@@ -489,7 +464,7 @@ def _covariance(
     total = 3 + sum(tables[name].shape[1] - 3 for name in OUTPUTS)
     bread, scores = np.zeros((total, total)), np.zeros((int(blocks.max()) + 1, total))
     bread[:3, :3] = np.diag(PRIOR**-2)
-    first, gains, constants, firsts = 3, [], [], {}
+    first, gains, constants = 3, [], []
     for name in OUTPUTS:
         table = tables[name]
         moved = table.shape[1] - 3 - len(weighings[name].prior)
@@ -498,7 +473,6 @@ def _covariance(
         still = places[3 + moved :]
         bread[still, still] += weighings[name].prior
         np.add.at(scores, (blocks[:, None], places[None]), table * errors[name][:, None])
-        firsts[name] = moved
         gains.append(first)
         constants.append(first + moved + CONSTANT)
         first += table.shape[1] - 3
@@ -510,7 +484,7 @@ def _covariance(
     wider = np.sqrt(np.maximum(1.0, np.diag(white) / np.maximum(np.diag(scattered), 1e-300)))
     covariance = scattered * np.outer(wider, wider) + inverse.open
     wanted = [0, 1, 2, *gains, *constants[:3]]
-    return firsts, np.asarray(covariance[np.ix_(wanted, wanted)])
+    return np.asarray(covariance[np.ix_(wanted, wanted)])
 
 
 def _air_covariance(problem: _Problem, moving: Tables, found: Mapping[str, Array]) -> Array:

@@ -91,7 +91,7 @@ def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
         name, predicted = flight.name, predict(wrong, ControllerFile(), flight, inlet, stride=1.0)
         return (
             comparison.fly(wrong)[name],
-            comparison.fly_from_fitted_starts(wrong)[name],
+            comparison.fly(wrong, fitted_starts=True)[name],
             predicted,
         )
 
@@ -120,7 +120,7 @@ def test_a_comparison_of_windows_predicts_and_names_what_is_fitted_otherwise(ful
     wrong = with_values(updated, {"torque_trim_x": 0.02})
     comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
     predicted = comparison.fly(wrong)[full_flight.name].rmse
-    met = comparison.fly_from_fitted_starts(wrong)[full_flight.name].rmse
+    met = comparison.fly(wrong, fitted_starts=True)[full_flight.name].rmse
     assert predicted.roll > 3 * met.roll  # a trim in each window hides what is wrong
     assert comparison.fly(updated)[full_flight.name].rmse.roll < 0.1 * predicted.roll
 
@@ -130,5 +130,5 @@ def test_fitted_starts_meet_a_flight_no_worse_than_recorded_ones(full_flight, up
     wrong = with_values(updated, {"angular_drag_x": -0.2, "torque_trim_x": 0.3})
     comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
     predicted = comparison.fly(wrong)[full_flight.name]
-    met = comparison.fly_from_fitted_starts(wrong)[full_flight.name]
+    met = comparison.fly(wrong, fitted_starts=True)[full_flight.name]
     assert met.rmse.length("attitude") < predicted.rmse.length("attitude")

@@ -207,7 +207,7 @@ def test_a_hover_tells_of_no_law():
     score = np.random.default_rng(0).normal(size=(9, 3))
     information = np.zeros((9, 3, 3))
     information[:, 0, 0] = 1.0
-    assert _likeliest(information, score, [0], [1, 2]) is None
+    assert not _likeliest(information, score, [0], [1, 2])
 
 
 def test_commands_stand_in_for_tachometers():
