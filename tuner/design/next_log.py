@@ -21,6 +21,7 @@ from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array, errors_of
 from tuner.design.proposals import LogProposal
+from tuner.design.ranking import seconds_recorded
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_at
 from tuner.objective.inlets import INLETS, STEADY_TORQUE
@@ -105,8 +106,7 @@ def beyond_noise(criterion: Criterion) -> float:
 def _information(fitted: Fitted, signal: str, noise: float) -> Array:
     """Return the information (K, K) of a signal at the fitted point, were it logged."""
     objective, criterion = fitted.objective, fitted.criterion
-    others = objective.segments.measured.values()
-    ends = np.max([np.asarray(other.time).max(axis=0) for other in others], axis=0)
+    ends = seconds_recorded(objective)
     seconds = objective.samples / float(objective.schedule.log_rate)
     time = np.repeat(np.arange(1, max(int(seconds * RATE), 2))[:, None] / RATE, len(ends), axis=1)
     width = 3 if signal == "body_rate" else 4

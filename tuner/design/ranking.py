@@ -32,6 +32,7 @@ from tuner.objective.information import information_at
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.trajectory import Published, at_speed, published
+from tuner.search.problem import SPIN_CHANNELS
 from tuner.search.progress import plain_criterion
 from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.examination import Examination
@@ -119,7 +120,6 @@ def candidate_problem(
     flights: Sequence[TrajectorySettings],
     *,
     seconds: float,
-    spin_channels: Sequence[str],
 ) -> Objective:
     """Return the problem with candidates in the place of recordings, whose values are zero.
 
@@ -127,8 +127,6 @@ def candidate_problem(
     ----------
     objective
         The problem of the recorded flights, which are whole.
-    spin_channels
-        Channels that a yaw spin is compared by.
     """
     recorded, schedule = objective.segments, objective.schedule
     references = [
@@ -147,9 +145,9 @@ def candidate_problem(
         measured={
             name: _sampled(
                 measured,
-                silent=spins & (name not in spin_channels),
+                silent=spins & (name not in SPIN_CHANNELS),
                 seconds=seconds,
-                recorded=_seconds(objective),
+                recorded=seconds_recorded(objective),
             )
             for name, measured in recorded.measured.items()
         },
@@ -196,10 +194,10 @@ def _filled(recorded: Any, count: int, value: float) -> Array | None:
     return None if recorded is None else np.full((*recorded.shape[:-1], count), value)
 
 
-def _seconds(objective: Objective) -> Array:
+def seconds_recorded(objective: Objective) -> Array:
     """Return (F,) s that each segment was recorded for."""
     ends = [np.asarray(m.time).max(axis=0) for m in objective.segments.measured.values()]
-    return np.asarray(np.maximum(np.max(ends, axis=0), 1e-9))
+    return np.asarray(np.max(ends, axis=0))
 
 
 def _sampled(
@@ -222,7 +220,7 @@ def _sampled(
     """
     weight = np.asarray(measured.weight)
     rows = int(seconds * SAMPLE_RATE) - 1
-    recorded_rate = (weight > 0).sum(axis=0) / recorded
+    recorded_rate = (weight > 0).sum(axis=0) / np.maximum(recorded, 1e-9)
     equivalent = np.where(
         weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(recorded_rate / SAMPLE_RATE), 0.0
     )
@@ -242,7 +240,6 @@ def rank_next_flights(
     *,
     arena: Arena,
     seconds: float,
-    spin_channels: Sequence[str],
 ) -> Proposals:
     """Rank the flights that could be flown next.
 
@@ -250,8 +247,6 @@ def rank_next_flights(
     ----------
     criterion
         Whose weights the recorded residuals have.
-    spin_channels
-        Channels that a yaw spin is compared by.
     """
     full_problem, found = examination.full_problem, candidates(arena)
     flights = [*found.values()]
@@ -262,9 +257,7 @@ def rank_next_flights(
     for first in range(0, len(flights), at_once):
         # the last ones again where too few are left: as many as the program was compiled for
         some = [flights[min(first + i, len(flights) - 1)] for i in range(at_once)]
-        objective = candidate_problem(
-            full_problem.objective, some, seconds=seconds, spin_channels=spin_channels
-        )
+        objective = candidate_problem(full_problem.objective, some, seconds=seconds)
         point = objective.start(full_problem.point.coefficients)
         scales = {
             name: np.full(at_once, float(np.median(scale)))
@@ -279,29 +272,7 @@ def rank_next_flights(
         gains += list(information.blocks.sum(axis=(0, 2)))
         flown += list(~information.crashed & inside)
     now = examination.information.data + examination.information.prior / WIDE**2
-    return _ranked(
-        examination,
-        [
-            (flight, gain)
-            for flight, gain, flies in zip(found.items(), gains, flown, strict=False)
-            if flies
-        ],
-        now,
-        arena=arena,
-        seconds=seconds,
-    )
-
-
-def _ranked(
-    examination: Examination,
-    flights: Sequence[tuple[tuple[str, TrajectorySettings], Array]],
-    now: Array,
-    *,
-    arena: Arena,
-    seconds: float,
-) -> Proposals:
-    names = tuple(examination.sensitivity.steps)
-    fitted = examination.uncertainty
+    names, fitted = tuple(examination.sensitivity.steps), examination.uncertainty
     count = len(fitted.names)
     verdicts = {name: fitted.estimates[name].verdict for name in fitted.names}
     verdicts |= {name: freed.estimates[name].verdict for name, freed in examination.freed.items()}
@@ -320,7 +291,8 @@ def _ranked(
             shrinks={name: _ratio(now, gain, names.index(name), count) for name in targets},
             volume=_volume(now, gain, count),
         )
-        for (flight, trajectory), gain in flights
+        for (flight, trajectory), gain, flies in zip(found.items(), gains, flown, strict=False)
+        if flies
     ]
     rows.sort(key=lambda row: (row.mean, row.name))
     return Proposals(

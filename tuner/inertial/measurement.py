@@ -158,7 +158,5 @@ def agreeing(
 
     Batteries, propellers and air differ from flight to flight by more than one flight shows.
     """
-    ratio = chi_square / freedom if freedom > 0 else 1.0
-    if ratio <= 1.0:
-        return tuple(measurements)
+    ratio = max(chi_square / freedom, 1.0) if freedom > 0 else 1.0
     return tuple(replace(m, covariance=np.asarray(m.covariance * ratio)) for m in measurements)

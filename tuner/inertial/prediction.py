@@ -54,32 +54,21 @@ def rate_errors(
     stretches: Sequence[Stretch], initial: VehicleFile, fitted: VehicleFile
 ) -> tuple[RateErrors, ...]:
     """Return how well a flight's body rates are predicted; none where none flies long enough."""
-    beginnings = [_beginnings(stretch) for stretch in stretches]
-    if not sum(len(begin) for begin in beginnings):
+    if not stretches:
         return ()
-    pairs = list(zip(stretches, beginnings, strict=True))
     missed = [
-        np.concatenate([_missed(stretch, begin, vehicle) for stretch, begin in pairs], axis=1)
+        np.concatenate([_missed(stretch, vehicle) for stretch in stretches], axis=1)
         for vehicle in (initial, fitted, None)
     ]
     errors = np.linalg.norm(missed, axis=-1).mean(axis=-1)
     return tuple(starmap(RateErrors, zip(AHEAD, *errors.tolist(), strict=True)))
 
 
-def _beginnings(stretch: Stretch) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    inside = np.flatnonzero(stretch.inside)
-    steps, stride = round(AHEAD[-1] / stretch.step), round(STRIDE / stretch.step)
-    return np.asarray(inside[: max(0, len(inside) - steps) : stride])
-
-
-def _missed(
-    stretch: Stretch,
-    begin: np.ndarray[tuple[int], np.dtype[np.intp]],
-    vehicle: VehicleFile | None,
-) -> Array:
-    """Return the errors (S, n, 3) rad/s of predictions that begin at n samples."""
-    measured = smoothed(stretch.body_rate, stretch.step)
+def _missed(stretch: Stretch, vehicle: VehicleFile | None) -> Array:
+    """Return the errors (S, n, 3) rad/s of predictions that begin every `STRIDE`."""
+    measured, inside = smoothed(stretch.body_rate, stretch.step), np.flatnonzero(stretch.inside)
     places = [round(seconds / stretch.step) for seconds in AHEAD]
+    begin = inside[: max(0, len(inside) - places[-1]) : round(STRIDE / stretch.step)]
     rates = [measured[begin]]
     if vehicle is not None:
         value = values_of(vehicle)

@@ -95,8 +95,6 @@ def blocks_of(stretches: tuple[Stretch, ...], order: int) -> NDArray[np.int64]:
     numbers, first = [], 0
     for stretch in stretches:
         inside = stretch.time[:-1][stretch.inside[:-1]][order:]
-        if not len(inside):
-            continue
         block = first + ((inside - inside[0]) / BLOCK).astype(np.int64)
         numbers.append(block)
         first = int(block[-1]) + 1

@@ -29,14 +29,7 @@ from tuner.result import (
     SearchResult,
     Status,
 )
-from tuner.uncertainty.verdict import (
-    IDENTIFIABLE_ERROR,
-    NOT_FITTED,
-    WELL_KNOWN,
-    Reason,
-    ReasonCode,
-    Verdict,
-)
+from tuner.uncertainty.verdict import NOT_FITTED, Reason, ReasonCode, Verdict, judge_by_error
 from tuner.vehicle import (
     COEFFICIENTS,
     VehicleFile,
@@ -280,15 +273,14 @@ def _judged(
     row, scaled = COEFFICIENTS[name], float(combination.scaled[place])
     deviation = float(np.sqrt(combination.covariance[place, place]))
     relative = deviation if row.scale == "log" else deviation / max(abs(scaled), least)
-    half_width = Z95 * deviation
-    unit = None if row.scale == "log" else row.unit
-    if relative > IDENTIFIABLE_ERROR:
-        code = ReasonCode.MEASURED_ROUGHLY
-        return Verdict.NOT_IDENTIFIABLE, Reason(code=code, half_width=half_width, unit=unit)
-    best = max(measurements, key=lambda m: _weight(name, m, combination)).experiment
-    well = Z95 * relative < WELL_KNOWN
-    reason = Reason(code=ReasonCode.INTERVAL, half_width=half_width, unit=unit, channel=best)
-    return Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN, reason
+    return judge_by_error(
+        deviation,
+        relative,
+        None if row.scale == "log" else row.unit,
+        known=ReasonCode.INTERVAL,
+        roughly=ReasonCode.MEASURED_ROUGHLY,
+        channel=max(measurements, key=lambda m: _weight(name, m, combination)).experiment,
+    )
 
 
 def _weight(name: str, measurement: Measurement, combination: Combination) -> float:

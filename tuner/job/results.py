@@ -45,7 +45,7 @@ from tuner.result import (
     Status,
 )
 from tuner.search.job_flights import Recording
-from tuner.search.problem import SPIN_CHANNELS, Job
+from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, knowledge_of
@@ -54,10 +54,11 @@ from tuner.uncertainty.verdict import (
     NOT_EXAMINED,
     NOT_FITTED,
     Reason,
+    ReasonCode,
     Verdict,
     judge_after_holding,
+    judge_by_error,
     judge_impossible_inertia,
-    judge_regressed,
 )
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, write_vehicle
 from tuner.vehicle.selection_table import SelectionRow
@@ -239,12 +240,16 @@ def _regressed(
     name: str, initial: float, best: float, error: float, bounds: tuple[float, float]
 ) -> CoefficientResult:
     """Return a coefficient by regression of accelerations, its error that of the scaled number."""
-    row = COEFFICIENTS[name]
-    std_error, interval = error, (best - Z95 * error, best + Z95 * error)
+    row, std_error = COEFFICIENTS[name], error
+    unit: str | None = row.unit
+    relative = error / max(abs(best), 1e-300)
+    interval = (best - Z95 * error, best + Z95 * error)
     if row.scale == "log":
-        std_error = best * error
+        std_error, relative, unit = best * error, error, None
         interval = (best * float(np.exp(-Z95 * error)), best * float(np.exp(Z95 * error)))
-    verdict, reason = judge_regressed(std_error, best, row.unit, relative=row.scale == "log")
+    verdict, reason = judge_by_error(
+        error, relative, unit, known=ReasonCode.REGRESSED, roughly=ReasonCode.WIDE_INTERVAL
+    )
     return CoefficientResult.judged(
         name,
         initial,
@@ -376,7 +381,6 @@ def write_next_flight(
         fitted.criterion,
         arena=arena_of(job.flights) if arena is None else arena,
         seconds=round(SHORTEST * 2**doublings),
-        spin_channels=SPIN_CHANNELS,
     )
     proposals.write(folder)
     return proposals

@@ -157,17 +157,19 @@ class Innovations:
             if not row.kept
             and row.reason in REFUSED
             and any(name in COEFFICIENTS and COEFFICIENTS[name].begin for name in row.names)
-            and self._chance(model, row.names) < WORTH_A_FIT
+            and score(
+                self.linear,
+                model,
+                self._columns(row.names),
+                candidates=1,
+                no_gust=True,
+                material=0.0,
+            ).chance
+            < WORTH_A_FIT  # of such innovations if the model did not lack it
         }
         if base is None or not lags:
             return None
         return self._with(base, lags, lags, begun(self.space, self.vector, names_in(lags)))
-
-    def _chance(self, model: Columns, names: Sequence[str]) -> float:
-        """Return the probability of such innovations if a model did not lack a group."""
-        columns = self._columns(names)
-        found = score(self.linear, model, columns, candidates=1, no_gust=True, material=0.0)
-        return found.chance
 
     def _with(
         self, base: tuple[Job, Fitted], judged: Groups, kept: Collection[str], moved: Array

@@ -224,25 +224,34 @@ def judge_after_holding(
     return Verdict.HELD if stand_in == name else Verdict.NOT_IDENTIFIABLE, reason
 
 
-def judge_regressed(
-    std_error: float, value: float, unit: str, *, relative: bool
+def judge_by_error(
+    error: float,
+    relative: float,
+    unit: str | None,
+    *,
+    known: ReasonCode,
+    roughly: ReasonCode,
+    channel: str | None = None,
 ) -> tuple[Verdict, Reason]:
-    """Return the judgement on a coefficient by regression of accelerations.
+    """Return the judgement on a coefficient of which a standard error is all that is known.
 
-    ``relative``: whether its half-width is given as a share of its value.
+    Parameters
+    ----------
+    error, unit
+        In ``unit``; a share of the value where that is None.
+    relative
+        The error as a share of the value.
+    known, roughly
+        What is said of one that is determined, and of one that is not.
+    channel
+        Where most of the information comes from.
     """
-    size = max(abs(value), 1e-300)
-    half_width = Z95 * std_error / (size if relative else 1.0)
-    shown = None if relative else unit
-    if std_error / size > IDENTIFIABLE_ERROR:
-        return Verdict.NOT_IDENTIFIABLE, _told(ReasonCode.WIDE_INTERVAL, half_width, shown)
-    well = Z95 * std_error / size < WELL_KNOWN
+    half_width = Z95 * error
+    if relative > IDENTIFIABLE_ERROR:
+        return Verdict.NOT_IDENTIFIABLE, Reason(code=roughly, half_width=half_width, unit=unit)
+    well = Z95 * relative < WELL_KNOWN
     verdict = Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN
-    return verdict, _told(ReasonCode.REGRESSED, half_width, shown)
-
-
-def _told(code: ReasonCode, half_width: float, unit: str | None) -> Reason:
-    return Reason(code=code, half_width=half_width, unit=unit)
+    return verdict, Reason(code=known, half_width=half_width, unit=unit, channel=channel)
 
 
 def judge_impossible_inertia(fitted_value: float) -> tuple[Verdict, Reason]:

@@ -25,7 +25,6 @@ from tuner.uncertainty.examination import Examination, examine
 
 FREE = ("inertia_xx", "inertia_zz", "input_scaling", "motor_constant", "moment_constant")
 ARENA = Arena(4.0, 3.0, 2.0)
-SPIN_CHANNELS = ("body_rate", "rotor_speed", "command")
 
 
 def only(objective: Objective, segment: int) -> Objective:
@@ -58,7 +57,6 @@ def ranked(examination: Examination, fitted: Fitted) -> Proposals:
         fitted.criterion,
         arena=ARENA,
         seconds=making.SECONDS,
-        spin_channels=SPIN_CHANNELS,
     )
 
 
