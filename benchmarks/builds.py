@@ -17,8 +17,8 @@ from benchmarks.contest import STRIDE, Contest, simple
 from tuner.config import Options, settle
 from tuner.config.job import JobFile
 from tuner.core.errors import InputError
-from tuner.evaluate.held_out import controller_flown, vehicle_fitted
-from tuner.evaluate.predict import Predictions, predict
+from tuner.evaluate.prediction import Predictions, predict
+from tuner.evaluate.validation import controller_flown, vehicle_fitted
 from tuner.objective.inlets import INLETS
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state

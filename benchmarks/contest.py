@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from benchmarks.regression import Regression
-from tuner.evaluate.predict import Predictions, hold
+from tuner.evaluate.prediction import Predictions, hold
 from tuner.recordings.flight import Flight
 
 STEPS = (10, 50)

@@ -33,8 +33,8 @@ from sim_jax.trim import in_trim
 from tuner.config import TrajectorySettings
 from tuner.core.disk import write_text
 from tuner.core.shipped import find_config
-from tuner.evaluate.simulate import Simulation
-from tuner.evaluate.write import write_bag
+from tuner.evaluate.closed_loop import Simulation
+from tuner.evaluate.simulation_files import write_bag
 from tuner.objective.trajectory import Published, published
 from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle, term_groups, with_values
 from tuner.vehicle.model import Model, model_of, schedule_of, vehicle_of, with_terms_computed

@@ -20,7 +20,7 @@ from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from tuner.config import Options, settle
 from tuner.core.errors import InputError
-from tuner.evaluate.predict import Predictions, predict
+from tuner.evaluate.prediction import Predictions, predict
 from tuner.findings.sentences import PREDICTED
 from tuner.job.run import run
 from tuner.objective.inlets import INLETS

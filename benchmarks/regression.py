@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tuner.core.numerics import Array
-from tuner.evaluate.predict import Predictions, errors_of
+from tuner.evaluate.prediction import Predictions, errors_of
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import States, filtered, states_at
 

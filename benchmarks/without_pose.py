@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.contest import STRIDE, Contest, simple
 from tuner.config import Options, settle
 from tuner.core.errors import InputError
-from tuner.evaluate.predict import Predictions, predict
+from tuner.evaluate.prediction import Predictions, predict
 from tuner.job.without_pose import fit_without_pose
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.loader import InertialFlight

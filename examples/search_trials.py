@@ -29,7 +29,7 @@ configure()
 
 from tuner.config import Options, Settings, settle  # noqa: E402 (jax is configured first)
 from tuner.engine import Report, engine_for  # noqa: E402
-from tuner.evaluate.held_out import validate, vehicle_fitted  # noqa: E402
+from tuner.evaluate.validation import validate, vehicle_fitted  # noqa: E402
 from tuner.findings.findings import Code  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
 from tuner.recordings.flight import Flight, Series  # noqa: E402

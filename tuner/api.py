@@ -29,8 +29,8 @@ from tuner.vehicle import VehicleFile
 
 if TYPE_CHECKING:
     from tuner.client.client import Client
+    from tuner.evaluate.closed_loop import Simulation
     from tuner.evaluate.records import Table
-    from tuner.evaluate.simulate import Simulation
     from tuner.exporters.export import Exported
     from tuner.job.sensitivity import SensitivityResult
 
@@ -211,8 +211,8 @@ def simulate(
     trajectory
         Which shape, flown from rest.
     grid
-        Coefficient -> (B,) values: B vehicles fly side by side. `tuner.evaluate.simulate.grid_of`
-        makes every combination of several ranges.
+        Coefficient -> (B,) values: B vehicles fly side by side. Every combination of several ranges
+        is made by `tuner.evaluate.closed_loop.grid_of`.
     forces
         Whether each simulation has ``forces``: what acted along the flight, term by term.
     options
@@ -222,7 +222,7 @@ def simulate(
     Returns
     -------
     tuple
-        One simulation, or B of them; `tuner.evaluate.write.write_flights` writes them.
+        One simulation, or B of them; `tuner.evaluate.simulation_files.write_flights` writes them.
 
     Raises
     ------
@@ -230,7 +230,7 @@ def simulate(
         Something cannot be flown.
     """
     configure()
-    from tuner.evaluate.simulate import fly  # noqa: PLC0415 (jax)
+    from tuner.evaluate.closed_loop import fly  # noqa: PLC0415 (jax)
 
     given: dict[str, Any] = {name: text_of(value) for name, value in options.items()}
     asked = SimulationOptions(trajectory=trajectory, **given)

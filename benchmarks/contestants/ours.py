@@ -27,7 +27,7 @@ from benchmarks.derivatives import FLIGHTS, GRADIENT, JACOBIAN, REVERSED, SAMPLE
 from benchmarks.timing import answer  # noqa: E402
 from tuner.config import TrajectorySettings  # noqa: E402
 from tuner.core.shipped import configs_folder  # noqa: E402
-from tuner.evaluate.simulate import simulate  # noqa: E402
+from tuner.evaluate.closed_loop import simulate  # noqa: E402
 from tuner.objective.criterion import Point  # noqa: E402
 from tuner.search.progress import beginning, criterion_of  # noqa: E402
 from tuner.search.stages import plan  # noqa: E402

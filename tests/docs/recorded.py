@@ -13,7 +13,7 @@ import numpy as np
 import tuner
 from tests.tuner.recordings import making
 from tuner.core.shipped import configs_folder
-from tuner.evaluate.write import write_flights
+from tuner.evaluate.simulation_files import write_flights
 from tuner.vehicle import read_vehicle, with_values
 
 FLIGHTS = {

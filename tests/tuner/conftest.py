@@ -16,8 +16,8 @@ def updated():
 @pytest.fixture(scope="session")
 def bag(updated, tmp_path_factory):
     """Twelve seconds of a small, quick circle of several laps, as a recording."""
-    from tuner.evaluate.simulate import simulate  # noqa: PLC0415 (jax)
-    from tuner.evaluate.write import write_flights  # noqa: PLC0415
+    from tuner.evaluate.closed_loop import simulate  # noqa: PLC0415 (jax)
+    from tuner.evaluate.simulation_files import write_flights  # noqa: PLC0415
 
     shape = TrajectorySettings(name="circle", radius=0.3, omega=1.0, speed_scale=4.0)
     path = tmp_path_factory.mktemp("lab") / "small_circle.bag"
@@ -28,8 +28,8 @@ def bag(updated, tmp_path_factory):
 @pytest.fixture(scope="session")
 def full_bag(updated, tmp_path_factory):
     """Six seconds of the same, every command of the 400 Hz loop recorded."""
-    from tuner.evaluate.simulate import simulate  # noqa: PLC0415 (jax)
-    from tuner.evaluate.write import write_flights  # noqa: PLC0415
+    from tuner.evaluate.closed_loop import simulate  # noqa: PLC0415 (jax)
+    from tuner.evaluate.simulation_files import write_flights  # noqa: PLC0415
 
     shape = TrajectorySettings(name="circle", radius=0.3, omega=1.0, speed_scale=4.0)
     path = tmp_path_factory.mktemp("lab") / "full_circle.bag"

@@ -35,7 +35,7 @@ from tuner.core import shipped
 from tuner.core.errors import ConfigError, ExportError
 from tuner.core.phrases import Worded
 from tuner.core.yaml_section import build, section_of
-from tuner.evaluate.write import write_flights
+from tuner.evaluate.simulation_files import write_flights
 from tuner.exporters.simulators import THIS_PROJECT, registered
 from tuner.exporters.target import Draft, Target, differences
 from tuner.findings.findings import Finding, brief, one_line

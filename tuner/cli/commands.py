@@ -148,8 +148,8 @@ def simulate(
 
     configure()
     from tuner.engine import engine_for
-    from tuner.evaluate.simulate import fly, grid_of
-    from tuner.evaluate.write import Summary, summary_of, write_flights
+    from tuner.evaluate.closed_loop import fly, grid_of
+    from tuner.evaluate.simulation_files import Summary, summary_of, write_flights
     from tuner.report.paper import SUFFIXES, check_figure, flight_figure, write_figure
 
     drawn = out.suffix in SUFFIXES

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tuner.config import Settings
     from tuner.evaluate.records import Row
     from tuner.evaluate.records import Table as Comparison
-    from tuner.evaluate.write import Summary
+    from tuner.evaluate.simulation_files import Summary
     from tuner.exporters.export import Exported
     from tuner.vehicle.scaling_laws import Estimate
 

@@ -27,7 +27,7 @@ from tuner.core.shipped import find_config
 from tuner.evaluate.forces import Forces, acting, in_order
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse, Row, Table, check_table_file, write_table
 from tuner.evaluate.rmse import FlightErrors, SignalErrors, joined, laps_of, rmse_of, short_way
-from tuner.evaluate.write import roll_pitch_yaw
+from tuner.evaluate.simulation_files import roll_pitch_yaw
 from tuner.findings.findings import one_line
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of

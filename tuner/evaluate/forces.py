@@ -128,7 +128,7 @@ def forces_of(vehicle: Vehicle, time: Array, signals: Mapping[str, Array]) -> Fo
     Parameters
     ----------
     time, signals
-        Of a `tuner.evaluate.simulate.Simulation`.
+        Of a `tuner.evaluate.closed_loop.Simulation`.
     """
     rate = (len(time) - 1) / (time[-1] - time[0])
     names = ("position", "velocity", "body_rate")

@@ -17,7 +17,8 @@ from tuner.core.runtime import PROGRAM, versions
 from tuner.core.yaml_document import commented, dump_yaml
 from tuner.design.proposals import LogProposal, Proposals
 from tuner.design.ranking import CLEARANCE, LEVEL, SMALLEST, Arena, rank_next_flights
-from tuner.evaluate.held_out import (
+from tuner.evaluate.records import RMSE_UNITS
+from tuner.evaluate.validation import (
     Validation,
     best_values,
     conditions_of,
@@ -26,7 +27,6 @@ from tuner.evaluate.held_out import (
     initial_of,
     offsets_of,
 )
-from tuner.evaluate.records import RMSE_UNITS
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.inlets import INLETS, window_seconds

@@ -21,7 +21,7 @@ from tuner.core.spans import span
 from tuner.design.next_log import what_to_log
 from tuner.design.proposals import LogProposal
 from tuner.evaluate.comparison import table_of
-from tuner.evaluate.held_out import (
+from tuner.evaluate.validation import (
     Validation,
     controller_flown,
     flights_not_flown,

@@ -14,7 +14,7 @@ from tuner.core.errors import InputError, did_you_mean
 from tuner.core.runtime import versions
 from tuner.design.proposals import Proposals
 from tuner.design.ranking import Arena
-from tuner.evaluate.held_out import comparison_of
+from tuner.evaluate.validation import comparison_of
 from tuner.findings.findings import Code, Finding
 from tuner.job.results import write_knowledge, write_next_flight
 from tuner.objective.normal import Objective, misfit, root_mean_squares, sums_at

@@ -12,7 +12,7 @@ import numpy as np
 from tuner.config import Settings
 from tuner.core.disk import folder_for
 from tuner.core.errors import ConfigError, InputError, RecordingError
-from tuner.evaluate.held_out import WORSE
+from tuner.evaluate.validation import WORSE
 from tuner.findings.findings import Code, Finding, Level
 from tuner.ground.bench_json import Combination, combine
 from tuner.ground.measurement import Measurement, value_of

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
+    from tuner.evaluate.closed_loop import Simulation
     from tuner.evaluate.rmse import FlightErrors
-    from tuner.evaluate.simulate import Simulation
 
 
 MOST = 8

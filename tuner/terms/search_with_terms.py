@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from tuner.core.spans import span
-from tuner.evaluate.held_out import point_estimates
+from tuner.evaluate.validation import point_estimates
 from tuner.findings.findings import Finding
 from tuner.objective.battery import require_voltage
 from tuner.objective.initial_conditions import rests

@@ -16,8 +16,8 @@ from tuner.core.disk import write_text
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.files import csv_text
 from tuner.engine import Report, current
-from tuner.evaluate.held_out import best_values, comparison_of
 from tuner.evaluate.records import RMSE_UNITS
+from tuner.evaluate.validation import best_values, comparison_of
 from tuner.objective.normal import Objective
 from tuner.search.estimation import free_offsets, polished
 from tuner.search.iteration import Iteration

@@ -53,7 +53,7 @@ def models() -> list[type[BaseModel]]:
                 "tuner.engine.cluster_file",
                 "tuner.recordings.topics",
                 "tuner.service.request",
-                "tuner.evaluate.simulate",
+                "tuner.evaluate.closed_loop",
             )
         ):
             importlib.import_module(module.name)

@@ -12,8 +12,8 @@ import pytest
 from tests.tuner.engine import tasks
 from tuner.config import Options, TrajectorySettings, settle
 from tuner.engine import using
-from tuner.evaluate import simulate as simulation
-from tuner.evaluate.simulate import simulate
+from tuner.evaluate import closed_loop as simulation
+from tuner.evaluate.closed_loop import simulate
 from tuner.job.sensitivity import unfitted
 from tuner.objective.criterion import Point
 from tuner.objective.normal import evaluate, sums_at

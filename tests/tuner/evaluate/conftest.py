@@ -2,7 +2,7 @@ import pytest
 
 from tuner.config import TrajectorySettings
 from tuner.core.shipped import configs_folder
-from tuner.evaluate.simulate import simulate
+from tuner.evaluate.closed_loop import simulate
 from tuner.vehicle import ControllerFile, read_vehicle
 
 

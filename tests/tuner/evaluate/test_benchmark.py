@@ -9,7 +9,7 @@ from benchmarks.prediction import HELD_OUT, options_of
 from benchmarks.regression import Regression
 from benchmarks.without_pose import posed
 from tuner.core.errors import InputError
-from tuner.evaluate.predict import hold
+from tuner.evaluate.prediction import hold
 from tuner.recordings.loader import InertialFlight
 
 

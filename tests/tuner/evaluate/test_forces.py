@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
+from tuner.evaluate.closed_loop import simulate
 from tuner.evaluate.forces import COMPONENTS
-from tuner.evaluate.simulate import simulate
-from tuner.evaluate.write import write_flights
+from tuner.evaluate.simulation_files import write_flights
 from tuner.vehicle import ControllerFile, with_values
 
 #: Every term beyond the motor model's four, with what makes it felt.

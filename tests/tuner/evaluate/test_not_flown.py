@@ -10,7 +10,7 @@ import yaml
 from tests.tuner.evaluate.test_rmse import errors
 from tuner.config import Options, settle
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.held_out import flights_not_flown
+from tuner.evaluate.validation import flights_not_flown
 from tuner.findings.findings import Code, remedy, sentence
 from tuner.search.job_flights import read_usable
 from tuner.vehicle import COEFFICIENTS, with_values

@@ -11,7 +11,7 @@ from tuner.cli import main
 from tuner.core.errors import ExportError
 from tuner.core.shipped import EXPORT_TARGETS, configs_folder
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.write import write_flights
+from tuner.evaluate.simulation_files import write_flights
 from tuner.exporters.export import export_vehicle
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import MUJOCO, hover_command, thrust_to_weight

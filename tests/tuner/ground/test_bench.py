@@ -216,8 +216,8 @@ def test_hovers_and_spins_are_taken_from_recordings(tmp_path):
 
 
 def test_hovers_and_spins_are_taken_from_bags(tmp_path, updated):
-    from tuner.evaluate.simulate import simulate  # noqa: PLC0415 (jax)
-    from tuner.evaluate.write import write_flights  # noqa: PLC0415
+    from tuner.evaluate.closed_loop import simulate  # noqa: PLC0415 (jax)
+    from tuner.evaluate.simulation_files import write_flights  # noqa: PLC0415
 
     for name in ("hover", "yaw_spin"):
         shape = TrajectorySettings(name=name, yaw_rate=2.0)

@@ -10,7 +10,7 @@ from tests.tuner.recordings.micro_sd import log_of
 from tuner.config import Options, TrajectorySettings, settle
 from tuner.core.errors import InputError, RecordingError
 from tuner.core.shipped import configs_folder
-from tuner.evaluate.simulate import fly, simulate
+from tuner.evaluate.closed_loop import fly, simulate
 from tuner.findings.findings import Code, one_line
 from tuner.ground.bench_json import Combination
 from tuner.inertial.prediction import rate_errors

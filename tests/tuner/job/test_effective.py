@@ -5,8 +5,8 @@ import re
 import pytest
 
 from tuner.config import Options, TrajectorySettings
-from tuner.evaluate.simulate import simulate
-from tuner.evaluate.write import write_flights
+from tuner.evaluate.closed_loop import simulate
+from tuner.evaluate.simulation_files import write_flights
 from tuner.exporters import effective
 from tuner.exporters.effective import effective_in, recordings_of
 from tuner.exporters.simulators import GAZEBO_CLASSIC

@@ -11,7 +11,7 @@ from tests.tuner.evaluate.test_rmse import errors
 from tuner.config import JobFile, Options, settle
 from tuner.config.job import Search
 from tuner.core.errors import ConfigError, RecordingError
-from tuner.evaluate.held_out import flights_worse
+from tuner.evaluate.validation import flights_worse
 from tuner.findings.findings import Code, Finding
 from tuner.job.check import said_once
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by

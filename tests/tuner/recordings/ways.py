@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tuner.config import TrajectorySettings
-from tuner.evaluate.simulate import simulate
+from tuner.evaluate.closed_loop import simulate
 from tuner.vehicle import ControllerFile, read_vehicle
 
 VEHICLE = Path(__file__).parents[3] / "configs/vehicles/hovergames_updated.yaml"

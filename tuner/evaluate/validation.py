@@ -13,7 +13,7 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.predict import Predictions, hold, predict
+from tuner.evaluate.prediction import Predictions, hold, predict
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, Pose
 from tuner.findings.findings import Code, Finding

@@ -11,7 +11,7 @@ from sim_jax.terms import total
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
-from tuner.evaluate.simulate import simulate
+from tuner.evaluate.closed_loop import simulate
 from tuner.objective.trajectory import at_speed, published
 from tuner.recordings.flight import SIGNALS
 from tuner.vehicle import ControllerFile, read_controller, with_values
@@ -94,7 +94,7 @@ def test_a_grid_flies_each_vehicle_as_it_flies_alone(vehicle):
 
 
 def test_a_large_grid_takes_turns(vehicle, monkeypatch):
-    monkeypatch.setattr("tuner.evaluate.simulate.CHUNK", 2)
+    monkeypatch.setattr("tuner.evaluate.closed_loop.CHUNK", 2)
     constants = [1.3e-5, 1.4e-5, 1.5e-5]
     grid = {"motor_constant": np.array(constants), "inertia_xx": np.array([0.025] * 3)}
     in_turns = fly(vehicle, "hover", grid=grid)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.predict import hold, predict
+from tuner.evaluate.prediction import hold, predict
 from tuner.findings.sentences import PREDICTED
 from tuner.recordings.flight import Series
 from tuner.recordings.states import FILTER_HALF_WIDTH

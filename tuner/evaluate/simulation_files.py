@@ -17,8 +17,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tuner.core.disk import check_file, whole_file
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array
+from tuner.evaluate.closed_loop import Simulation
 from tuner.evaluate.forces import COMPONENTS
-from tuner.evaluate.simulate import Simulation
 
 #: ns since 1970 of the first sample; a fixed one, so that the same flight gives the same file.
 EPOCH = 1_577_836_800_000_000_000

@@ -6,8 +6,8 @@ import pandas as pd
 import pytest
 
 from tuner.core.errors import InputError
-from tuner.evaluate.simulate import fly, grid_of
-from tuner.evaluate.write import roll_pitch_yaw, summary_of, write_csv, write_flights
+from tuner.evaluate.closed_loop import fly, grid_of
+from tuner.evaluate.simulation_files import roll_pitch_yaw, summary_of, write_csv, write_flights
 from tuner.options import SimulationOptions
 from tuner.recordings.loader import load_flight
 
