@@ -195,18 +195,15 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
 
 
 def _coefficients(examination: Examination, space: Space) -> dict[str, CoefficientKnowledge]:
-    uncertainty = examination.uncertainty
-    steps = examination.sensitivity.steps
-    known = {}
-    for index, parameter in enumerate(space.parameters):
-        for name, ratio in parameter.ratios.items():
-            step = steps[parameter.name] * abs(ratio)
-            known[name] = _coefficient(name, uncertainty, index, step, fitted=True, bias={})
-    for row, (name, freed) in enumerate(examination.freed.items()):
-        bias = dict(zip(uncertainty.names, examination.bias[row].tolist(), strict=True))
-        known[name] = _coefficient(
-            name, freed, len(freed.names) - 1, steps[name], fitted=False, bias=bias
-        )
+    uncertainty, steps = examination.uncertainty, examination.sensitivity.steps
+    known = {
+        name: _coefficient(name, uncertainty, index, steps[parameter.name] * abs(ratio))
+        for index, parameter in enumerate(space.parameters)
+        for name, ratio in parameter.ratios.items()
+    }
+    for (name, freed), row in zip(examination.freed.items(), examination.bias, strict=True):
+        bias = dict(zip(uncertainty.names, row.tolist(), strict=True))
+        known[name] = _coefficient(name, freed, len(freed.names) - 1, steps[name], bias)
     return known
 
 
@@ -215,14 +212,13 @@ def _coefficient(
     uncertainty: Uncertainty,
     index: int,
     step: float,
-    *,
-    fitted: bool,
-    bias: Mapping[str, float],
+    bias: dict[str, float] | None = None,
 ) -> CoefficientKnowledge:
+    """Return what is known of a coefficient; ``bias`` of one that was not fitted."""
     estimate = uncertainty.estimates[name]
     return CoefficientKnowledge(
         unit=COEFFICIENTS[name].unit,
-        fitted=fitted,
+        fitted=bias is None,
         value=estimate.value,
         std_error=estimate.std_error,
         ci95=estimate.ci95,
@@ -234,7 +230,7 @@ def _coefficient(
             for channel, row in zip(uncertainty.channels, uncertainty.shares, strict=True)
         },
         prior_share=float(uncertainty.prior_share[index]),
-        bias=dict(bias),
+        bias=bias or {},
     )
 
 
@@ -274,24 +270,19 @@ def _residual(flight: str, channel: str, time: Array, error: Array) -> Residual:
     spacing = float(np.median(np.diff(time)))
     centred = error - error.mean(axis=0)
     power = np.maximum((centred**2).sum(axis=0), 1e-300)
-    count = len(time)
-    correlation = np.array(
-        [1.0]
-        + [
-            float(np.mean((centred[lag:] * centred[:-lag]).sum(axis=0) / power))
-            for lag in range(1, LAGS)
-        ]
+    others = np.array(
+        [((centred[n:] * centred[:-n]).sum(axis=0) / power).mean() for n in range(1, LAGS)]
     )
-    limit = Z95 / np.sqrt(count * error.shape[1])
+    limit = float(Z95 / np.sqrt(error.size))
     return Residual(
         flight=flight,
         channel=channel,
         rms=float(np.sqrt(np.mean(error**2))),
         spacing=spacing,
-        autocorrelation=correlation.round(4).tolist(),
-        limit=float(limit),
-        memory=float(spacing * (1.0 + 2.0 * (correlation[1:] ** 2).sum())),
-        white=bool(np.mean(np.abs(correlation[1:]) > limit) <= OUTSIDE),
+        autocorrelation=[1.0, *others.round(4).tolist()],
+        limit=limit,
+        memory=float(spacing * (1.0 + 2.0 * (others**2).sum())),
+        white=bool(np.mean(np.abs(others) > limit) <= OUTSIDE),
     )
 
 
@@ -326,7 +317,11 @@ def full_problem_of(objective: Objective, point: Point) -> FullProblem:
     """Return a fit's problem with its fixed coefficients free, too, around their values."""
     space = objective.space
     values = space.numbers(point.coefficients)
-    fixed = {name: value for name, value in _fixed(objective).items() if name not in values}
+    fixed = {
+        name: value
+        for name, value in space.fixed.items()
+        if name not in values and _acts(name, value)
+    }
     parameters = [*space.parameters, *(_parameter(*of, space.size) for of in fixed.items())]
     full_space = Space(parameters, {}, space.joint_prior, space.size)
     vector = full_space.vector_of(values | fixed)
@@ -340,14 +335,11 @@ def full_problem_of(objective: Objective, point: Point) -> FullProblem:
     )
 
 
-def _fixed(objective: Objective) -> Mapping[str, float]:
-    """Return the fixed coefficients that act in this simulation, and have a logarithm if needed."""
-    return {
-        name: value
-        for name, value in objective.space.fixed.items()
-        if not (COEFFICIENTS[name].is_optional and value == COEFFICIENTS[name].neutral)
-        and not (COEFFICIENTS[name].scale == "log" and value <= 0.0)
-    }
+def _acts(name: str, value: float) -> bool:
+    """Return whether a fixed coefficient acts in a simulation, and has a logarithm if needed."""
+    row = COEFFICIENTS[name]
+    neutral = row.is_optional and value == row.neutral
+    return not neutral and not (row.scale == "log" and value <= 0.0)
 
 
 def _parameter(name: str, value: float, size: Size) -> Parameter:
