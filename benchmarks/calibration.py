@@ -34,7 +34,7 @@ from tuner.config import Options, settle
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.space import Space
 from tuner.search.continuation import grow
 from tuner.search.estimation import free_offsets

@@ -17,7 +17,7 @@ from sim_jax.rollout import rollout
 from sim_jax.state import Setpoints
 from tuner.core.numerics import Array
 from tuner.disturbances.ticks import SETPOINTS
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import CLOCKS, OFFSETS, Measured
 from tuner.objective.simulation import beginning_of, recorded_of

@@ -17,7 +17,7 @@ import numpy as np  # noqa: E402
 from benchmarks.calibration import problem  # noqa: E402
 from benchmarks.simulated_recordings import recorded  # noqa: E402
 from tuner.objective.criterion import Point  # noqa: E402
-from tuner.objective.normal import Objective  # noqa: E402
+from tuner.objective.normal_equations import Objective  # noqa: E402
 from tuner.search.levenberg_marquardt import advance, begin  # noqa: E402
 from tuner.search.progress import beginning, criterion_of  # noqa: E402
 from tuner.search.stages import plan  # noqa: E402

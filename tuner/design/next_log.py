@@ -25,7 +25,7 @@ from tuner.design.ranking import seconds_recorded
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_at
 from tuner.objective.inlets import INLETS, STEADY_TORQUE
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import Measured
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import Recording

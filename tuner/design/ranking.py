@@ -29,7 +29,7 @@ from tuner.core.numerics import Array, log_determinant, scaled_inverse
 from tuner.design.proposals import Proposal, Proposals
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_at
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.trajectory import Published, at_speed, published
 from tuner.search.problem import SPIN_CHANNELS

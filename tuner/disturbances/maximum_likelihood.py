@@ -26,7 +26,7 @@ from tuner.disturbances.disturbances import LEAST, MOST, within
 from tuner.disturbances.predictor import Predictor, unscaled
 from tuner.disturbances.ticks import gathered
 from tuner.objective.criterion import OFFSET_SD, OFFSET_UNIT, Criterion, Point, SegmentSums
-from tuner.objective.normal import Objective, normal_equations
+from tuner.objective.normal_equations import Objective, normal_equations
 from tuner.objective.residuals import gauss_newton, robust
 from tuner.objective.segments import CLOCKS
 from tuner.objective.space import Space

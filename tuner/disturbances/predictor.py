@@ -39,7 +39,7 @@ from tuner.disturbances.ticks import (
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_at, with_secants
 from tuner.objective.inlets import INLETS
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.recordings.flight import Flight
 from tuner.vehicle.model import coefficients_in, with_terms_computed

@@ -34,7 +34,7 @@ from tuner.objective.criterion import Point, units_of
 from tuner.objective.initial_conditions import recent_command
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.noise import noise_of
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import (
     CLOCKS,

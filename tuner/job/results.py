@@ -30,7 +30,7 @@ from tuner.evaluate.validation import (
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.inlets import INLETS, window_seconds
-from tuner.objective.normal import normal_equations
+from tuner.objective.normal_equations import normal_equations
 from tuner.objective.segments import OFFSETS
 from tuner.recordings.flight import Flight
 from tuner.result import (

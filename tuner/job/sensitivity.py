@@ -17,7 +17,7 @@ from tuner.design.ranking import Arena
 from tuner.evaluate.validation import comparison_of
 from tuner.findings.findings import Code, Finding
 from tuner.job.results import write_knowledge, write_next_flight
-from tuner.objective.normal import Objective, misfit, root_mean_squares, sums_at
+from tuner.objective.normal_equations import Objective, misfit, root_mean_squares, sums_at
 from tuner.options import ExaminationOptions
 from tuner.report import render
 from tuner.report.contents import About, Recording, write_traces

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tuner.core.numerics import Array, Inverse, huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.space import Space
 from tuner.vehicle import COEFFICIENTS
 

@@ -8,7 +8,7 @@ from warnings import catch_warnings
 import numpy as np
 
 from tuner.objective.criterion import Point
-from tuner.objective.normal import CHUNK, evaluate, position_rmse
+from tuner.objective.normal_equations import CHUNK, evaluate, position_rmse
 from tuner.search.progress import Iterate, StageProblem, point_of
 
 POPULATION = CHUNK

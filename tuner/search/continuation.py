@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tuner.core.numerics import Array, scaled_inverse, scaled_solve
 from tuner.objective.criterion import OFFSET_UNIT, Point, SegmentSums
-from tuner.objective.normal import (
+from tuner.objective.normal_equations import (
     Objective,
     misfit,
     normal_equations,

@@ -24,7 +24,7 @@ from tuner.core.numerics import Array
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.inlets import INLETS
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.findings import findings_at, unmatched

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tuner.core.numerics import Array
 from tuner.objective.criterion import Criterion, Point, SegmentSums
-from tuner.objective.normal import (
+from tuner.objective.normal_equations import (
     NEAR,
     NormalEquations,
     Objective,

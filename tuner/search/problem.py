@@ -16,7 +16,7 @@ from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_vol
 from tuner.objective.initial_conditions import begins_gently
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by, window_seconds
 from tuner.objective.noise import noise_of
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import Segments, on_time, segments_of, window_segments
 from tuner.objective.space import Space, space_of
 from tuner.recordings.flight import Flight

@@ -20,7 +20,7 @@ from sim_jax.numeric import Scalar
 from tuner.core.numerics import Array
 from tuner.findings.findings import Finding
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.recordings.flight import Flight
 from tuner.search.iteration import Iteration, Outcome

@@ -11,7 +11,7 @@ from sim_jax.numeric import Array
 from tuner.config import JobFile
 from tuner.findings.findings import Finding
 from tuner.objective.criterion import Point
-from tuner.objective.normal import Objective, with_conditions
+from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.objective.space import Space, extended
 from tuner.search.findings import findings_at
 from tuner.search.problem import Job

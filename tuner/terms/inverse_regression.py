@@ -49,7 +49,7 @@ from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.core.numerics import huber_weights, robust_sd, scaled_solve
 from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.criterion import Point, SegmentSums
-from tuner.objective.normal import Objective, normal_equations, some_segments, sums_at
+from tuner.objective.normal_equations import Objective, normal_equations, some_segments, sums_at
 from tuner.objective.simulation import fly
 from tuner.objective.space import Space
 from tuner.recordings.flight import Flight

@@ -29,7 +29,7 @@ from tuner.objective.information import (
     information_at,
     with_secants,
 )
-from tuner.objective.normal import Objective, portions
+from tuner.objective.normal_equations import Objective, portions
 from tuner.objective.residuals import robust
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from tuner.core.phrases import listed
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.information import begun
-from tuner.objective.normal import Objective, with_conditions
+from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.search.estimation import (
     LAST,
     ROUGH,

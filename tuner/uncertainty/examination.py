@@ -13,7 +13,7 @@ from tuner.core.numerics import Z95, Array, scaled_solve
 from tuner.disturbances.predictor import Predictor, with_hidden, with_strengths
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_at
-from tuner.objective.normal import Objective, portion, portions
+from tuner.objective.normal_equations import Objective, portion, portions
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import LACK, Uncertainty, at_rest, references, uncertainty_at

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from tuner.core.numerics import scaled_solve
 from tuner.core.phrases import listed
 from tuner.objective.criterion import Point
-from tuner.objective.normal import normal_equations
+from tuner.objective.normal_equations import normal_equations
 from tuner.search.estimation import LAST, LAST_TWO, free_offsets, polished
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress

@@ -35,7 +35,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import log_voltage_of, read_again
 from tuner.objective.criterion import Point
 from tuner.objective.inlets import zero_order_hold
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.simulation import MOTION, SETPOINTS, SPEEDS, TURNED, Flown, environment_of, fly
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series

@@ -13,7 +13,7 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.objective.criterion import Criterion, Point
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.search.levenberg_marquardt import advance, begin
 from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.estimates import Uncertainty

@@ -18,7 +18,7 @@ from tuner.core.files import csv_text
 from tuner.engine import Report, current
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.evaluate.validation import best_values, comparison_of
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.search.estimation import free_offsets, polished
 from tuner.search.iteration import Iteration
 from tuner.search.problem import Job

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tuner.core.numerics import Array
 from tuner.objective.criterion import Criterion, Jacobian, Point
-from tuner.objective.normal import Batch, Objective, evaluate
+from tuner.objective.normal_equations import Batch, Objective, evaluate
 from tuner.uncertainty.records import (
     EffectOverTime,
     GlobalSensitivity,

@@ -19,7 +19,7 @@ from tuner.design.proposals import (
     proposals_in_words,
 )
 from tuner.design.ranking import CLEARANCE, Arena, candidates, rank_next_flights
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.search.progress import Fitted
 from tuner.uncertainty.examination import Examination, examine
 

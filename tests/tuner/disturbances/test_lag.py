@@ -15,7 +15,7 @@ from tuner.config import JobFile
 from tuner.disturbances.maximum_likelihood import with_least_innovations
 from tuner.disturbances.predictor import Predictor
 from tuner.objective.information import begun
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.space import extended
 from tuner.recordings.flight import Flight
 from tuner.vehicle.model import with_coefficients

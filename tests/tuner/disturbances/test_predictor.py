@@ -38,7 +38,7 @@ from tuner.disturbances.predictor import (
 )
 from tuner.objective.criterion import Point
 from tuner.objective.information import information_at
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.simulation import beginning_of, recorded_of
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.uncertainty.covariance import covariance_of

@@ -16,7 +16,7 @@ from tuner.evaluate import closed_loop as simulation
 from tuner.evaluate.closed_loop import simulate
 from tuner.job.sensitivity import unfitted
 from tuner.objective.criterion import Point
-from tuner.objective.normal import evaluate, sums_at
+from tuner.objective.normal_equations import evaluate, sums_at
 from tuner.search.job_flights import read_usable
 from tuner.search.problem import job_of
 from tuner.uncertainty.refits import (

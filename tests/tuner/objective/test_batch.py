@@ -8,7 +8,7 @@ import pytest
 
 from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.objective.criterion import Point
-from tuner.objective.normal import CHUNK, evaluate
+from tuner.objective.normal_equations import CHUNK, evaluate
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
 

@@ -27,7 +27,7 @@ from tuner.objective.battery import (
     with_reference_voltage,
 )
 from tuner.objective.criterion import Point
-from tuner.objective.normal import normal_equations
+from tuner.objective.normal_equations import normal_equations
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.uncertainty.estimates import DRAWS, STEP

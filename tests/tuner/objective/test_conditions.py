@@ -7,7 +7,7 @@ import pytest
 from tests.tuner.uncertainty.making import criterion_of, problem, truth, with_data
 from tuner.objective.criterion import OFFSET_SD, Point, units_of
 from tuner.objective.information import information_at
-from tuner.objective.normal import normal_equations, with_conditions
+from tuner.objective.normal_equations import normal_equations, with_conditions
 from tuner.objective.segments import OFFSETS
 from tuner.vehicle import conditions
 

@@ -11,7 +11,7 @@ from tests.tuner.uncertainty.making import (
     with_data,
 )
 from tuner.objective.criterion import Point
-from tuner.objective.normal import normal_equations
+from tuner.objective.normal_equations import normal_equations
 from tuner.search.progress import Loop, with_loop
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import NotCarried

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
-from tuner.objective.normal import normal_equations, sums_at
+from tuner.objective.normal_equations import normal_equations, sums_at
 from tuner.objective.segments import OFFSETS
 from tuner.search import continuation, levenberg_marquardt
 from tuner.search.continuation import _clocks_that_differ, grow

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tuner.objective.criterion import Point
-from tuner.objective.normal import NormalEquations
+from tuner.objective.normal_equations import NormalEquations
 from tuner.search import levenberg_marquardt
 from tuner.search.levenberg_marquardt import NEAR, advance, begin
 

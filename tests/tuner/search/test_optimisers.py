@@ -16,7 +16,7 @@ FREE = ("inertia_zz", "motor_constant", "moment_constant")
 MODULE = '''
 import numpy as np
 
-from tuner.objective.normal import evaluate
+from tuner.objective.normal_equations import evaluate
 from tuner.objective.criterion import Point
 from tuner.search.continuation import OPTIMISERS
 from tuner.search.progress import Iterate, point_of

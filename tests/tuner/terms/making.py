@@ -24,7 +24,7 @@ from tests.tuner.uncertainty.making import (
 )
 from tuner.config import JobFile
 from tuner.objective.criterion import Point, units_of
-from tuner.objective.normal import Objective, with_conditions
+from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.objective.simulation import SETPOINTS, fly
 from tuner.objective.space import space_of
 from tuner.recordings.flight import InitialState

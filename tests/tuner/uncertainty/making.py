@@ -21,7 +21,7 @@ from sim_jax.state import AIRBORNE, hover
 from tuner.config import JobFile
 from tuner.core.shipped import find_config
 from tuner.objective.criterion import Criterion, Point
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.space import space_of
 from tuner.search.progress import Fitted

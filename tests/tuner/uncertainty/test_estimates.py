@@ -9,7 +9,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.information import information_at
-from tuner.objective.normal import Objective, normal_equations
+from tuner.objective.normal_equations import Objective, normal_equations
 from tuner.uncertainty.estimates import Uncertainty, _lags, uncertainty_of
 from tuner.uncertainty.verdict import Verdict
 

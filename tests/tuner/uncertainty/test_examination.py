@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.objective.normal import Objective, portions
+from tuner.objective.normal_equations import Objective, portions
 from tuner.uncertainty.examination import Examination, examine, knowledge_of
 from tuner.uncertainty.records import Knowledge, write_files
 from tuner.uncertainty.sensitivity import shortest_half

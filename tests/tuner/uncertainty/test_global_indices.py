@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.uncertainty.records import (
     GlobalSensitivity,
     Method,

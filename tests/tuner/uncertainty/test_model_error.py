@@ -23,7 +23,7 @@ from tuner.config import JobFile
 from tuner.equation_error.omitted_laws import _likeliest
 from tuner.equation_error.rate_controller import Answer
 from tuner.findings.findings import Code
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.simulation import SETPOINTS
 from tuner.objective.space import space_of

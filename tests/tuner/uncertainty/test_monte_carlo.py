@@ -8,7 +8,7 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.search.levenberg_marquardt import advance, begin
 from tuner.uncertainty.estimates import uncertainty_of
 

@@ -12,7 +12,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.core.errors import InputError
 from tuner.job.sensitivity import _uncertainty_with
-from tuner.objective.normal import Objective
+from tuner.objective.normal_equations import Objective
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
 from tuner.uncertainty.examination import FullProblem, full_problem_of

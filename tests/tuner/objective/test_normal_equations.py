@@ -9,7 +9,7 @@ import pytest
 
 from tests.tuner.uncertainty.making import criterion_of, problem, truth, with_data
 from tuner.objective.criterion import OFFSET_UNIT, Point
-from tuner.objective.normal import normal_equations
+from tuner.objective.normal_equations import normal_equations
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
 
