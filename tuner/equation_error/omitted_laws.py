@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuner.core.numerics import Array
+from tuner.core.numerics import Array, unit_diagonal
 from tuner.equation_error.model_accelerations import Linear, ModelAccelerations
 from tuner.equation_error.recorded_accelerations import Measured, rows_of
 from tuner.equation_error.regression import filtered_sums, whitening
@@ -283,7 +283,7 @@ def _nuisances(part: Measured, motion: _Motion, place: tuple[int, int], of_comma
 def _solved(total: Array, inside: Sequence[int], right: Array) -> Array:
     """Return what solves the normal equations of some columns; what they do not tell is zero."""
     square = total[np.ix_(inside, inside)]
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
+    unit = unit_diagonal(square)
     inverse = np.linalg.pinv(square * np.outer(unit, unit), rcond=1e-9, hermitian=True)
     by = unit.reshape(-1, *[1] * (right.ndim - 1))
     return np.asarray(by * (inverse @ (by * right[list(inside)])))

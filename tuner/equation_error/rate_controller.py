@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import Array
+from tuner.core.numerics import Array, unit_diagonal
 
 STRETCH = 1.0
 """s whose scores are summed up."""
@@ -176,5 +176,5 @@ def _regression(signals: Signals, axis: int) -> tuple[Array, Array]:
 
 def _condition(square: Array) -> float:
     """Return the inverse condition of a matrix of unit diagonal."""
-    size = np.sqrt(np.maximum(np.abs(np.diag(square)), 1e-300))
-    return float(1.0 / np.linalg.cond(square / np.outer(size, size)))
+    unit = unit_diagonal(square)
+    return float(1.0 / np.linalg.cond(square * np.outer(unit, unit)))

@@ -232,12 +232,11 @@ class _Settling:
 
         What does not act in the balance, the motors above all, stays as it is.
         """
-        objective, fitted = self.fitted.objective, self.fitted
-        vector = np.array(begin, float)
+        objective, vector = self.fitted.objective, np.array(begin, float)
         model, space = objective.model, objective.space
         residuals = np.asarray(self.balance.residuals(model, space, vector))
         inside = inside & np.isfinite(residuals).all(axis=(0, 1))
-        held = np.isin(objective.space.names, list(set(fitted.held.values())))
+        held = np.isin(space.names, list(self.fitted.held.values()))
         for _ in range(STEPS):
             residuals = np.asarray(self.balance.residuals(model, space, vector))
             columns = np.asarray(self.balance.jacobian(model, space, vector))
@@ -254,7 +253,7 @@ class _Settling:
         """Return the search vector (K,) that meets some windows best with a balance's `TURNS`."""
         settled = np.isin(self.fitted.objective.space.names, TURNS)
         begin = np.where(settled, balanced, np.asarray(self.fitted.point.coefficients))
-        return _fitted_to(self.fitted, inside, begin=begin, settled=settled)
+        return _fitted_to(self.fitted, inside, begin, settled)
 
     def _normal_equations(
         self, vector: Vector, residuals: Vector, columns: Vector, inside: Mask
@@ -366,52 +365,37 @@ def with_inputs_balanced(
 def _losses_left_out(settling: _Settling, balanced: Vector) -> tuple[float, float]:
     """Return the loss of what is left out, over all folds: as fitted to the rest, and balanced."""
     fitted = settling.fitted
-    segments = fitted.objective.segments
-    flight = np.asarray(segments.flight)
-    fold = flight
+    segments, fold = fitted.objective.segments, np.asarray(fitted.objective.segments.flight)
     if fitted.objective.flights < 2:
         fold = (segments.begins > np.median(segments.begins)).astype(int)
-    numbers = np.unique(fold)
+    vector = np.asarray(fitted.point.coefficients)
+    others = [fold != number for number in np.unique(fold)]
     vectors = np.stack(
         [
-            *(_fitted_to(fitted, fold != number) for number in numbers),
-            *(
-                settling.refitted(fold != number, settling.at(fold != number, balanced))
-                for number in numbers
-            ),
+            *(_fitted_to(fitted, rest, vector, np.zeros(len(vector), bool)) for rest in others),
+            *(settling.refitted(rest, settling.at(rest, balanced)) for rest in others),
         ]
     )
-    offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
-    points = Point(np.asarray(vectors), np.asarray(offsets))
+    points = Point(vectors, np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0))
     flown = sums_at(fitted.objective, points, fitted.criterion, derivatives=False)
     losses = np.asarray(flown.loss)
-    out = np.array([losses[row, fold == n].sum() for row, n in enumerate([*numbers, *numbers])])
-    as_fitted, as_balanced = out.reshape(2, -1).sum(axis=1)
+    out = [row[~rest].sum() for row, rest in zip(losses, [*others, *others], strict=True)]
+    as_fitted, as_balanced = np.reshape(out, (2, -1)).sum(axis=1)
     return float(as_fitted), float(as_balanced)
 
 
-def _fitted_to(
-    fitted: Fitted,
-    inside: Mask,
-    *,
-    begin: Vector | None = None,
-    settled: Mask | None = None,
-) -> Vector:
-    """Return where a few steps lead from the fit, if only some windows (F,) are fitted.
+def _fitted_to(fitted: Fitted, inside: Mask, begin: Vector, settled: Mask) -> Vector:
+    """Return where a few steps lead from a vector (K,), if only some windows (F,) are fitted.
 
-    ``begin`` (K,) is another place to begin, ``settled`` (K,) what stays as it is there.
+    ``settled`` (K,) is what stays as it is there, beside what the fit holds.
     """
-    objective = fitted.objective
-    some, criterion = some_segments(objective, fitted.criterion, inside)
-    held = np.isin(objective.space.names, list(set(fitted.held.values())))
-    if settled is not None:
-        held |= settled
-    start = fitted.point.coefficients if begin is None else np.asarray(begin)
+    some, criterion = some_segments(fitted.objective, fitted.criterion, inside)
+    held = np.isin(fitted.objective.space.names, list(fitted.held.values())) | settled
     problem = StageProblem(
         objective=some,
         criterion=criterion,
         stage=LEFT_OUT,
-        points=Point(start[None], fitted.point.offsets[None]),
+        points=Point(begin[None], fitted.point.offsets[None]),
         losses=np.array([np.inf]),
         free=Free(~held, np.zeros(fitted.point.offsets.shape, bool)),
         seed=0,
