@@ -24,7 +24,7 @@ from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array
 from tuner.core.shipped import find_config
-from tuner.evaluate.forces import Forces, acting, in_order
+from tuner.evaluate.forces import Forces, acting
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse, Row, Table, check_table_file, write_table
 from tuner.evaluate.rmse import FlightErrors, SignalErrors, joined, laps_of, rmse_of, short_way
 from tuner.evaluate.simulation_files import roll_pitch_yaw
@@ -290,8 +290,7 @@ class _Group:
 
         A window's last instants, which the next one begins with, are left out.
         """
-        of_term = in_order(acted)
-        count = next(iter(of_term.values())).shape[1]
+        count = next(iter(acted.values())).shape[1]
         time = np.arange(count) * self._stride / self._schedule.log_rate
         shown = time < (self._seconds if self.windowed else end)
         segments = range(first, first + len(windows))
@@ -299,7 +298,7 @@ class _Group:
             np.concatenate([time[shown] + window.begin for window in windows]),
             {
                 name: np.concatenate([values[segment, shown] for segment in segments])
-                for name, values in of_term.items()
+                for name, values in acted.items()
             },
         )
         return whole.before(windows[0].flight.duration) if self.windowed else whole

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,6 @@ from tuner.objective.simulation import CODE
 COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
 """Force in N and moment in N m, about the centre of mass in body axes."""
 WEIGHT = "gravity"
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -68,6 +67,8 @@ def acting(
 ) -> dict[str, Array]:
     """Return term -> (F, m, 6) of what acted at every ``stride``-th sample, as in `Forces`.
 
+    In the order of the simulator's terms, gravity last.
+
     Parameters
     ----------
     motion
@@ -95,7 +96,8 @@ def acting(
     )
     program = program_of(_acting, arguments, name="forces", made_of=total.TERMS, packages=CODE)
     acted: dict[str, Array] = program(given, lanes=flights * samples).values
-    return {name: values.reshape(flights, samples, 6) for name, values in acted.items()}
+    names = (*(term.__name__ for term in total.TERMS), WEIGHT)
+    return {n: acted[n].reshape(flights, samples, 6) for n in names if n in acted}
 
 
 def _acting(given: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:
@@ -135,13 +137,7 @@ def forces_of(vehicle: Vehicle, time: Array, signals: Mapping[str, Array]) -> Fo
     motion = np.concatenate([signals[name] for name in names], axis=1)
     logged = (motion, signals["attitude"], signals["rotor_speed"])
     parts = acting(vehicle, *(np.asarray(part, float)[None] for part in logged), rate=rate)
-    return Forces(time, in_order({name: part[0] for name, part in parts.items()}))
-
-
-def in_order(parts: Mapping[str, T]) -> dict[str, T]:
-    """Return term -> what belongs to it, in the order of the simulator's terms, gravity last."""
-    names = (*(term.__name__ for term in total.TERMS), WEIGHT)
-    return {name: parts[name] for name in names if name in parts}
+    return Forces(time, {name: part[0] for name, part in parts.items()})
 
 
 def _components(vector: Vec3) -> tuple[JaxArray, JaxArray, JaxArray]:

@@ -167,11 +167,9 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
 
 def _predictions(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, Predictions]:
     """Return flight -> its predictions, of those that are not flown in a closed loop."""
-    controller, predicted = controller_flown(job, fitted), {}
-    for recording in job.recordings:
-        if INLETS[recording.inlet].closed_loop:
-            continue
-        predicted[recording.flight.name] = predict(
+    controller = controller_flown(job, fitted)
+    return {
+        recording.flight.name: predict(
             vehicle,
             controller,
             recording.flight,
@@ -180,7 +178,9 @@ def _predictions(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, Pr
             stride=STRIDE,
             input_late=recording.input_late,
         )
-    return predicted
+        for recording in job.recordings
+        if not INLETS[recording.inlet].closed_loop
+    }
 
 
 def _unchanged(flight: Flight, predictions: Predictions) -> Predictions:
