@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from tuner.core.numerics import Array
+from tuner.objective.inlets import linear_interpolation
 from tuner.recordings.flight import Series
 
 CUTOFF = 30.0
@@ -75,7 +76,9 @@ def stretches_of(
         count = int((end - begin) * rate)
         if count >= 4 * END_MARGIN * rate - 1:
             time = begin + np.arange(count) / rate
-            stretches.append(Stretch(time, *(_interpolate(time, series[name]) for name in names)))
+            stretches.append(
+                Stretch(time, *(linear_interpolation(series[name], time) for name in names))
+            )
     return tuple(stretches)
 
 
@@ -99,10 +102,3 @@ def blocks_of(stretches: tuple[Stretch, ...], order: int) -> NDArray[np.int64]:
         numbers.append(block)
         first = int(block[-1]) + 1
     return np.concatenate(numbers)
-
-
-def _interpolate(time: Array, series: Series) -> Array:
-    known = np.isfinite(series.values).all(axis=1)
-    return np.column_stack(
-        [np.interp(time, series.time[known], column) for column in series.values[known].T]
-    )

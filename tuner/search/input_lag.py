@@ -19,7 +19,7 @@ from sim_jax.constants import GRAVITY
 from tuner.core.numerics import Array
 from tuner.equation_error.recorded_accelerations import Mask, measured_with, with_rotors
 from tuner.equation_error.regression import MEMORY, convolved, whitening_filter
-from tuner.objective.inlets import INLETS
+from tuner.objective.inlets import INLETS, linear_interpolation
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import states_at
 from tuner.search.inlet_choice import regressors
@@ -171,13 +171,7 @@ def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
     turning = np.gradient(state.body_rate, clock, axis=0)
     if not (np.isfinite(force).all() and np.isfinite(turning).all()):
         return None
-    inputs = np.column_stack(
-        [
-            np.interp(clock, rows.time[np.isfinite(column)], column[np.isfinite(column)])
-            for column in rows.values.T
-        ]
-    )
-    thrust = _thrust_like(inputs, signal, vehicle)
+    thrust = _thrust_like(linear_interpolation(rows, clock), signal, vehicle)
     place = np.array([rotor.position for rotor in vehicle.rotors])
     spin = np.array([1.0 if rotor.spin == "ccw" else -1.0 for rotor in vehicle.rotors])
     driven = np.column_stack(
