@@ -95,10 +95,11 @@ class ModelAccelerations:
         With noise, which takes most of the time.
         """
         flights, size = self._with_rotors(point), len(self.parameters)
-        values, columns = zip(*_made(self.model, self.parameters, point, flights), strict=True)
+        made = _made(self.model, self.parameters, point, flights)
         left = [
-            part.accelerations - modelled for part, modelled in zip(flights, values, strict=True)
+            part.accelerations - values for part, (values, _) in zip(flights, made, strict=True)
         ]
+        columns = [of_flight.copy() for _, of_flight in made]
         for number, parameter in enumerate(self.parameters if self.commands else ()):
             if moves_rotors(parameter.name):
                 step = MOTOR_STEP * (parameter.usual or 1.0)
