@@ -72,7 +72,7 @@ class Arena:
         InputError
             They are not three, or too small to fly in.
         """
-        if len(numbers) != 3:
+        if len(numbers) != 3 or not np.isfinite(numbers).all():
             raise InputError("--arena", "needs three lengths in m", "write it as 8,6,3")
         arena = Arena(*numbers)
         smallest = 2 * CLEARANCE + 2 * SMALLEST

@@ -28,6 +28,7 @@ from sim_jax.terms import total
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError, did_you_mean
 from tuner.core.numerics import Array
+from tuner.core.phrases import listed
 from tuner.core.shipped import find_config
 from tuner.core.yaml_section import Number, Section, build
 from tuner.engine import Here, Report, current
@@ -84,7 +85,15 @@ def fly(
         | {"trajectory": {"name": asked.trajectory, **shape}},
         "command line",
     )
+    if plan.duration * plan.rate < 1.0:
+        what = f"{plan.duration:g} s hold no two samples at {plan.rate:g} Hz"
+        raise InputError("--duration", what, "fly longer, or write samples at a higher --rate")
     check_names(grid or (), "grid")
+    grid = {name: np.atleast_1d(column) for name, column in (grid or {}).items()}
+    shapes = {column.shape for column in grid.values()}
+    if len(shapes) > 1 or any(len(shape) != 1 or shape == (0,) for shape in shapes):
+        sizes = listed([f"{column.size} of {name}" for name, column in grid.items()])
+        raise InputError("grid", f"holds {sizes}", "give one value of each for every flight")
     vehicle, controller = asked.vehicle, asked.controller
     if isinstance(vehicle, str):
         vehicle = read_vehicle(find_config("vehicles", vehicle, Path()))
@@ -119,7 +128,7 @@ def grid_of(sweeps: Sequence[str]) -> dict[str, Array]:
     axes = dict(_axis(sweep) for sweep in sweeps)
     if len(axes) < len(sweeps):
         raise InputError("--sweep", "names a coefficient twice", "sweep each once")
-    count = int(np.prod([len(values) for values in axes.values()], dtype=np.int64)) if axes else 0
+    count = math.prod(map(len, axes.values())) if axes else 0
     if count > MAX_FLIGHTS:
         raise InputError("--sweep", f"asks for {count} flights", f"at most {MAX_FLIGHTS}")
     mesh = np.meshgrid(*axes.values(), indexing="ij")
@@ -239,7 +248,7 @@ def _flights(  # noqa: PLR0917 (a piece travels as a tuple)
 ) -> Iterator[Simulation]:
     """Fly a piece of a grid, and yield as many of its flights as are wanted."""
     clock = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
-    fits = round(controller.physics.rate) % rate == 0
+    fits = rate == round(rate) and round(controller.physics.rate) % rate == 0
     schedule = schedule_of(controller, log_rate=round(rate) if fits else None)
     control_rate = schedule.position_control_rate
     reference = published(trajectory, duration=duration, control_rate=control_rate)

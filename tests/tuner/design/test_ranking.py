@@ -127,7 +127,9 @@ def test_candidates_stay_between_the_walls(size: tuple[float, float, float]) -> 
             assert flight.radius <= size[1] / 2 - CLEARANCE + 0.01
 
 
-@pytest.mark.parametrize("numbers", [(3.0, 3.0), (1.5, 4.0, 3.0), (4.0, 4.0, 1.2)])
+@pytest.mark.parametrize(
+    "numbers", [(3.0, 3.0), (1.5, 4.0, 3.0), (4.0, 4.0, 1.2), (np.nan,) * 3, (np.inf,) * 3]
+)
 def test_an_arena_that_nothing_fits_is_refused(numbers: tuple[float, ...]) -> None:
     with pytest.raises(InputError, match="--arena"):
         Arena.of(numbers)

@@ -11,8 +11,10 @@ from sim_jax.terms import total
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
+from tuner.evaluate import closed_loop
 from tuner.evaluate.closed_loop import simulate
 from tuner.objective.trajectory import at_speed, published
+from tuner.options import SimulationOptions
 from tuner.recordings.flight import SIGNALS
 from tuner.vehicle import ControllerFile, read_controller, with_values
 
@@ -74,6 +76,31 @@ def test_rates_that_do_not_divide_the_physics_rate_are_interpolated(vehicle):
     np.testing.assert_allclose(
         at_100.signals["position"][::2], at_250.signals["position"][::5], atol=1e-6
     )
+
+
+@pytest.mark.parametrize("rate", [2.5, 0.5])
+def test_a_rate_that_is_no_whole_number_is_that_of_the_samples(vehicle, rate):
+    (often,), (seldom,) = fly(vehicle, rate=100.0), fly(vehicle, rate=rate)
+    step = round(100.0 / rate)
+    np.testing.assert_allclose(seldom.time, often.time[::step])
+    np.testing.assert_allclose(
+        seldom.signals["position"], often.signals["position"][::step], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "grid", "expected"),
+    [
+        ({"duration": 0.005}, None, "0.005 s hold no two samples at 100 Hz"),
+        ({"rate": 0.1}, None, "4 s hold no two samples at 0.1 Hz"),
+        ({}, {"mass": [2.0, 2.1], "inertia_xx": [0.02]}, "holds 2 of mass and 1 of inertia_xx"),
+        ({}, {"mass": []}, "holds 0 of mass"),
+        ({}, {"mass": [[2.0, 2.1]]}, "holds 2 of mass"),
+    ],
+)
+def test_what_makes_no_flight_is_refused(given, grid, expected):
+    with pytest.raises(InputError, match=expected):
+        closed_loop.fly(SimulationOptions(trajectory="circle", **SHORT | given), grid=grid)
 
 
 def test_a_grid_flies_each_vehicle_as_it_flies_alone(vehicle):

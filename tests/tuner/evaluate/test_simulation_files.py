@@ -131,6 +131,10 @@ def test_sweeps_combine_with_the_last_varying_fastest():
         (["mass"], "is no range"),
         (["mass=1:2:3", "mass=1:2:3"], "twice"),
         (["mass=1:2:1000", "inertia_xx=1:2:1000"], "asks for 1000000 flights"),
+        (  # 2 to the power of 64
+            [f"{n}=1:2:65536" for n in ("mass", "inertia_xx", "inertia_yy", "motor_constant")],
+            "asks for 18446744073709551616 flights",
+        ),
     ],
 )
 def test_a_wrong_sweep_is_named(sweep, expected):
