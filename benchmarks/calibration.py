@@ -2,8 +2,8 @@
 
 Truths are drawn from a prior, and flown with measurement noise; depending on the kind of flight
 with gusts, and with a random half of some terms beyond the motor model. Each set is fitted from the
-prior's mean by the last stages of the search, with that prior and with all of these terms in the
-model, and the truth is ranked. So what is calibrated is the interval of a model that can fly what
+prior's mean by all stages of the search, with that prior and with all of these terms in the model,
+and the truth is ranked. So what is calibrated is the interval of a model that can fly what
 flew: `benchmarks.lab` measures what selects terms. A search that says that it did not converge is
 counted as such, not ranked: it says so to its user, too. ``TUNE_CALIBRATION_DRAWS`` sets of each
 kind are drawn, in ``TUNE_CALIBRATION_WORKERS`` processes beside this one.
@@ -67,8 +67,6 @@ FLOWN = 0.5
 """Probability that a vehicle has a term."""
 INSIDE = 0.01
 """Share of its range by which a truth keeps away from a coefficient's bounds."""
-STAGES = 3
-"""Of the search: whole flights, and the polish."""
 
 
 @dataclass(frozen=True)
@@ -225,12 +223,11 @@ def drawn(space: Space, random: np.random.Generator) -> Array:
 
 
 def fitted(objective: Objective) -> Fitted:
-    """Return the fit that the last stages of the search lead to from the prior's mean."""
+    """Return the fit that the search leads to from the prior's mean."""
     space, names = objective.space, [flight.name for flight in reference_job().fitted]
     rate = float(objective.schedule.log_rate)
     steps = reference_job().settings.job.search.max_iterations
     stages = plan("gradient", objective.samples, rate, windows=False, robust=True, steps=steps)
-    stages = stages[-STAGES:]
     begin = space.at_share((space.prior_mean - space.lower) / space.width)
     progress = grow(
         objective,

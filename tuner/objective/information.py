@@ -15,9 +15,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim_jax.inlet import ReferenceInlet
 from tuner.core.numerics import Array, Inverse, huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
 from tuner.objective.normal_equations import Objective
+from tuner.objective.residuals import is_steady
 from tuner.objective.space import Space
 from tuner.vehicle import COEFFICIENTS
 
@@ -27,6 +29,10 @@ LEFT = 0.25
 """Share that is left at least of what a new coefficient acts as, where a search of it begins."""
 BLOCK = 2.0
 """Time beyond which residuals are taken to be independent, s."""
+ASTRAY = 2.0
+"""Residuals' mean square, over that of what was recorded about its mean in all flights, from which
+a simulated flight is another one. What disturbs a vehicle is in its recording, too, so that the
+right model leaves no more than 1; of two flights that have nothing to do with each other, 2."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +56,8 @@ class FisherInformation:
     prior
         (K, K): what the priors of the coefficients contribute.
     crashed
-        (F,) which simulated segments crashed.
+        (F,) which simulated segments crashed, or tumble: their derivatives are
+        `tuner.objective.residuals.CHAOTIC`.
     begins
         (F,) s since the flights' starts at which the segments begin.
     scale
@@ -63,6 +70,8 @@ class FisherInformation:
         What might be simulated differently -> (F, K) JᵀW times the change of the residuals.
     in_doubt
         (K,) how far the estimates would move with terms that were left out; None if none was tried.
+    astray
+        (F,) which segments of a closed loop crashed, or are `ASTRAY`; None where none can be.
     pull, nuisance_pull
         (K,) slopes of the priors' losses at the point, of the coefficients' own and of the
         nuisances'; None where those of all scores add up to zero with them.
@@ -82,6 +91,7 @@ class FisherInformation:
     lost: Array | None = None
     changes: Mapping[str, Array] = field(default_factory=dict)
     in_doubt: Array | None = None
+    astray: NDArray[np.bool_] | None = None
     pull: Array | None = None
     nuisance_pull: Array | None = None
 
@@ -128,6 +138,9 @@ class FisherInformation:
                 name: np.concatenate([part.changes[name] for part in parts])
                 for name in first.changes
             },
+            astray=None
+            if first.astray is None
+            else np.concatenate([part.astray for part in parts if part.astray is not None]),
             pull=first.pull,
             nuisance_pull=_summed([part.nuisance_pull for part in parts]),
         )
@@ -158,6 +171,18 @@ class FisherInformation:
             pull=some(self.pull),
             nuisance_pull=some(self.nuisance_pull),
         )
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the flights contradict all that they say of the coefficients.
+
+        A vehicle that crashes where the recorded one flew, or that flies most flights in another
+        way, is not the recorded one, and derivatives along its flights are not those of the
+        recorded ones.
+        """
+        if self.astray is None:
+            return False
+        return bool(np.any(self.astray & self.crashed) or np.mean(self.astray) > 0.5)
 
     @property
     def slope(self) -> Array:
@@ -278,6 +303,7 @@ def information_at(
     score = np.zeros((len(channels), segments, blocks, size))
     spread = np.ones((len(channels), segments))
     changes = {name: np.zeros((segments, size)) for name in otherwise}
+    crashed = np.isfinite(np.asarray(jacobian.crash_time))
     for number, channel in enumerate(channels):
         columns = np.asarray(jacobian.columns[channel])
         residuals = np.asarray(jacobian.residuals[channel])
@@ -292,7 +318,11 @@ def information_at(
                 inside = stretch == index
                 own = rows[inside].reshape(-1, size)
                 weighted = (own * robust[inside].reshape(-1, 1)).T
-                information[number, segment, index] = weighted @ own
+                curved = weighted @ own
+                if not is_steady(curved, len(own)):
+                    rows[inside], crashed[segment] = 0.0, True
+                    continue
+                information[number, segment, index] = curved
                 score[number, segment, index] = weighted @ error[inside].ravel()
             for name, others in otherwise.items():
                 change = others[channel][..., segment] / scale - error
@@ -304,6 +334,7 @@ def information_at(
     to_scaled[: len(space)] = 1.0 / space.slope(np.asarray(point.coefficients))
     information = information * to_scaled[:, None] * to_scaled
     fitted = np.asarray(point.offsets) != 0.0 if offsets_fitted is None else offsets_fitted
+    closed = isinstance(objective.segments.inlet, ReferenceInlet) and not objective.segments.windowed
     along, prior, pull = _along(objective, point, criterion, information, fitted)
     return FisherInformation(
         channels=channels,
@@ -313,7 +344,7 @@ def information_at(
         spread=spread,
         nuisance_prior=prior,
         prior=np.diag(criterion.prior**2 / space.prior_sd**2),
-        crashed=np.isfinite(np.asarray(jacobian.crash_time)),
+        crashed=crashed,
         begins=objective.segments.begins,
         scale=scales,
         changes={
@@ -323,9 +354,27 @@ def information_at(
         ground=None
         if space.joint_prior is None
         else criterion.prior**2 * space.joint_rows.T @ space.joint_rows,
+        astray=crashed | _astray(objective, jacobian) if closed else None,
         pull=_pull(space, point, criterion),
         nuisance_pull=pull,
     )
+
+
+def _astray(objective: Objective, jacobian: Jacobian) -> NDArray[np.bool_]:
+    """Return which segments (F,) are `ASTRAY` in some channel; an attitude has no mean."""
+    furthest = np.zeros(objective.segments.count)
+    for channel, measured in objective.segments.measured.items():
+        values, weight = np.asarray(measured.values), np.asarray(measured.weight)
+        if channel == "attitude" or channel not in jacobian.residuals:
+            continue
+        used = weight > 0.0
+        counts = np.maximum(used.sum(axis=(0, 2), keepdims=True), 1)
+        mean = np.where(used, values, 0.0).sum(axis=(0, 2), keepdims=True) / counts
+        own = np.maximum(used.sum(axis=(0, 1)), 1)
+        of_recorded = np.square(np.where(used, values - mean, 0.0) * weight).sum() / own.sum()
+        of_residuals = np.square(np.asarray(jacobian.residuals[channel])).sum(axis=(0, 1)) / own
+        furthest = np.maximum(furthest, of_residuals / max(of_recorded, 1.0))
+    return np.asarray(furthest > ASTRAY)
 
 
 def _along(

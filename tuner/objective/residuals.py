@@ -269,6 +269,10 @@ def _rotation_program() -> Program:
     )
 
 
+CHAOTIC = 1e6
+"""Root mean square derivative of a channel by a step of the search, in (scaled) standard deviations,
+beyond which it says nothing: where a simulated vehicle tumbles, derivatives grow a million
+millionfold, and the straight line that they draw ends before the smallest step."""
 ROWS_AT_ONCE = 1024
 """Residuals whose products are summed up by one call of BLAS: few enough for one thread, so that
 sums do not depend on how many there are."""
@@ -285,6 +289,8 @@ def robust(error: Array, limit: float) -> Array:
 
 def gauss_newton(columns: Array, scaled: Array, scale: Array, huber: float) -> tuple[Array, Array]:
     """Return gradient (F, Q) and Gauss-Newton Hessian (F, Q, Q) of one channel's robust loss.
+
+    Zero where the derivatives are `CHAOTIC`.
 
     Parameters
     ----------
@@ -306,4 +312,16 @@ def gauss_newton(columns: Array, scaled: Array, scale: Array, huber: float) -> t
         some = rows[:, first : first + ROWS_AT_ONCE]
         gradient += np.einsum("fr,frq->fq", error[:, first : first + ROWS_AT_ONCE], some)
         hessian += np.swapaxes(some, 1, 2) @ some
+    chaotic = ~is_steady(hessian, rows.shape[1])
+    if chaotic.any():
+        gradient[chaotic], hessian[chaotic] = 0.0, 0.0
     return gradient, hessian
+
+
+def is_steady(hessian: Array, rows: int) -> NDArray[np.bool_]:
+    """Return whether the derivatives that Hessians (..., Q, Q) of so many rows sum up say anything.
+
+    See `CHAOTIC`.
+    """
+    largest = np.diagonal(hessian, axis1=-2, axis2=-1).max(axis=-1, initial=0.0)
+    return np.asarray(largest <= CHAOTIC**2 * max(rows, 1))

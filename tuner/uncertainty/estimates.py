@@ -132,6 +132,8 @@ def uncertainty_at(
     reference, bounds = references(space, vector), _bounds(space, vector)
     of_residuals = covariance_of(information)
     parts = parts_of(information, of_residuals.error, _lags(space, scaled))
+    if information.refuted:
+        parts["astray"] = space.prior_sd
     error = total_error(parts)
     covariance = of_residuals.widened(error)
     shares, prior_share = _shares(information, len(flights))
@@ -160,6 +162,7 @@ def uncertainty_at(
             directions,
             relative_half_width=half_width / reference[index],
             data_error=float(covariance.data_error[index] / reference[index]),
+            refuted=information.refuted,
         )
         at = float(scaled[index]), float(error[index])
         estimates |= _estimates(space, index, at, judgement=judgement, parts=parts)
@@ -351,6 +354,7 @@ def total_error(parts: Mapping[str, Array]) -> Array:
     depend on what the flights say of them, and their effect stands in no residual as long as
     coefficients take it up. And what steps do, those of the simulation and those that the search
     did not take, what inputs do that were read with errors, and what the model is seen to lack.
+    And all that was believed before, where the flights contradict what they say.
     """
     same = [parts[name] for name in SAME_ERRORS if name in parts]
     others = [np.square(part) for name, part in parts.items() if name not in SAME_ERRORS]

@@ -118,6 +118,7 @@ def examine(
         )
         residuals.extend(whiteness(batch[0], jacobian, batch[2], flight_names))
     information = FisherInformation.joined(informations)
+    astray = information.astray if at_minimum else None
     if predictor is not None and slopes is not None:
         information = with_hidden(
             with_strengths(
@@ -132,6 +133,7 @@ def examine(
         information = replace(information, in_doubt=np.array(moves))
     searched = set(full_problem.fitted) - set(fitted.held.values()) if at_minimum else set[str]()
     information = information.resting(at_rest(objective.space, point, searched))
+    information = replace(information, astray=astray)
     return Examination(
         uncertainty=_uncertainty_of(full_problem, information, full_problem.fitted, names),
         freed={

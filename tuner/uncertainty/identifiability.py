@@ -138,12 +138,14 @@ def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:
 
     A coefficient is its own stand-in unless it trades off against another one. What they determine
     but for disturbances and model error stays where they put it, with a wide interval: it is no
-    better known where the search began.
+    better known where the search began. So does all where the fitted vehicle flies otherwise.
     """
     undetermined = [
         name
         for name in uncertainty.names
-        if not uncertainty.estimates[name].identifiable and name not in _known_roughly(uncertainty)
+        if not uncertainty.estimates[name].identifiable
+        and uncertainty.estimates[name].reason.code is not ReasonCode.REFUTED
+        and name not in _known_roughly(uncertainty)
     ]
     stand_ins: dict[str, str] = {}
     for direction in uncertainty.directions:

@@ -44,6 +44,9 @@ class ErrorParts(Part):
         None where none was found.
     search
         How far one more linear step would move it: a search ends where its steps gain nothing.
+    astray
+        The standard deviation of its prior, where the fitted vehicle crashes on a fitted flight,
+        or flies most of them otherwise than they were recorded; None where it does not.
     """
 
     noise: FiniteOrNone
@@ -54,6 +57,7 @@ class ErrorParts(Part):
     readings: FiniteOrNone = None
     lack: FiniteOrNone = None
     search: FiniteOrNone = None
+    astray: FiniteOrNone = None
 
 
 class Refit(Part):

@@ -77,6 +77,8 @@ class ReasonCode(StrEnum):
     """With the others free, the flights hold no information about it."""
     WIDE_INTERVAL = "wide_interval"
     """The flights alone determine it no better than ``half_width``."""
+    REFUTED = "refuted"
+    """The fitted vehicle flies otherwise than the recorded one: flights say nothing about it."""
     PRIOR_DOMINATES = "prior_dominates"
     """``prior_share`` of the information about it comes from its prior."""
     NOT_WITH_ALL_FREE = "not_with_all_free"
@@ -161,6 +163,7 @@ def judge(
     *,
     relative_half_width: float,
     data_error: float,
+    refuted: bool = False,
 ) -> tuple[Verdict, Reason]:
     """Return the verdict on a fitted coefficient, and its reason.
 
@@ -173,11 +176,15 @@ def judge(
     relative_half_width, data_error
         Half the 95 % interval, and the standard error from the flights alone, over the
         coefficient's reference.
+    refuted
+        Whether the flights contradict all that they say.
     """
 
     def reason(code: ReasonCode, *kept: str, **more: Any) -> Reason:
         return Reason(code=code, **{n: getattr(known, n) for n in (*kept, "bound")}, **more)
 
+    if refuted:
+        return Verdict.NOT_IDENTIFIABLE, reason(ReasonCode.REFUTED, "prior_given")
     prior_share = known.prior_share or 0.0
     if data_error > IDENTIFIABLE_ERROR or prior_share > PRIOR_SHARE:
         for direction in directions:

@@ -102,3 +102,17 @@ def test_a_late_clock_is_found_in_its_own_column(fit):
     with_offset = moved.sums(late, criterion, derivatives=True)
     without = moved.sums(truth(fit), criterion, derivatives=True)
     assert float(jnp.sum(with_offset.loss)) < 1e-3 * float(jnp.sum(without.loss))
+
+
+def test_a_flight_on_which_the_vehicle_tumbles_has_a_loss_and_no_slope(fit):
+    """Derivatives grow a million millionfold there, and would be all that a step goes by."""
+    values, criterion = fit.space.numbers(fit.space.initial), criterion_of(fit)
+    values["inertia_xx"] *= 0.1
+    light, flies, tumbles = fit.start(fit.space.vector_of(values)), 0, 1
+    columns = fit.jacobian(light, criterion).columns["body_rate"]
+    assert np.abs(columns[..., tumbles]).max() > 1e8
+    sums = fit.sums(light, criterion)
+    assert sums.loss[tumbles] > 0.0
+    assert not sums.gradient[:, tumbles].any()
+    assert not sums.hessian[..., tumbles].any()
+    assert sums.gradient[:, flies].any()

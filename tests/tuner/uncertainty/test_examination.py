@@ -14,8 +14,10 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.objective.normal_equations import Objective, portions
 from tuner.uncertainty.examination import Examination, examine, knowledge_of
+from tuner.uncertainty.identifiability import stand_ins_of
 from tuner.uncertainty.records import Knowledge, write_files
 from tuner.uncertainty.sensitivity import shortest_half
+from tuner.uncertainty.verdict import ReasonCode, Verdict
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant", "estimate_latency")
 UNIT = {"position": 1.0, "attitude": 180.0 / np.pi, "body_rate": 1.0, "rotor_speed": 1.0}
@@ -57,6 +59,37 @@ def test_flights_that_do_not_fit_the_memory_take_turns(
         one, other = ([leaf.model_dump() for leaf in e[kind]] for e in (in_turns, at_once))
         for here, there in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
             assert here == (there if isinstance(there, str) else pytest.approx(there, rel=1e-6))
+
+
+@pytest.mark.parametrize(("name", "factor"), [("motor_constant", 0.3), ("inertia_xx", 0.1)])
+def test_flights_that_the_fitted_vehicle_does_not_fly_say_nothing(
+    objective: Objective, name: str, factor: float
+) -> None:
+    """With so little of its thrust it falls; with so little inertia it tumbles on the second."""
+    space = objective.space
+    values = space.numbers(space.initial)
+    point = objective.start(space.vector_of({**values, name: factor * values[name]}))
+    known = examine(making.fitted_of(objective, point)).uncertainty
+    assert {known.estimates[one].verdict for one in FREE} == {Verdict.NOT_IDENTIFIABLE}
+    assert {known.estimates[one].reason.code for one in FREE} == {ReasonCode.REFUTED}
+    assert np.all(known.covariance.error >= space.prior_sd)
+    assert not stand_ins_of(known)
+    looked_at = examine(making.fitted_of(objective, point), at_minimum=False).uncertainty
+    assert not any(looked_at.estimates[one].parts.astray for one in FREE)
+
+
+def test_flights_that_are_disturbed_as_much_as_they_move_still_tell(objective: Objective) -> None:
+    random, shaken = np.random.default_rng(0), {}
+    for channel, old in objective.segments.measured.items():
+        values = np.asarray(old.values)
+        if channel != "attitude":
+            values = values + random.permutation(values - values.mean(axis=0))
+        shaken[channel] = replace(old, values=values)
+    segments = replace(objective.segments, measured=shaken)
+    disturbed = replace(objective, segments=segments)
+    information = examine(making.fitted_of(disturbed, making.truth(disturbed))).information
+    assert information.astray is not None
+    assert not information.astray.any()
 
 
 def flown(objective: Objective, name: str, factor: float) -> dict[str, np.ndarray]:
