@@ -370,6 +370,15 @@ class Code(Worded):
         ),
         "Judge the fit by held-out flights, not by its intervals.",
     )
+    FLIGHTS_REFUTE = (
+        "flights_refute",
+        (
+            "It crashes on a fitted flight, or flies most of them otherwise than they were "
+            "recorded: they say nothing of its coefficients, whose intervals are no narrower than "
+            "before."
+        ),
+        "Check controller file, set-points, frames and clocks; leave out a flight that crashes.",
+    )
     FINER_THAN_STEPS = (
         "finer_than_steps",  # seconds
         (

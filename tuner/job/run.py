@@ -60,7 +60,7 @@ from tuner.terms.candidates import Selected
 from tuner.terms.inverse_regression import with_inputs_balanced
 from tuner.terms.refit_with_disturbances import Examined, examined
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
-from tuner.uncertainty.estimates import finer_than_steps, terms_shown
+from tuner.uncertainty.estimates import finer_than_steps, flights_refute, terms_shown
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import ground_conflicts, sources_of
 from tuner.uncertainty.model_error import lack_found
@@ -288,6 +288,7 @@ def _known(
     if examination is None:
         return {}
     uncertainty, known = examination.uncertainty, examination.known
+    explanation.notice(flights_refute(uncertainty))
     explanation.notice(finer_than_steps(uncertainty))
     explanation.notice(lack_found(examination.lack, uncertainty))
     explanation.notice(terms_shown(fitted, uncertainty))

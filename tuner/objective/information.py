@@ -334,7 +334,9 @@ def information_at(
     to_scaled[: len(space)] = 1.0 / space.slope(np.asarray(point.coefficients))
     information = information * to_scaled[:, None] * to_scaled
     fitted = np.asarray(point.offsets) != 0.0 if offsets_fitted is None else offsets_fitted
-    closed = isinstance(objective.segments.inlet, ReferenceInlet) and not objective.segments.windowed
+    closed = (
+        isinstance(objective.segments.inlet, ReferenceInlet) and not objective.segments.windowed
+    )
     along, prior, pull = _along(objective, point, criterion, information, fitted)
     return FisherInformation(
         channels=channels,

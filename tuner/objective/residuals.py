@@ -270,9 +270,9 @@ def _rotation_program() -> Program:
 
 
 CHAOTIC = 1e6
-"""Root mean square derivative of a channel by a step of the search, in (scaled) standard deviations,
-beyond which it says nothing: where a simulated vehicle tumbles, derivatives grow a million
-millionfold, and the straight line that they draw ends before the smallest step."""
+"""Root mean square derivative of a channel by a step of the search, in (scaled) standard
+deviations, beyond which it says nothing: where a simulated vehicle tumbles, derivatives grow a
+million millionfold, and the straight line that they draw ends before the smallest step."""
 ROWS_AT_ONCE = 1024
 """Residuals whose products are summed up by one call of BLAS: few enough for one thread, so that
 sums do not depend on how many there are."""

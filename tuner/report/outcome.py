@@ -17,7 +17,7 @@ from tuner.report.result_texts import metres, simulator_lacks
 from tuner.report.section import Cell, Table
 from tuner.result import FlightResult, RunResult
 from tuner.uncertainty.records import Knowledge
-from tuner.uncertainty.verdict import ReasonCode, Verdict
+from tuner.uncertainty.verdict import Verdict
 from tuner.uncertainty.verdict_texts import verdict_in_words
 
 NAMES = 90
@@ -254,8 +254,6 @@ def _usability(
     if any(found.level == "failure" for found in result.findings):
         return Usability.UNUSABLE
     fitted = [row for row in result.coefficients.values() if row.fitted]
-    if any(row.reason.code is ReasonCode.REFUTED for row in fitted):
-        return Usability.UNUSABLE
     unsure = (
         "unchanged" in words,
         bool(flights) and not any(one.held_out for one in flights),

@@ -304,6 +304,14 @@ def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
     return (Finding(Code.FINER_THAN_STEPS, "warning", ", ".join(names), numbers),)
 
 
+def flights_refute(uncertainty: Uncertainty) -> tuple[Finding, ...]:
+    """Say that the fitted vehicle is not the one that flew, where its flights show that."""
+    reasons = (estimate.reason.code for estimate in uncertainty.estimates.values())
+    if ReasonCode.REFUTED not in reasons:
+        return ()
+    return (Finding(Code.FLIGHTS_REFUTE, "failure", "the fitted vehicle"),)
+
+
 TERMS_SHOWN = (
     "thrust_exponent",
     "motor_lag",

@@ -78,7 +78,7 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
         "voltmeter": parts.readings,
         "what the model lacks": parts.lack,
         "rest of the search": parts.search,
-        "other flights": parts.astray,
+        "a vehicle that flies otherwise": parts.astray,
     }
     least = NEGLIGIBLE * max(error or 0.0 for error in named.values())
     size = 1.0 if unit is not None else max(abs(value), 1e-300)
@@ -103,8 +103,8 @@ def _main_clause(reason: Reason) -> str:
         f"the interval is that of {prior}",
         ReasonCode.WIDE_INTERVAL: f"the flights alone determine it only to ±{_half_width(reason)}; "
         f"the interval leans on {prior}",
-        ReasonCode.REFUTED: "the fitted vehicle does not fly what was recorded, so that the flights "
-        f"say nothing about it; the interval is no narrower than that of {prior}",
+        ReasonCode.REFUTED: "the fitted vehicle does not fly what was recorded, so that its "
+        f"flights say nothing about it; the interval is no narrower than that of {prior}",
         ReasonCode.PRIOR_DOMINATES: f"{reason.prior_share or 0.0:.0%} of the information about it "
         f"is that of {prior}",
         ReasonCode.NOT_WITH_ALL_FREE: "the flights do not identify it while all others are free",

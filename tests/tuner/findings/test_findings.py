@@ -214,6 +214,7 @@ MADE = {
     Code.REFERENCE_VOLTAGE: Finding(
         Code.REFERENCE_VOLTAGE, "info", "input_scaling, zero_position_armed", {"volts": 16.36}
     ),
+    Code.FLIGHTS_REFUTE: Finding(Code.FLIGHTS_REFUTE, "failure", "the fitted vehicle"),
     Code.FINER_THAN_STEPS: Finding(
         Code.FINER_THAN_STEPS, "warning", "estimate_latency", {"seconds": 1e-4}
     ),

@@ -13,6 +13,7 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.objective.normal_equations import Objective, portions
+from tuner.uncertainty.estimates import flights_refute
 from tuner.uncertainty.examination import Examination, examine, knowledge_of
 from tuner.uncertainty.identifiability import stand_ins_of
 from tuner.uncertainty.records import Knowledge, write_files
@@ -74,8 +75,11 @@ def test_flights_that_the_fitted_vehicle_does_not_fly_say_nothing(
     assert {known.estimates[one].reason.code for one in FREE} == {ReasonCode.REFUTED}
     assert np.all(known.covariance.error >= space.prior_sd)
     assert not stand_ins_of(known)
+    (said,) = flights_refute(known)
+    assert said.level == "failure"
     looked_at = examine(making.fitted_of(objective, point), at_minimum=False).uncertainty
     assert not any(looked_at.estimates[one].parts.astray for one in FREE)
+    assert not flights_refute(looked_at)
 
 
 def test_flights_that_are_disturbed_as_much_as_they_move_still_tell(objective: Objective) -> None:
