@@ -19,7 +19,7 @@ from tuner.search.estimation import LAST, free_offsets, polished
 from tuner.search.explanation import Explanation
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
-from tuner.terms.candidates import Selected, is_stand_in, names_in
+from tuner.terms.candidates import Selected, names_in
 from tuner.terms.innovations import Innovations, outside
 from tuner.terms.search_with_terms import candidates_of
 from tuner.uncertainty.estimates import Uncertainty
@@ -140,8 +140,8 @@ def with_disturbances(
         # without a lag that samples surely call for simulated flights tell nothing of the others
         better = True
     else:
-        if any(is_stand_in(name) and name not in seen.selected.kept for name in had):
-            # what stood in for other terms made another model of it, which says nothing of this one
+        if set(seen.selected.kept) != set(had):
+            # with other terms it is a fit of another model, which says nothing of this one
             fitted = polished(
                 job,
                 again,

@@ -165,23 +165,19 @@ def test_a_fit_with_a_lag_whose_filter_loses_a_flight_is_not_taken(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("group", "titles", "lag"),
-    [("angular_drag", 2, False), ("fuselage_drag", 1, False), ("angular_drag", 1, True)],
+    ("others", "titles", "lag"), [(True, 2, False), (False, 1, False), (True, 1, True)]
 )
-def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, group, titles, lag):
-    """What stood in for other terms made another model of it: it cannot contradict this one.
-
-    Nor can one without a lag.
-    """
+def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, others, titles, lag):
+    """A fit of another model cannot contradict this one, nor can one without a lag."""
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
     predictor = SimpleNamespace(memory=0, is_lost=False, keeps_track=True, strengths=USUAL)
     predictor.without_gains = predictor
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
-    row = SimpleNamespace(group=group, kept=True)
+    row = SimpleNamespace(group="fuselage_drag", kept=True)
     begin = Selected(job, fitted(2.0 * COLOURED), (cast(Any, row),))
     polished, examined, read = [], [], []
-    chosen = iter([replace(begin, rows=()), None])
+    chosen = iter([replace(begin, rows=()) if others else None, None])
 
     def seen(selected: Selected, *_: Any) -> Any:
         return SimpleNamespace(
