@@ -170,6 +170,7 @@ _REASONS = {
     "model",
     SelectionCode.WORSE_AFTER_REFIT: "fitted again with it, flights left out of the fit are not "
     "predicted better",
+    SelectionCode.REFUTED: "recorded commands have the gains of the controller file",
 }
 
 

@@ -21,7 +21,12 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
 from tuner.terms.candidates import Selected, names_in
 from tuner.terms.innovations import Innovations, outside
-from tuner.terms.search_with_terms import candidates_of
+from tuner.terms.search_with_terms import (
+    FILES_GAINS,
+    candidates_of,
+    refuted_by_commands,
+    with_refuted,
+)
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine, full_problem_of
 from tuner.uncertainty.identifiability import with_undetermined_held
@@ -54,9 +59,14 @@ def examined(
     And how well each coefficient is known; first the terms, of which innovations may call for
     others.
     """
-    followed = explanation.part(
-        "disturbances", partial(with_disturbances, selected, on_progress, on_message), None
-    )
+    follow = partial(with_disturbances, on_progress=on_progress, on_message=on_message)
+    followed = explanation.part("disturbances", partial(follow, selected), None)
+    if followed is not None and (
+        refuted := set(refuted_by_commands(*followed[:2])).difference(selected.kept)
+    ):
+        on_message(FILES_GAINS.format(listed(sorted(refuted))))
+        less = with_refuted(selected, refuted)
+        followed = explanation.part("disturbances", partial(follow, less), None)
     on_message("Examining how well each coefficient is known.")
     if followed is not None:
         return followed

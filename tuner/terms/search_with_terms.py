@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from tuner.core.phrases import listed
 from tuner.core.spans import span
 from tuner.evaluate.validation import point_estimates
 from tuner.findings.findings import Finding
@@ -23,8 +24,9 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected, candidate_groups, groups_around, groups_named, start_of
 from tuner.terms.selection import Selection
+from tuner.uncertainty.model_error import lack_of
 from tuner.vehicle import COEFFICIENTS
-from tuner.vehicle.selection_table import Groups
+from tuner.vehicle.selection_table import Groups, SelectionCode
 
 MARKERS = ("marker_offset", "marker_tilt")
 """The groups of the motion capture's frame."""
@@ -32,6 +34,11 @@ LEAST_TILT = 3e-3
 """rad of tilt in hover below which markers are not freed for it."""
 SIGNIFICANT = 3.0
 """Standard errors, over the flights, by which the tilt exceeds zero."""
+GAINS = {"rate_gain_roll_pitch": ("roll", "pitch"), "rate_gain_yaw": ("yaw",)}
+"""Coefficient -> axes of the rate controller whose gains it scales."""
+SAME_GAIN = 0.02
+"""Share of a gain within which it is the file's."""
+FILES_GAINS = "Recorded commands have the file's gains: fitting again without {}."
 
 
 def with_first_terms(job: Job) -> Job:
@@ -142,11 +149,46 @@ def with_terms_selected(
         selected = Selected(job, fitted, selection.rows_of_named())
     elif candidates:
         selected = selection.run()
+        if refuted := refuted_by_commands(selected, selected.fitted):
+            on_message(FILES_GAINS.format(listed(refuted)))
+            left = {name: names for name, names in candidates.items() if name not in refuted}
+            gone = [row for row in with_refuted(selected, refuted).rows if row.group in refuted]
+            without = replace(selection, candidates=left).run()
+            selected = replace(without, rows=(*without.rows, *gone))
     else:
         rows = () if job.accelerations is None else job.accelerations.rows
         selected = Selected(job, fitted, rows)
     spent = time.perf_counter() - clock
     return replace(selected, fitted=replace(selected.fitted, wall_time=fitted.wall_time + spent))
+
+
+def refuted_by_commands(selected: Selected, fitted: Fitted) -> tuple[str, ...]:
+    """Return the groups of gains in a selection's fit that recorded commands take back.
+
+    Simulated flights tell gains by all that a loop does, and may want others for what the model
+    lacks; how recorded commands answer the recorded rates says them by itself.
+    """
+    kept = {row.group: row.names for row in selected.rows if row.kept and row.names[0] in GAINS}
+    if not kept or (lack := lack_of(fitted, selected.job.fitted)) is None:
+        return ()
+    heard = {one.axis: one for one in lack.answers if one.part == "P"}
+    numbers = fitted.objective.space.numbers(fitted.point.coefficients)
+
+    def are_files(name: str) -> bool:
+        those = [heard[axis] for axis in GAINS[name] if axis in heard]
+        if len(those) < len(GAINS[name]):
+            return False
+        of_fit = np.average([one.value for one in those], weights=[one.sd**-2.0 for one in those])
+        return bool(abs(numbers[name] * of_fit - 1.0) < SAME_GAIN)
+
+    return tuple(group for group, names in kept.items() if any(map(are_files, names)))
+
+
+def with_refuted(selected: Selected, groups: Collection[str]) -> Selected:
+    """Return a selection whose table says that recorded commands refute some groups."""
+    found = {"kept": False, "reason": SelectionCode.REFUTED}
+    rows = (row.model_copy(update=found if row.group in groups else {}) for row in selected.rows)
+    return replace(selected, rows=tuple(rows))
 
 
 def candidates_of(job: Job) -> Groups:

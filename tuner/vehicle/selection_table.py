@@ -41,6 +41,8 @@ class SelectionCode(StrEnum):
     """The flights do not tell it from the coefficients that are in the model."""
     WORSE_AFTER_REFIT = "worse_after_refit"
     """Refitted with it, the flights left out are not predicted better."""
+    REFUTED = "refuted"
+    """Recorded commands answer the recorded rates with the gains of the controller file."""
 
 
 class SelectionRow(Part):

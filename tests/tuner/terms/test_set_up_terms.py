@@ -28,6 +28,7 @@ def selected(monkeypatch, groups=GROUPS, **given):
     """Return the selection among these terms alone, which makes it cheap."""
     monkeypatch.setattr(search_with_terms, "candidate_groups", lambda *_: groups)
     monkeypatch.setattr(search_with_terms, "groups_around", lambda *_, **__: {})
+    monkeypatch.setattr(search_with_terms, "lack_of", lambda *_: None)  # no commands were recorded
     fit = job_with(0.0, seed=0, **given)
     return with_terms_selected(*fit, lambda *_: None, lambda _: None)
 
