@@ -13,9 +13,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.contest import STRIDE, Contest, simple
+from benchmarks.contest import STRIDE, Contest, rivals, simple
 from tuner.config import Options, settle
-from tuner.config.job import JobFile
+from tuner.config.job import InletName, JobFile
 from tuner.core.errors import InputError
 from tuner.evaluate.prediction import Predictions, predict
 from tuner.evaluate.validation import controller_flown, vehicle_fitted
@@ -27,7 +27,7 @@ from tuner.search.problem import job_of
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.uncertainty.identifiability import with_undetermined_held
 
-INLET = "actuator"
+INLET: InletName = "actuator"
 """What the commanded thrust and torque ask of the motors."""
 
 
@@ -86,11 +86,13 @@ def _predicted(path: Path, mass: float) -> dict[str, list[Predictions]]:
         fitted, _ = with_undetermined_held(
             selected.job, selected.fitted, lambda *_: None, lambda _: None
         )
-    vehicles = {"unfitted": settings.vehicle, "fitted": vehicle_fitted(selected.job, fitted)}
+    best = vehicle_fitted(selected.job, fitted)
     controller = controller_flown(selected.job, fitted)
     predictions = {
-        label: [predict(vehicle, controller, second, INLET, stride=STRIDE)]
-        for label, vehicle in vehicles.items()
+        label: [predict(vehicle, controller, second, INLET, stride=STRIDE, observer=observer)]
+        for label, vehicle, observer in rivals(
+            settings.vehicle, best, controller, [(first, INLET, 0.0)]
+        )
     }
     signal = INLETS[INLET].needs[0]
     return simple([first], [second], signal, predictions["fitted"]) | predictions

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.contest import STRIDE, Contest, simple
+from benchmarks.contest import STRIDE, Contest, rivals, simple
 from tuner.config import Options, settle
+from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.evaluate.prediction import Predictions, predict
 from tuner.job.without_pose import fit_without_pose
@@ -27,6 +28,7 @@ from tuner.result import BEST_FIT_FILE
 from tuner.search.job_flights import without_pose
 from tuner.vehicle import ControllerFile, read_vehicle
 
+INLET: InletName = "actuator"
 RATE = 100.0
 """Hz of the clock on which flights are compared."""
 REMARK = (
@@ -54,15 +56,18 @@ def contest_of(folder: Path) -> Contest:
         fit = fit_without_pose(settings, flights[-1:], out=Path(name) / "run")
         best = read_vehicle(fit.folder / BEST_FIT_FILE)
     seconds = time.perf_counter() - began
-    held_out = [posed(flight) for flight in flights[:-1]]
+    fitted, held_out = posed(flights[-1]), [posed(flight) for flight in flights[:-1]]
+    controller = ControllerFile()
     predictions = {
         label: [
-            _of_rate(predict(vehicle, ControllerFile(), flight, "actuator", stride=STRIDE))
+            _of_rate(predict(vehicle, controller, flight, INLET, stride=STRIDE, observer=observer))
             for flight in held_out
         ]
-        for label, vehicle in {"unfitted": settings.vehicle, "fitted": best}.items()
+        for label, vehicle, observer in rivals(
+            settings.vehicle, best, controller, [(fitted, INLET, 0.0)]
+        )
     }
-    others = simple([posed(flights[-1])], held_out, "command", predictions["fitted"])
+    others = simple([fitted], held_out, "command", predictions["fitted"])
     return Contest(
         tuple(flight.name for flight in held_out),
         flights[-1].name,

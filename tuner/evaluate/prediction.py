@@ -2,12 +2,13 @@
 
 A prediction begins at the recorded state (`tuner.recordings.states`) and is simulated open loop
 for a stated time. Nothing is fitted to the flight that is predicted: no start, no trim, no offset.
+From the state alone, or with the torque that an observer has told just before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -17,6 +18,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.state import AIRBORNE
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
+from tuner.evaluate.torque_observer import TorqueObserver
 from tuner.findings.sentences import PREDICTED
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.inlets import INLETS
@@ -67,6 +69,7 @@ def predict(
     seconds: float = 0.5,
     stride: float | None = None,
     input_late: float = 0.0,
+    observer: TorqueObserver | None = None,
 ) -> Predictions:
     """Predict a flight open loop from many of its recorded states.
 
@@ -82,6 +85,8 @@ def predict(
         s from one prediction to the next; by default one sample.
     input_late
         s by which what is fed in is stamped later than the recorded state.
+    observer
+        Tells the torque that no input shows when a prediction begins.
 
     Raises
     ------
@@ -101,11 +106,14 @@ def predict(
         input_late={flight.name: input_late},
     )
     whole = np.flatnonzero(segments.begins + seconds <= flight.duration + 1e-9)
-    begins = segments.begins[whole]
+    segments, begins = _taken(segments, whole), segments.begins[whole]
+    if observer is not None:
+        unseen = observer.disturbance((flight, inlet, input_late), begins)
+        segments = replace(segments, disturbance=unseen)
     model = model_of(with_reference_voltage(vehicle, [flight]), controller)
     steps = round(seconds * flight.rate)
     ahead = np.arange(1, steps + 1) / flight.rate
-    reached = _simulated(model, _taken(segments, whole), schedule, ahead)
+    reached = _simulated(model, segments, schedule, ahead)
     recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
     errors = errors_of(reached, recorded, (steps, len(begins)))
     followed = INLETS[inlet].silences

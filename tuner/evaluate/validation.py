@@ -16,6 +16,7 @@ from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.prediction import Predictions, hold, predict
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, Pose
+from tuner.evaluate.torque_observer import FED, TorqueObserver
 from tuner.findings.findings import Code, Finding
 from tuner.findings.sentences import PREDICTED
 from tuner.objective.criterion import OFFSET_UNIT, units_of
@@ -128,6 +129,8 @@ class Validation:
         As ``best``, but windows start where the vehicle meets them best; flights in windows only.
     predicted_initial, predicted_best
         Open-loop predictions; flights in windows only.
+    predicted_with_observer
+        Likewise by the fitted vehicle, with the torque that fed rotors do not show before them.
     predicted_holding
         That the state stays as it was recorded, at the times of these predictions.
     turning_explained
@@ -140,6 +143,7 @@ class Validation:
     fitted_starts: Mapping[str, FlightErrors] = field(default_factory=dict)
     predicted_initial: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     predicted_best: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
+    predicted_with_observer: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     predicted_holding: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     turning_explained: Mapping[str, float] = field(default_factory=dict)
 
@@ -156,6 +160,7 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
         fitted_starts=comparison.fly(vehicle, fitted_starts=True),
         predicted_initial=_errors(_predictions(job, fitted, initial)),
         predicted_best=_errors(predictions),
+        predicted_with_observer=_errors(_observed(job, fitted, vehicle)),
         predicted_holding=_errors(held),
         turning_explained={
             name: 1.0 - _turning_missed(of) / _turning_missed(held[name])
@@ -165,8 +170,20 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
     )
 
 
-def _predictions(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, Predictions]:
-    """Return flight -> its predictions, of those that are not flown in a closed loop."""
+def _observed(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, Predictions]:
+    """Return flight -> its predictions that know what turned it, where that can be told."""
+    known = [(r.flight, r.inlet, r.input_late) for r in job.recordings if not r.holdout]
+    observer = TorqueObserver.of(vehicle, controller_flown(job, fitted), known)
+    return {} if observer is None else _predictions(job, fitted, vehicle, observer)
+
+
+def _predictions(
+    job: Job, fitted: Fitted, vehicle: VehicleFile, observer: TorqueObserver | None = None
+) -> dict[str, Predictions]:
+    """Return flight -> its predictions, of those that are not flown in a closed loop.
+
+    With an observer, of those alone of which it can tell something.
+    """
     controller = controller_flown(job, fitted)
     return {
         recording.flight.name: predict(
@@ -177,9 +194,10 @@ def _predictions(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, Pr
             seconds=max(AHEAD),
             stride=STRIDE,
             input_late=recording.input_late,
+            observer=observer,
         )
         for recording in job.recordings
-        if not INLETS[recording.inlet].closed_loop
+        if not INLETS[recording.inlet].closed_loop and (observer is None or recording.inlet in FED)
     }
 
 
