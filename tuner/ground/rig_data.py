@@ -98,6 +98,8 @@ def _middle(time: Array, first: int, end: int) -> Plateau | None:
 def without_outliers(values: Array) -> NDArray[np.bool_]:
     """Return (n,) which values lie within `OUTLIER` robust standard deviations of their median."""
     finite = np.isfinite(values)
+    if not finite.any():
+        return finite
     middle = np.median(values[finite])
     spread = max(float(robust_sd(values[finite] - middle)), 1e-12 * abs(middle))
     return np.asarray(finite & (np.abs(values - middle) <= OUTLIER * spread))

@@ -209,7 +209,7 @@ def rpm_curve(name: str, path: str, samples: Mapping[str, Array], given: RpmCurv
             path, what, f"record {FEWEST_COMMANDS} or more commands, each for seconds"
         )
     u, omega, error, volts = (np.array(column) for column in zip(*points, strict=True))
-    if np.corrcoef(u, omega)[0, 1] < 0.8:
+    if not np.ptp(omega) > 0 or np.corrcoef(u, omega)[0, 1] < 0.8:
         raise RecordingError(path, "has a rotor speed that does not follow the command",
                              "check the columns")  # fmt: skip
     error = np.maximum(error, 0.5 * np.median(error))

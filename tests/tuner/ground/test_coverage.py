@@ -8,6 +8,7 @@ import pytest
 from pydantic import TypeAdapter
 
 from tests.tuner.ground import rigs
+from tuner.core.errors import RecordingError
 from tuner.core.shipped import configs_folder
 from tuner.ground.bench_json import combine
 from tuner.ground.bifilar import bifilar
@@ -113,6 +114,21 @@ def test_the_truth_lies_in_the_interval_as_often_as_it_says(rig, repeats, least)
     off = [deviations(rig(np.random.default_rng(seed))) for seed in range(repeats)]
     inside = np.mean(np.abs(np.concatenate(off)) < 1.959964)
     assert least <= inside <= (0.995 if repeats == 200 else 1.0), inside
+
+
+def test_a_stuck_tachometer_is_refused():
+    samples = rigs.steps_of_command(np.random.default_rng(0))
+    stuck = samples | {"rotor_speed": np.full(len(samples["time"]), 500.0)}
+    with pytest.raises(RecordingError, match="does not follow the command; check the columns"):
+        rpm_curve("rpm", "r.csv", stuck, plan("rpm_curve"))
+
+
+def test_a_command_without_a_speed_is_left_out():
+    samples = rigs.steps_of_command(np.random.default_rng(0))
+    third = samples["command"] == np.unique(samples["command"])[2]
+    gone = samples | {"rotor_speed": np.where(third, np.nan, samples["rotor_speed"])}
+    found = rpm_curve("rpm", "r.csv", gone, plan("rpm_curve", reference_voltage=16.4))
+    assert (np.abs(deviations(found)) < 4).all()
 
 
 def test_a_second_lag_is_named():
