@@ -83,6 +83,12 @@ def test_bad_input_is_one_line_and_nothing_is_asked(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("out", ["", ".", "/"])
+def test_a_folder_is_no_file(out, capsys):
+    assert main(["new-vehicle", "--like", "crazyflie", "--out", out]) == 2
+    assert "it is a folder; name a file" in capsys.readouterr().err
+
+
 def test_a_terminal_is_asked_for_what_was_not_given(tmp_path, monkeypatch, capsys):
     answers = {"Mass": "2.243", "Distance": "0.5", "Cells": "", "kV": "", "Throttle": "0.54"}
     answers |= {"Propeller": "11x4.7", "Height": "0.06"}

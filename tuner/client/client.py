@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote, urlsplit
+from urllib.parse import quote
 
 from tuner.config import Settings, settle
 from tuner.core.disk import folder_for, inside, make_folder, whole_file
@@ -57,10 +57,17 @@ class Client:
                 "--server", "needs httpx", "pip install 'multirotor-tune[service]'"
             ) from None
         url = url or os.environ.get("TUNE_SERVER") or DEFAULT_SERVER
-        if urlsplit(url).scheme not in ("http", "https") or not urlsplit(url).hostname:
-            raise InputError("--server", f"'{url}' is no address", f"write {DEFAULT_SERVER}")
         self.url = url.rstrip("/")
-        token = token or os.environ.get("TUNE_TOKEN")
+        token = token or os.environ.get("TUNE_TOKEN") or ""
+        if not (token.isascii() and token.isprintable()):
+            raise self._no_token()
+        try:
+            address = httpx.URL(self.url)
+            if address.scheme not in ("http", "https") or not address.host.encode("idna"):
+                raise ValueError(url)
+        except (ValueError, httpx.InvalidURL):
+            what = f"{url!r} is no address"
+            raise InputError("--server", what, f"write {DEFAULT_SERVER}") from None
         self._errors = httpx.TransportError
         self._http = httpx.Client(
             base_url=self.url,
@@ -280,9 +287,7 @@ class Client:
         except (ValueError, KeyError, TypeError):
             raise self._stranger() from None
         if answer.status_code == 401:
-            raise InputError(
-                "--token", f"is none of {self.url}", "ask who runs it, and set TUNE_TOKEN"
-            )
+            raise self._no_token()
         if answer.status_code == 500:
             raise ServerFaultError(f"{self.url}: {what}; {remedy}")
         raise InputError(where, what, remedy)
@@ -293,6 +298,10 @@ class Client:
             f"{self.url} cannot be reached ({error})",
             "check the address, or start a server with: tune serve",
         )
+
+    def _no_token(self) -> InputError:
+        remedy = "ask who runs it, and set TUNE_TOKEN"
+        return InputError("--token", f"is none of {self.url}", remedy)
 
     def _stranger(self) -> InputError:
         return InputError("--server", f"{self.url} is no tuning service", "check the address")

@@ -183,9 +183,9 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
     OutputError
         A file cannot be written.
     """
+    check_file(out)
     job = out.with_name(f"{out.stem}.job.yaml")
-    for path in (out, job):
-        check_file(path)
+    check_file(job)
     template = read_vehicle(configs_folder() / "vehicles" / "hovergames_updated.yaml")
     if like is None:
         estimates = coefficients_of(airframe)
