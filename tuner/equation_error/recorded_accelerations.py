@@ -27,7 +27,7 @@ loop answers what disturbs it later than that by most of a rotor's lag."""
 GAP = 2.5
 """Gaps between samples beyond which a signal is unknown."""
 FEWEST = 100
-"""Steps below which nothing is said."""
+"""Known steps below which nothing is said."""
 
 Commands = tuple[Series, ...]
 """Of each flight."""
@@ -133,7 +133,8 @@ def measured_with(flight: Flight, rotors: Series, *, noise: float) -> Measured |
         weights=weights,
         noise=noise,
     )
-    return with_rotors(part, rotors)
+    part = with_rotors(part, rotors)
+    return part if np.count_nonzero(part.known) >= FEWEST else None
 
 
 def with_rotors(part: Measured, rotors: Series) -> Measured:
@@ -142,11 +143,12 @@ def with_rotors(part: Measured, rotors: Series) -> Measured:
     fine = part.time[:, None] + (np.arange(inside + 1) / inside - 0.5) * part.step
     speeds = _read(rotors, fine.ravel()).reshape(*fine.shape, 4)
     mean = np.einsum("nir,i->nr", speeds, part.weights)
-    known = np.isfinite(mean).all(axis=1, keepdims=True)
+    there = np.isfinite(mean)
+    known, usual = there.all(axis=1, keepdims=True), np.nanmean(mean) if there.any() else 0.0
     return replace(
         part,
         # where it is unknown, one that some rotor might have: derivatives by none are not finite
-        rotor_speed=np.where(np.isfinite(mean), mean, np.nanmean(mean)),
+        rotor_speed=np.where(there, mean, usual),
         rotor_acceleration=np.nan_to_num((speeds[:, -1] - speeds[:, 0]) / part.step),
         accelerations=np.where(known, part.accelerations, np.nan),
     )
@@ -180,9 +182,10 @@ def read_commands(
         recorded = Series(command.time - late, command.values)
         every, second = (_held(flight, recorded, rate, count) for count in (1, 2))
         part = measured_with(flight, rotor_response(model, every), noise=0.0)
-        if part is None:
+        part = None if part is None else without_gaps_of(recorded, part)
+        if part is None or np.count_nonzero(part.known) < FEWEST:
             return None
-        steps.append(without_gaps_of(recorded, part))
+        steps.append(part)
         commands.append(every)
         coarser.append(second)
     return tuple(steps), (tuple(commands), tuple(coarser))

@@ -186,3 +186,19 @@ def test_gaps_are_left_out(flown):
     unknown = np.flatnonzero(~steps.known) * steps.step
     assert 0.4 < np.ptp(unknown) < 0.6
     assert steps.rotor_speed.min() > 0.0  # what is differentiated by them stays finite
+
+
+@pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
+def test_rotor_speeds_in_bursts_say_too_little(flown):
+    """Stamps a few ms apart, and then nothing for tenths of a second: no step is known."""
+    _, settings, recordings = flown
+    seldom = []
+    for recording in recordings:
+        rotors = recording.flight.series["rotor_speed"]
+        kept = np.arange(len(rotors.time)) % 40 < 3
+        burst = Series(rotors.time[kept], rotors.values[kept])
+        series = {**recording.flight.series, "rotor_speed": burst}
+        seldom.append(replace(recording, flight=replace(recording.flight, series=series)))
+    assert measured(seldom[0].flight) is None
+    job = job_of(settings, seldom)
+    assert with_accelerations(job) == (job, ())
