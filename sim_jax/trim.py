@@ -12,7 +12,9 @@ from dataclasses import replace
 from typing import TypeAlias
 
 import jax.numpy as jnp
-from jaxtyping import Bool
+import numpy as np
+from jax import lax
+from jaxtyping import Bool, Float
 
 from sim_jax.constants import GRAVITY
 from sim_jax.control.gains import Controller
@@ -80,16 +82,13 @@ def trim_speeds(vehicle: Vehicle, *, gravity: float = GRAVITY) -> PerRotor:
     motion = Motion(rest, rest, Quaternion.identity(rest.x), rest)
     air = Air.around(vehicle, motion, rotor_acceleration=(rest.x,) * ROTORS)
 
-    def lift_and_moments(speeds: PerRotor) -> _Row:
-        wrench = total_wrench(vehicle, motion, speeds, air)
-        return [wrench.force.z, wrench.moment.x, wrench.moment.y, wrench.moment.z]
+    def lift_and_moments(speeds: Float[Array, " 4"]) -> tuple[Scalar, ...]:
+        wrench = total_wrench(vehicle, motion, tuple(unit * speed for speed in speeds), air)
+        return wrench.force.z, wrench.moment.x, wrench.moment.y, wrench.moment.z
 
     unit = jnp.ones_like(rest.x)
-    none = lift_and_moments((0.0 * unit,) * ROTORS)
-    columns = [
-        lift_and_moments(tuple(unit if i == rotor else 0.0 * unit for i in range(ROTORS)))
-        for rotor in range(ROTORS)
-    ]
+    # one after the other, so that what acts is compiled once
+    none, *columns = zip(*lax.map(lift_and_moments, np.eye(1 + ROTORS, ROTORS, -1)), strict=True)
     weight = vehicle.body.mass * gravity
     wanted = [weight - none[0], -none[1], -none[2], -none[3]]
     rows = [

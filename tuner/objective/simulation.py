@@ -290,8 +290,21 @@ def _flight(
         after, row = plant.sample(state, number)
         return after, recorded_of(row, model, environment, given.conditions, channels)
 
-    last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))
+    begin = replace(_moving(first), crash_time=first.crash_time)
+    last, logged = lax.scan(sample, begin, jnp.arange(lengths["turns"]))
     return logged, last.crash_time
+
+
+@jax.custom_jvp
+def _moving(state: State) -> State:
+    """Return a state as it is, with a derivative, if it is zero, for each of its numbers.
+
+    A loop into which some of them enter without one is differentiated once more.
+    """
+    return state
+
+
+_moving.defjvp(lambda state, moved: (state[0], moved[0]))
 
 
 def recorded_of(
