@@ -29,7 +29,9 @@ __all__ = ["demo"]
 
 collect_rarely()
 threadpool_limits(1, user_api="blas")
-keep_code_in(cache_folder() / "kernels_of_tests")
+KERNELS = cache_folder() / "kernels"
+"""The program's own: commands that a test runs, in this process or another, find what it built."""
+keep_code_in(KERNELS)
 assert jax.config.jax_compilation_cache_dir, "jax was imported before `tests` set its environment"
 
 settings.register_profile("project", deadline=None, derandomize=True)

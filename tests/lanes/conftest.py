@@ -2,10 +2,12 @@
 
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from tests.conftest import KERNELS_ALONE
+from lanes import keep_code_in
+from tests.conftest import KERNELS, KERNELS_ALONE
 
 
 @pytest.fixture(autouse=True)
@@ -14,3 +16,11 @@ def fallback_allowed() -> Iterator[None]:
     watched.removeHandler(KERNELS_ALONE)
     yield
     watched.addHandler(KERNELS_ALONE)
+
+
+@pytest.fixture
+def kernels(tmp_path: Path) -> Iterator[Path]:
+    """Keep object code in an empty folder."""
+    keep_code_in(tmp_path)
+    yield tmp_path
+    keep_code_in(KERNELS)

@@ -106,7 +106,8 @@ def test_the_digest_follows_the_source(tmp_path, monkeypatch):
     assert len(digests) == 2
 
 
-def test_a_kept_program_is_not_traced_again(tmp_path):
+@pytest.mark.usefixtures("kernels")
+def test_a_kept_program_is_not_traced_again():
     traced = []
 
     def program(factor: float, shape: tuple[int, ...] = (3,)) -> Program:
@@ -118,19 +119,15 @@ def test_a_kept_program_is_not_traced_again(tmp_path):
         return Program(function, argument, name="times", made_of=("times", factor))
 
     x = np.arange(6.0).reshape(3, 2)
-    keep_code_in(tmp_path)
-    try:
-        first = program(2.0)(x, [np.eye(3)], lanes=2)
-        assert traced == [2.0]
-        again = program(2.0)(x, [np.eye(3)], lanes=2)
-        assert traced == [2.0]
-        for run in (first, again):
-            np.testing.assert_array_equal(run.values["times"], 2.0 * x.T)
-            np.testing.assert_array_equal(run.values["count"], [7, 7])
-            np.testing.assert_array_equal(run.columns["times"][0], 2.0 * np.eye(3))
-            assert run.columns["count"] is None
-        program(3.0)(x, [np.eye(3)], lanes=2)
-        program(2.0, (2, 3))(np.ones((2, 3, 2)), [np.ones((1, 2, 3))], lanes=2)
-        assert traced == [2.0, 3.0, 2.0]
-    finally:
-        keep_code_in(None)
+    first = program(2.0)(x, [np.eye(3)], lanes=2)
+    assert traced == [2.0]
+    again = program(2.0)(x, [np.eye(3)], lanes=2)
+    assert traced == [2.0]
+    for run in (first, again):
+        np.testing.assert_array_equal(run.values["times"], 2.0 * x.T)
+        np.testing.assert_array_equal(run.values["count"], [7, 7])
+        np.testing.assert_array_equal(run.columns["times"][0], 2.0 * np.eye(3))
+        assert run.columns["count"] is None
+    program(3.0)(x, [np.eye(3)], lanes=2)
+    program(2.0, (2, 3))(np.ones((2, 3, 2)), [np.ones((1, 2, 3))], lanes=2)
+    assert traced == [2.0, 3.0, 2.0]

@@ -335,46 +335,35 @@ def test_what_a_loop_computes_for_nobody_needs_no_rule():
 TEXT = "define i32 @seven() {\n ret i32 7\n}\n"
 
 
-def test_kept_code_is_used_and_damage_is_noticed(tmp_path):
-    keep_code_in(tmp_path)
-    try:
-        code = object_code(TEXT)
-        (path,) = tmp_path.glob("*.o")
-        held = path.read_bytes()
-        assert held[32:] == code
-        assert held[:32] == hashlib.sha256(code).digest()
-        other = b"other code"
-        path.write_bytes(hashlib.sha256(other).digest() + other)
-        assert object_code(TEXT) == other  # it is the file that is read
-        for damaged in (b"", held[:40], held[:-1] + b"!", b"x" * len(held)):
-            path.write_bytes(damaged)
-            assert object_code(TEXT) == code
-            assert path.read_bytes() == held
-    finally:
-        keep_code_in(None)
+def test_kept_code_is_used_and_damage_is_noticed(kernels):
+    code = object_code(TEXT)
+    (path,) = kernels.glob("*.o")
+    held = path.read_bytes()
+    assert held[32:] == code
+    assert held[:32] == hashlib.sha256(code).digest()
+    other = b"other code"
+    path.write_bytes(hashlib.sha256(other).digest() + other)
+    assert object_code(TEXT) == other  # it is the file that is read
+    for damaged in (b"", held[:40], held[:-1] + b"!", b"x" * len(held)):
+        path.write_bytes(damaged)
+        assert object_code(TEXT) == code
+        assert path.read_bytes() == held
 
 
-def test_kept_code_is_bounded_and_the_longest_unused_goes(tmp_path, monkeypatch):
+def test_kept_code_is_bounded_and_the_longest_unused_goes(kernels, monkeypatch):
     monkeypatch.setattr(lanes.machine, "MOST", 1500)
-    keep_code_in(tmp_path)
-    try:
-        for number in range(6):
-            object_code(TEXT.replace("7", str(number)))
-        held = list(tmp_path.glob("*.o"))
-        assert sum(path.stat().st_size for path in held) <= 1500
-        assert held
-    finally:
-        keep_code_in(None)
+    for number in range(6):
+        object_code(TEXT.replace("7", str(number)))
+    held = list(kernels.glob("*.o"))
+    assert sum(path.stat().st_size for path in held) <= 1500
+    assert held
 
 
-def test_a_folder_that_cannot_be_written_is_no_reason_to_fail(tmp_path):
-    blocked = tmp_path / "file"
+def test_a_folder_that_cannot_be_written_is_no_reason_to_fail(kernels):
+    blocked = kernels / "file"
     blocked.write_text("")
     keep_code_in(blocked / "below")
-    try:
-        assert object_code(TEXT)
-    finally:
-        keep_code_in(None)
+    assert object_code(TEXT)
 
 
 def test_a_kernel_keeps_nothing_of_what_it_was_made_from():

@@ -18,8 +18,8 @@ from lanes.program import _program_of
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import BodyRateInlet
 from sim_jax.state import hover
+from tests.conftest import KERNELS
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
-from tuner.core.disk import cache_folder
 from tuner.disturbances import extended_kalman_filter as ekf
 from tuner.disturbances.disturbances import COUNT, USUAL
 from tuner.disturbances.observer import Expected, Feed, first_errors
@@ -98,7 +98,7 @@ def folder(tmp_path_factory):
     _program_of.cache_clear()
     yield path
     _program_of.cache_clear()
-    keep_code_in(cache_folder() / "kernels_of_tests")
+    keep_code_in(KERNELS)
 
 
 @pytest.mark.usefixtures("folder")
