@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks import fast_flights
 from benchmarks.table import Section, figure
 from tuner.config import Options, settle
-from tuner.equation_error.recorded_accelerations import Measured, measured
+from tuner.equation_error.recorded_accelerations import Steps, steps_of
 from tuner.equation_error.regression import convolved, summing
 from tuner.job.run import run
 from tuner.recordings.flight import Flight
@@ -104,7 +104,7 @@ def _regression(
 ) -> float:
     """Return the mean error of a plain regression's body rate, rad/s."""
     known, asked = (
-        [part for flight in flights if (part := measured(flight)) is not None]
+        [part for flight in flights if (part := steps_of(flight)) is not None]
         for flights in (fitted, held_out)
     )
     errors = []
@@ -120,7 +120,7 @@ def _regression(
     return float(np.mean(errors))
 
 
-def _weights(known: list[Measured], vehicle: VehicleFile, axis: int) -> fast_flights.Numbers:
+def _weights(known: list[Steps], vehicle: VehicleFile, axis: int) -> fast_flights.Numbers:
     columns = np.concatenate([regressors(part, vehicle)[axis][part.known] for part in known])
     turning = np.concatenate([part.accelerations[part.known, 3 + axis] for part in known])
     return np.asarray(np.linalg.lstsq(columns, turning, rcond=None)[0])

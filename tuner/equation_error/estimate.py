@@ -10,7 +10,7 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.equation_error.model_accelerations import ModelAccelerations, values_at
-from tuner.equation_error.recorded_accelerations import Commands, Mask, Measured
+from tuner.equation_error.recorded_accelerations import Commands, Mask, Steps
 from tuner.equation_error.regression import (
     MEMORY,
     Regression,
@@ -72,7 +72,7 @@ def estimate(
     model: Model,
     space: Space,
     candidates: Groups,
-    flights: Sequence[Measured],
+    flights: Sequence[Steps],
     commands: Sequence[Commands] = (),
 ) -> Estimate:
     """Return what some flights' accelerations say.

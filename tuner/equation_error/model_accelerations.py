@@ -17,7 +17,7 @@ from sim_jax.rigid_body import angular_acceleration
 from sim_jax.terms import total
 from sim_jax.terms.total import total_wrench
 from tuner.core.numerics import Array
-from tuner.equation_error.recorded_accelerations import Measured, rotor_response, with_rotors
+from tuner.equation_error.recorded_accelerations import Steps, rotor_response, with_rotors
 from tuner.objective.simulation import CODE
 from tuner.recordings.flight import Series
 from tuner.vehicle import COEFFICIENTS
@@ -52,7 +52,7 @@ class Linear:
         (6, K): likewise of columns and the model's accelerations.
     """
 
-    steps: Measured
+    steps: Steps
     left: Array
     columns: Array
     moved: Array
@@ -76,7 +76,7 @@ class ModelAccelerations:
 
     model: Model
     parameters: tuple[Parameter, ...]
-    flights: tuple[Measured, ...]
+    flights: tuple[Steps, ...]
     commands: tuple[Series, ...] = ()
 
     @property
@@ -126,7 +126,7 @@ class ModelAccelerations:
         values = values_at(self.parameters, point)
         return with_coefficients(self.model, {n: np.asarray(v) for n, v in values.items()})
 
-    def _with_rotors(self, point: Array) -> tuple[Measured, ...]:
+    def _with_rotors(self, point: Array) -> tuple[Steps, ...]:
         """Return the steps with the rotor speeds that a point's motors make of commands."""
         if not self.commands:
             return self.flights
@@ -149,7 +149,7 @@ def values_at(parameters: Sequence[Parameter], point: Array) -> dict[str, float]
     }
 
 
-def _faster(part: Measured, share: Array) -> Measured:
+def _faster(part: Steps, share: Array) -> Steps:
     """Return every so manyth step, with rotors (4,) faster by a share."""
     return replace(
         part,
@@ -160,7 +160,7 @@ def _faster(part: Measured, share: Array) -> Measured:
 
 
 def _made(
-    model: Model, parameters: Sequence[Parameter], point: Array, flights: Sequence[Measured]
+    model: Model, parameters: Sequence[Parameter], point: Array, flights: Sequence[Steps]
 ) -> list[tuple[Array, Array]]:
     """Return each flight's modelled accelerations (N, 6) and columns (N, 6, K)."""
     values, slopes = values_at(parameters, point), dict[str, Array]()

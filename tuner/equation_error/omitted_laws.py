@@ -27,7 +27,7 @@ import numpy as np
 
 from tuner.core.numerics import Array, unit_diagonal
 from tuner.equation_error.model_accelerations import Linear, ModelAccelerations
-from tuner.equation_error.recorded_accelerations import Measured, rows_of
+from tuner.equation_error.recorded_accelerations import Steps, rows_of
 from tuner.equation_error.regression import filtered_sums, whitening
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model
@@ -58,8 +58,8 @@ class Pair(NamedTuple):
     these may be off by is not told then.
     """
 
-    recorded: Measured
-    simulated: Measured
+    recorded: Steps
+    simulated: Steps
     driven: bool
 
 
@@ -223,7 +223,7 @@ def unexplained(
     return Unexplained(tuple(laws), made_of_laws, float(sizes[-1]))
 
 
-def _moved(part: Measured) -> list[Measured]:
+def _moved(part: Steps) -> list[Steps]:
     """Return the steps with rotor speeds as a motor's curve and its lags move them."""
     speed, change = part.rotor_speed, part.rotor_acceleration
     ways = (np.ones_like(speed), speed, np.maximum(change, 0.0), np.minimum(change, 0.0))
@@ -260,7 +260,7 @@ def _late(shift: Array) -> Array:
     return np.asarray(column)
 
 
-def _nuisances(part: Measured, motion: _Motion, place: tuple[int, int], of_commands: bool) -> Array:
+def _nuisances(part: Steps, motion: _Motion, place: tuple[int, int], of_commands: bool) -> Array:
     """Return (N, 6, n) what else errors may be, and is not told.
 
     A steady one of each axis in each flight (``place``: which of how many); what a thrust looks

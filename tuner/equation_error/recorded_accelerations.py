@@ -34,7 +34,7 @@ Commands = tuple[Series, ...]
 
 
 @dataclass(frozen=True)
-class Measured:
+class Steps:
     """N steps of one flight, or of several behind each other.
 
     Attributes
@@ -71,7 +71,7 @@ class Measured:
         return np.asarray(np.isfinite(self.accelerations).all(axis=1))
 
 
-def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
+def steps_of(flight: Flight, *, input_late: float = 0.0) -> Steps | None:
     """Return what a flight with rotor speeds and body rates says; None where it says too little.
 
     Parameters
@@ -88,10 +88,10 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
     if known.sum() < FEWEST:
         return None
     rotors = Series(rotors.time[known] - input_late, rotors.values[known])
-    return measured_with(flight, rotors, noise=_noise(rotors))
+    return steps_with(flight, rotors, noise=_noise(rotors))
 
 
-def measured_with(flight: Flight, rotors: Series, *, noise: float) -> Measured | None:
+def steps_with(flight: Flight, rotors: Series, *, noise: float) -> Steps | None:
     """Return the same with rotor speeds on the clock of the state, of so much white noise."""
     series = flight.series
     if not {"position", "attitude", "body_rate"} <= set(series):
@@ -118,7 +118,7 @@ def measured_with(flight: Flight, rotors: Series, *, noise: float) -> Measured |
     turning = np.diff(_read(gyro, edges), axis=0) * rate
     accelerations = np.hstack([turned.inv().apply(pull), turning])
     accelerations[~np.isfinite(state.body_rate).all(axis=1)] = np.nan
-    part = Measured(
+    part = Steps(
         step=1.0 / rate,
         time=middle,
         motion=Motion(
@@ -137,7 +137,7 @@ def measured_with(flight: Flight, rotors: Series, *, noise: float) -> Measured |
     return part if np.count_nonzero(part.known) >= FEWEST else None
 
 
-def with_rotors(part: Measured, rotors: Series) -> Measured:
+def with_rotors(part: Steps, rotors: Series) -> Steps:
     """Return the steps with other rotor speeds; where these are unknown, so is the step."""
     inside = len(part.weights) - 1
     fine = part.time[:, None] + (np.arange(inside + 1) / inside - 0.5) * part.step
@@ -154,7 +154,7 @@ def with_rotors(part: Measured, rotors: Series) -> Measured:
     )
 
 
-def without_gaps_of(series: Series, part: Measured) -> Measured:
+def without_gaps_of(series: Series, part: Steps) -> Steps:
     """Return the steps, of which those in a signal's gaps are unknown."""
     known = np.isfinite(_read(series, part.time)).all(axis=1, keepdims=True)
     return replace(part, accelerations=np.where(known, part.accelerations, np.nan))
@@ -162,7 +162,7 @@ def without_gaps_of(series: Series, part: Measured) -> Measured:
 
 def read_commands(
     model: Model, flights: Sequence[tuple[Flight, float]], rate: float
-) -> tuple[tuple[Measured, ...], tuple[Commands, Commands]] | None:
+) -> tuple[tuple[Steps, ...], tuple[Commands, Commands]] | None:
     """Return the steps of some flights; their commands, and the same of every second sample.
 
     None where a flight says too little.
@@ -176,12 +176,12 @@ def read_commands(
     rate
         Hz of the loop that computes commands.
     """
-    steps, commands, coarser = list[Measured](), list[Series](), list[Series]()
+    steps, commands, coarser = list[Steps](), list[Series](), list[Series]()
     for flight, late in flights:
         command = flight.series["command"]
         recorded = Series(command.time - late, command.values)
         every, second = (_held(flight, recorded, rate, count) for count in (1, 2))
-        part = measured_with(flight, rotor_response(model, every), noise=0.0)
+        part = steps_with(flight, rotor_response(model, every), noise=0.0)
         part = None if part is None else without_gaps_of(recorded, part)
         if part is None or np.count_nonzero(part.known) < FEWEST:
             return None

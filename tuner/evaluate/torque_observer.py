@@ -21,7 +21,7 @@ from sim_jax.geometry import Vec3
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
 from tuner.equation_error.model_accelerations import ModelAccelerations
-from tuner.equation_error.recorded_accelerations import Measured, measured, read_commands
+from tuner.equation_error.recorded_accelerations import Steps, read_commands, steps_of
 from tuner.objective.battery import with_reference_voltage
 from tuner.recordings.flight import Flight
 from tuner.vehicle import ControllerFile, VehicleFile
@@ -102,7 +102,7 @@ class TorqueObserver:
 
 def _unseen(
     vehicle: VehicleFile, controller: ControllerFile, fed: Fed
-) -> tuple[Measured, Array] | None:
+) -> tuple[Steps, Array] | None:
     """Return a flight's steps, and what of their angular acceleration (N, 3) the model lacks.
 
     Zero where it is unknown. None where rotors do not turn the vehicle, or too little is known.
@@ -112,7 +112,7 @@ def _unseen(
         return None
     model, part = model_of(with_reference_voltage(vehicle, [flight]), controller), None
     if inlet == "rotor_speed":
-        part = measured(flight, input_late=late)
+        part = steps_of(flight, input_late=late)
     else:
         rate = float(schedule_of(controller).rate_control_rate)
         driven = read_commands(model, [(flight, late)], rate)

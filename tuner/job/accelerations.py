@@ -17,9 +17,9 @@ from tuner.equation_error.estimate import GAINS, Estimate, estimate
 from tuner.equation_error.model_accelerations import moves_rotors
 from tuner.equation_error.recorded_accelerations import (
     Commands,
-    Measured,
-    measured,
+    Steps,
     read_commands,
+    steps_of,
 )
 from tuner.findings.findings import Code, Finding
 from tuner.objective.space import extended
@@ -63,14 +63,14 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     return (job, ()) if begun is None else (begun, (_finding(found),))
 
 
-def _steps(job: Job) -> tuple[tuple[Measured, ...], tuple[Commands, ...]] | None:
+def _steps(job: Job) -> tuple[tuple[Steps, ...], tuple[Commands, ...]] | None:
     """Return the steps of the fitted flights, with commands where these turn the rotors.
 
     None where they say too little.
     """
     fitted = [(r.flight, r.input_late) for r in job.recordings if not r.holdout]
     if job.inlets[0] == "rotor_speed":
-        parts = [measured(flight, input_late=late) for flight, late in fitted]
+        parts = [steps_of(flight, input_late=late) for flight, late in fitted]
         known = tuple(part for part in parts if part is not None)
         return (known, ()) if len(known) == len(parts) else None
     if job.inlets[0] != "actuator":

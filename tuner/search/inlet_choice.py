@@ -11,7 +11,7 @@ import numpy as np
 from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
-from tuner.equation_error.recorded_accelerations import Measured, measured, rows_of
+from tuner.equation_error.recorded_accelerations import Steps, rows_of, steps_of
 from tuner.equation_error.regression import convolved, summing
 from tuner.findings.findings import Code, Finding
 from tuner.objective.inlets import INLETS
@@ -30,7 +30,7 @@ def predicts_turning(flight: Flight, vehicle: VehicleFile) -> bool:
 
     Roll and pitch rate, `AHEAD` s later; the regression knows nothing but where rotors sit.
     """
-    steps = measured(flight)
+    steps = steps_of(flight)
     if steps is None:
         return False
     half, squares = len(steps.rotor_speed) // 2, np.zeros(2)
@@ -46,7 +46,7 @@ def predicts_turning(flight: Flight, vehicle: VehicleFile) -> bool:
     return bool(squares[0] < squares[1])
 
 
-def regressors(steps: Measured, vehicle: VehicleFile) -> tuple[Array, Array, Array]:
+def regressors(steps: Steps, vehicle: VehicleFile) -> tuple[Array, Array, Array]:
     """Return about x, y and z what angular acceleration is regressed on, (N, k).
 
     The rotors' torque up to a factor, air velocity across and body rate times the sum of the

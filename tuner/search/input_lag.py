@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
 from tuner.core.numerics import Array
-from tuner.equation_error.recorded_accelerations import Mask, measured_with, with_rotors
+from tuner.equation_error.recorded_accelerations import Mask, steps_with, with_rotors
 from tuner.equation_error.regression import MEMORY, convolved, whitening_filter
 from tuner.objective.inlets import INLETS, linear_interpolation
 from tuner.recordings.flight import Flight, Series
@@ -110,7 +110,7 @@ def _of_turning(flight: Flight, vehicle: VehicleFile, at: Sequence[float]) -> li
     rotors = flight.series["rotor_speed"]
     there = np.isfinite(rotors.values).all(axis=1)
     rotors = Series(rotors.time[there], rotors.values[there])
-    steps = measured_with(flight, rotors, noise=0.0)
+    steps = steps_with(flight, rotors, noise=0.0)
     if steps is None:
         return [0.0] * len(at)
     parts = [with_rotors(steps, Series(rotors.time - late, rotors.values)) for late in at]

@@ -30,7 +30,7 @@ from sim_jax.vehicle import Motor
 from tuner.core.numerics import Array
 from tuner.equation_error.omitted_laws import Law, Pair, unexplained
 from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, answers
-from tuner.equation_error.recorded_accelerations import FEWEST, Measured, measured
+from tuner.equation_error.recorded_accelerations import FEWEST, Steps, steps_of
 from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import log_voltage_of, read_again
 from tuner.objective.criterion import Point
@@ -324,12 +324,12 @@ def _signals(parts: Sequence[Series], mixer: MixerSettings, time: Array) -> Sign
 
 def _recorded(
     flight: Flight, model: Model, conditions: Mapping[str, Array], number: int
-) -> Measured | None:
+) -> Steps | None:
     """Return the steps of a recording, of the centre of mass in body axes through the air."""
     known = {"position", "attitude", "body_rate", "rotor_speed"} <= set(flight.series)
     if known:
         flight = replace(flight, series={**flight.series, **_of_body(flight.series, model)})
-    steps = measured(flight)
+    steps = steps_of(flight)
     return None if steps is None else _through_air(steps, conditions, number)
 
 
@@ -400,7 +400,7 @@ def _motor_answers(motor: Motor, commands: Array, steps: Array) -> tuple[Any, An
     return reference_speed(motor, jnp.asarray(commands)), lag.decay_up, lag.decay_down
 
 
-def _through_air(part: Measured, conditions: Mapping[str, Array], number: int) -> Measured:
+def _through_air(part: Steps, conditions: Mapping[str, Array], number: int) -> Steps:
     x, y = (conditions.get(name, np.zeros(number + 1))[number] for name in ("wind_x", "wind_y"))
     wind = Vec3(np.asarray(x), np.asarray(y), np.zeros(()))
     motion = part.motion
@@ -409,12 +409,12 @@ def _through_air(part: Measured, conditions: Mapping[str, Array], number: int) -
 
 
 def _simulated(
-    part: Measured,
+    part: Steps,
     channels: Mapping[str, Array],
     conditions: Mapping[str, Array],
     number: int,
     rate: float,
-) -> Measured:
+) -> Steps:
     """Return the same steps as the fit flies them; nothing of them is unknown."""
     clock = np.arange(channels[MOTION].shape[1]) / rate
 

@@ -12,8 +12,8 @@ from tuner.config import Options, settle
 from tuner.config.job import Search
 from tuner.equation_error.estimate import GAINS
 from tuner.equation_error.recorded_accelerations import (
-    measured,
     read_commands,
+    steps_of,
     without_gaps_of,
 )
 from tuner.job.accelerations import with_accelerations
@@ -68,10 +68,10 @@ def test_errors_hold_tachometers_whose_noise_is_a_quarter_more(flown, begun, mon
         certain = with_accelerations(job)[0].accelerations
 
     def noisier(flight, **given):
-        steps = measured(flight, **given)
+        steps = steps_of(flight, **given)
         return replace(steps, noise=np.sqrt(1.25) * steps.noise)
 
-    monkeypatch.setattr("tuner.job.accelerations.measured", noisier)
+    monkeypatch.setattr("tuner.job.accelerations.steps_of", noisier)
     other = with_accelerations(job)[0].accelerations
     for name in TILTING:
         moved = abs(np.log(other.values[name] / found.values[name]))
@@ -119,7 +119,7 @@ def test_commands_that_were_recorded_seldom_leave_more_unknown(commanded, monkey
 
 def test_steps_in_a_gap_of_the_commands_are_unknown(flown):
     flight = flown[2][0].flight
-    part, clock = measured(flight), np.arange(0.0, flight.duration, 0.01)
+    part, clock = steps_of(flight), np.arange(0.0, flight.duration, 0.01)
     kept = clock[(clock < 2.0) | (clock > 2.5)]
     left = without_gaps_of(Series(kept, np.ones((len(kept), 4))), part)
     inside = (part.time > 2.0) & (part.time < 2.5)
@@ -130,7 +130,7 @@ def test_steps_in_a_gap_of_the_commands_are_unknown(flown):
 
 def test_a_plain_regression_takes_the_answer_for_inertia(flown):
     racer, settings, recordings = flown
-    steps = [measured(r.flight) for r in recordings if not r.holdout]
+    steps = [steps_of(r.flight) for r in recordings if not r.holdout]
     for axis, name in enumerate(TILTING):
         matrix = np.concatenate([regressors(one, settings.vehicle)[axis] for one in steps])
         turning = np.concatenate([one.accelerations[:, 3 + axis] for one in steps])
@@ -182,7 +182,7 @@ def test_gaps_are_left_out(flown):
     rotors = flight.series["rotor_speed"]
     hole = (rotors.time > 3.0) & (rotors.time < 3.5)
     cut = Series(rotors.time[~hole], rotors.values[~hole])
-    steps = measured(replace(flight, series={**flight.series, "rotor_speed": cut}))
+    steps = steps_of(replace(flight, series={**flight.series, "rotor_speed": cut}))
     unknown = np.flatnonzero(~steps.known) * steps.step
     assert 0.4 < np.ptp(unknown) < 0.6
     assert steps.rotor_speed.min() > 0.0  # what is differentiated by them stays finite
@@ -199,6 +199,6 @@ def test_rotor_speeds_in_bursts_say_too_little(flown):
         burst = Series(rotors.time[kept], rotors.values[kept])
         series = {**recording.flight.series, "rotor_speed": burst}
         seldom.append(replace(recording, flight=replace(recording.flight, series=series)))
-    assert measured(seldom[0].flight) is None
+    assert steps_of(seldom[0].flight) is None
     job = job_of(settings, seldom)
     assert with_accelerations(job) == (job, ())
