@@ -141,14 +141,14 @@ def _measurement(
         remarks=(
             Remark("explained", {name: 100.0 * response.explained[name] for name in OUTPUTS}),
         ),
-        curves=tuple(_curve(response, output) for output in OUTPUTS),
+        curves=tuple(
+            Curve.of(
+                (title, "time, s", title.split(", ")[0]),
+                *((response.time, curve) for curve in response.curves[output]),
+            )
+            for output, title in TITLES.items()
+        ),
     )
-
-
-def _curve(response: Response, output: str) -> Curve:
-    measured, modelled = response.curves[output]
-    titles = (TITLES[output], "time, s", TITLES[output].split(", ")[0])
-    return Curve.of(titles, (response.time, measured), (response.time, modelled))
 
 
 def agreeing(
