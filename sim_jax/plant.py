@@ -261,6 +261,8 @@ class Plant(eqx.Module):
             offset: Int[Array, ""], carried: tuple[State, PerRotor]
         ) -> tuple[State, PerRotor]:
             before, command = carried
+            if self.reversible:  # what no step changes need not be remembered at every step
+                before = replaced(before, setpoints=state.setpoints, crash_time=state.crash_time)
             after = self.step(before, number * count + offset)
             return after, where(offset == 0, after.command, command)
 
@@ -285,7 +287,7 @@ class Plant(eqx.Module):
         def next_block(state: State, offset: Int[Array, ""]) -> tuple[State, Sample]:
             return self.block(state, number * count + offset)
 
-        state, rows = lax.scan(forgetful(next_block), state, jnp.arange(count))
+        state, rows = lax.scan(next_block, state, jnp.arange(count))
         return state, jax.tree.map(lambda leaf: leaf[0], rows)
 
 

@@ -24,6 +24,8 @@ from sim_jax.vehicle import Vehicle
 
 SECOND_LAG = "time_constant_second"
 """The effect of a second lag of the motors."""
+STRETCH = 100
+"""Physics steps from one state that reverse mode remembers to the next."""
 
 
 class Rollout(eqx.Module):
@@ -133,7 +135,7 @@ def rollout(
 ) -> Rollout:
     """Fly: one vehicle, or a batch along trailing axes of any leaf.
 
-    Reverse mode remembers the state at every tick and computes the steps between again.
+    Reverse mode remembers a state every `STRETCH`, and from it computes those of all steps again.
 
     Parameters
     ----------
@@ -182,8 +184,17 @@ def rollout(
         reversible=True,
     )
 
+    stretches = -(-samples // max(1, STRETCH * schedule.log_rate // schedule.physics_rate)) or 1
+    length = -(-samples // stretches)
+
     def sample(state: State, number: Int[Array, ""]) -> tuple[State, Sample]:
         return plant.sample(state, number)
 
-    state, log = lax.scan(forgetful(sample), first, jnp.arange(samples))
-    return Rollout(log, state.crash_time)
+    def stretch(state: State, numbers: Int[jax.Array, " length"]) -> tuple[State, Sample]:
+        return lax.scan(sample, state, numbers)
+
+    numbers = jnp.arange(stretches * length).reshape(stretches, length)
+    state, log = lax.scan(forgetful(stretch), first, numbers)
+    log = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:samples], log)
+    flown = state.crash_time <= samples / schedule.log_rate  # the last stretch may be longer
+    return Rollout(log, jnp.where(flown, state.crash_time, jnp.inf))

@@ -30,14 +30,14 @@ SAMPLES = 300
 POINTS = reference("circle", ticks=SAMPLES)
 
 
-def fly(craft: Vehicle, limits: Limits | None = None) -> Rollout:
+def fly(craft: Vehicle, limits: Limits | None = None, samples: int = SAMPLES) -> Rollout:
     return compiled_rollout(  # type: ignore[no-any-return]
         craft,
         controller(),
         Schedule(),
         ReferenceInlet(POINTS),
         at_first_point(vehicle(), POINTS),
-        samples=SAMPLES,
+        samples=samples,
         limits=limits,
     )
 
@@ -71,6 +71,8 @@ def test_a_vehicle_that_sinks_is_frozen_on_the_ground_at_the_right_time() -> Non
     assert apart(height[step + 2 :], height[-1]) == 0.0
     assert float(height[-1]) == pytest.approx(0.227, abs=0.03)
     assert apart(flown.log.rotor_speed[0][step + 2 :], flown.log.rotor_speed[0][-1]) == 0.0
+    assert bool(fly(with_motor_constants(WEAK), samples=step).crashed)
+    assert not bool(fly(with_motor_constants(WEAK), samples=step - 1).crashed)
 
 
 @pytest.mark.parametrize(
