@@ -23,6 +23,8 @@ from tuner.vehicle import COEFFICIENTS, scale_group, term_groups
 
 STEP = "step"
 """Simulated otherwise: half the physics step, controllers and log at their own rates."""
+LOGGED = "logged"
+"""Rotor speeds as a logger may have filtered them."""
 READINGS = "readings"
 """The battery's voltmeter read again, `DRAWS` times."""
 LACK = "lack"
@@ -386,6 +388,8 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
     }
     if STEP in moved:
         moved[STEP] = np.hypot(moved[STEP], lags * SIMULATORS_STEP / 2.0 / np.sqrt(3.0))
+    if LOGGED in moved:
+        moved[STEP] = np.hypot(moved[STEP], moved[LOGGED])
     drawn = [moves for name, moves in moved.items() if name.startswith(READINGS)]
     parts = {
         "noise": noise_alone(information),

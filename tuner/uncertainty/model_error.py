@@ -40,7 +40,7 @@ from tuner.objective.simulation import MOTION, SETPOINTS, SPEEDS, TURNED, Flown,
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
 from tuner.search.progress import Fitted
-from tuner.uncertainty.estimates import DRAWS, READINGS, STEP, Uncertainty
+from tuner.uncertainty.estimates import DRAWS, LOGGED, READINGS, STEP, Uncertainty
 from tuner.vehicle.model import Model
 
 MATTERS = 0.5
@@ -87,15 +87,12 @@ class Lack:
         rate = model.controller.rate
         for answer in self.answers:
             rate = _answering(rate, answer)
-        measured = dict(segments.measured)
-        if self.late and "rotor_speed" in measured:
-            speeds = measured["rotor_speed"]
-            measured["rotor_speed"] = eqx.tree_at(lambda m: m.time, speeds, speeds.time - self.late)
-        return replace(
+        pushed = replace(
             objective,
-            segments=replace(segments, disturbance=self.disturbance, measured=measured),
+            segments=replace(segments, disturbance=self.disturbance),
             model=eqx.tree_at(lambda m: m.controller.rate, model, rate),
         )
+        return _with_speeds_earlier(pushed, self.late) if self.late else pushed
 
 
 def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
@@ -190,7 +187,35 @@ def alternatives_of(
         return {}
     schedule = objective.schedule
     finer = replace(schedule, physics_rate=2 * schedule.physics_rate)
-    return {STEP: replace(objective, schedule=finer), **_read_again(objective, point, flights)}
+    return {
+        STEP: replace(objective, schedule=finer),
+        **_filtered_by_samples(objective),
+        **_read_again(objective, point, flights),
+    }
+
+
+def _filtered_by_samples(objective: Objective) -> dict[str, Objective]:
+    """Return the problem whose rotor speeds were filtered sample by sample, if it has their lag.
+
+    Such a filter is late by half a period of the log less than one of the same time constant that
+    is steady, and what was logged does not tell which it was: limits, of which the standard error
+    is the half-width over √3.
+    """
+    speeds = objective.segments.measured.get("rotor_speed")
+    if speeds is None or "tachometer_lag" not in objective.space.names:
+        return {}
+    apart = np.diff(np.asarray(speeds.time), axis=0)
+    late = 0.5 * float(np.median(apart[apart > 0.0])) / np.sqrt(3.0)
+    return {LOGGED: _with_speeds_earlier(objective, late)}
+
+
+def _with_speeds_earlier(objective: Objective, seconds: float) -> Objective:
+    """Return a problem whose rotor speeds were recorded so much earlier."""
+    measured = dict(objective.segments.measured)
+    if "rotor_speed" in measured:
+        speeds = measured["rotor_speed"]
+        measured["rotor_speed"] = eqx.tree_at(lambda m: m.time, speeds, speeds.time - seconds)
+    return replace(objective, segments=replace(objective.segments, measured=measured))
 
 
 def _read_again(

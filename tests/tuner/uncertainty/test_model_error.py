@@ -23,13 +23,16 @@ from tuner.config import JobFile
 from tuner.equation_error.omitted_laws import _likeliest
 from tuner.equation_error.rate_controller import Answer
 from tuner.findings.findings import Code
+from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.simulation import SETPOINTS
 from tuner.objective.space import space_of
 from tuner.recordings.flight import Flight, InitialState, Series
+from tuner.search.progress import Fitted
+from tuner.terms.candidates import with_terms
 from tuner.uncertainty.examination import examine
-from tuner.uncertainty.model_error import Lack, lack_found, lack_of
+from tuner.uncertainty.model_error import Lack, alternatives_of, lack_found, lack_of
 from tuner.vehicle import with_values
 from tuner.vehicle.model import model_of, schedule_of
 
@@ -154,11 +157,15 @@ def fit_of(
     measured, flights = flown(truth, seed)
     objective = problem(known or {}, sees_markers=sees_markers)
     objective = replace(objective, segments=replace(objective.segments, measured=measured))
-    fitted = making.fitted_of(objective, making.truth(objective))
-    names = [flight.name for flight in flights]
+    return fitted_at(objective, making.truth(objective), flights), flights
+
+
+def fitted_at(objective: Objective, point: Point, flights: list[Flight]) -> Fitted:
+    """Return a point of flights as a fit to their noise."""
+    fitted = making.fitted_of(objective, point)
     criterion = replace(fitted.criterion, scale={name: jnp.ones(FLIGHTS) for name in NOISE})
-    scales = {name: dict.fromkeys(NOISE, 1.0) for name in names}
-    return replace(fitted, criterion=criterion, scales=scales), flights
+    scales = {flight.name: dict.fromkeys(NOISE, 1.0) for flight in flights}
+    return replace(fitted, criterion=criterion, scales=scales)
 
 
 @pytest.mark.parametrize("gusts", [False, True], ids=["still", "gusts"])
@@ -219,6 +226,22 @@ def test_commands_stand_in_for_tachometers():
     assert lack_of(fitted, blind) is None
 
 
+def test_what_a_logger_filters_sample_by_sample_is_half_a_period_off():
+    objective = problem({"tachometer_lag": 0.008})
+    measured, flights = flown(objective, 0)
+    objective = replace(objective, segments=replace(objective.segments, measured=measured))
+    objective, point = with_terms(
+        objective, making.truth(objective), ("tachometer_lag",), JobFile()
+    )
+    numbers = objective.space.numbers(point.coefficients) | {"tachometer_lag": 0.008}
+    point = Point(objective.space.vector_of(numbers), point.offsets)
+    fitted = fitted_at(objective, point, flights)
+    known = examine(fitted, otherwise=alternatives_of(objective, fitted.point)).uncertainty
+    lag, inertia = (known.estimates[name] for name in ("tachometer_lag", "inertia_xx"))
+    assert lag.parts.step == pytest.approx(0.5 / RATE / np.sqrt(3.0), rel=0.2)
+    assert inertia.parts.step < 0.005 * inertia.value  # the lag takes it up
+
+
 def test_gains_that_were_found_fly_the_other_model():
     objective = problem({})
     found = (Answer("roll", "P", 1.05, 0.01), Answer("yaw", "I", 0.7, 0.01))
@@ -259,13 +282,7 @@ def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
     model = eqx.tree_at(lambda m: m.controller.rate.p, truth.model, p)
     measured, flights = flown(replace(truth, model=model), 0, loop=True)
     objective = replace(fitted_to, segments=replace(fitted_to.segments, measured=measured))
-    fitted = making.fitted_of(objective, making.truth(objective))
-    criterion = replace(fitted.criterion, scale={name: jnp.ones(FLIGHTS) for name in NOISE})
-    fitted = replace(
-        fitted,
-        criterion=criterion,
-        scales={flight.name: dict.fromkeys(NOISE, 1.0) for flight in flights},
-    )
+    fitted = fitted_at(objective, making.truth(objective), flights)
     lack = lack_of(fitted, flights)
     if factor == 1.0:
         assert lack is None
