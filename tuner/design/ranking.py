@@ -249,24 +249,25 @@ def rank_next_flights(
         Whose weights the recorded residuals have.
     """
     full_problem, found = examination.full_problem, candidates(arena)
-    flights = [*found.values()]
-    at_once = min(full_problem.objective.segments.count, len(flights))
+    flights, at_once = [*found.values()], full_problem.objective.segments.count
     kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
-    offsets_fitted = np.repeat(kinds[:, None], at_once, axis=1)
     gains, flown = [], []
-    for first in range(0, len(flights), at_once):
-        # the last ones again where too few are left: as many as the program was compiled for
-        some = [flights[min(first + i, len(flights) - 1)] for i in range(at_once)]
+    for first in range(0, len(flights), at_once):  # the memory of so many is had
+        some = flights[first : first + at_once]
         objective = candidate_problem(full_problem.objective, some, seconds=seconds)
         point = objective.start(full_problem.point.coefficients)
         scales = {
-            name: np.full(at_once, float(np.median(scale)))
+            name: np.full(len(some), float(np.median(scale)))
             for name, scale in criterion.scale.items()
         }
         weights = plain_criterion(objective, objective.samples, scales)
         jacobian = objective.jacobian(point, weights)
         information = information_at(
-            objective, point, weights, jacobian, offsets_fitted=offsets_fitted
+            objective,
+            point,
+            weights,
+            jacobian,
+            offsets_fitted=np.repeat(kinds[:, None], len(some), axis=1),
         )
         inside = _inside(objective, jacobian.residuals, arena)
         gains += list(information.blocks.sum(axis=(0, 2)))
@@ -291,7 +292,7 @@ def rank_next_flights(
             shrinks={name: _ratio(now, gain, names.index(name), count) for name in targets},
             volume=_volume(now, gain, count),
         )
-        for (flight, trajectory), gain, flies in zip(found.items(), gains, flown, strict=False)
+        for (flight, trajectory), gain, flies in zip(found.items(), gains, flown, strict=True)
         if flies
     ]
     rows.sort(key=lambda row: (row.mean, row.name))

@@ -223,7 +223,7 @@ def simulate(
     """
     check_mixer(vehicle)
     flown = vehicle, controller, trajectory, duration, rate, precision, forces
-    pieces = ((*piece, *flown) for piece in _chunks(grid or {}))
+    pieces = ((columns, *flown) for columns in _pieces(grid or {}))
     engine = current()
     here = isinstance(engine, Here)  # flights then need not be in memory all at once
     for flights in starmap(_flights, pieces) if here else engine.stream(_flown, pieces):
@@ -237,7 +237,6 @@ def _flown(piece: tuple[Any, ...], _report: Report) -> list[Simulation]:
 
 def _flights(  # noqa: PLR0917 (a piece travels as a tuple)
     columns: dict[str, Array],
-    wanted: int,
     vehicle: VehicleFile,
     controller: ControllerFile,
     trajectory: TrajectorySettings,
@@ -246,7 +245,7 @@ def _flights(  # noqa: PLR0917 (a piece travels as a tuple)
     precision: Precision,
     forces: bool,
 ) -> Iterator[Simulation]:
-    """Fly a piece of a grid, and yield as many of its flights as are wanted."""
+    """Fly a piece of a grid, and yield its flights."""
     clock = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
     fits = rate == round(rate) and round(controller.physics.rate) % rate == 0
     schedule = schedule_of(controller, log_rate=round(rate) if fits else None)
@@ -258,7 +257,7 @@ def _flights(  # noqa: PLR0917 (a piece travels as a tuple)
     model = model_of(vehicle, controller)
     fed = reference.inlet, reference.start
     logged, crashes = _logged((columns, model, *fed), schedule, samples, precision)
-    for segment in range(wanted):
+    for segment, crash in enumerate(crashes):
         signals = {
             name: resample(name, Series(log_time, values[segment]), clock)
             for name, values in logged.items()
@@ -268,23 +267,17 @@ def _flights(  # noqa: PLR0917 (a piece travels as a tuple)
         flight = Simulation(
             time=clock,
             signals=signals | sent,
-            crash_time=float(crashes[segment]) if np.isfinite(crashes[segment]) else None,
+            crash_time=float(crash) if np.isfinite(crash) else None,
             coefficients=coefficients,
         )
         yield _with_forces(flight, model) if forces else flight
 
 
-def _chunks(grid: Mapping[str, Array]) -> Iterator[tuple[dict[str, Array], int]]:
-    """Yield a grid in pieces of one size, the last filled up, and how many of each are wanted."""
+def _pieces(grid: Mapping[str, Array]) -> Iterator[dict[str, Array]]:
+    """Yield a grid in pieces of at most `CHUNK` vehicles."""
     count = len(next(iter(grid.values()))) if grid else 1
-    size = min(count, CHUNK)
-    for start in range(0, count, size):
-        piece = {name: np.asarray(column)[start : start + size] for name, column in grid.items()}
-        wanted = min(size, count - start)
-        yield (
-            {name: np.pad(column, (0, size - wanted), "edge") for name, column in piece.items()},
-            wanted,
-        )
+    for start in range(0, count, CHUNK):
+        yield {name: np.asarray(column)[start : start + CHUNK] for name, column in grid.items()}
 
 
 def _logged(

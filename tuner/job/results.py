@@ -349,7 +349,7 @@ MARGIN = 1.0
 """Length added to what the recorded flights took, to make an arena of it; m."""
 SHORTEST = 20.0
 """Length of a proposed flight, or twice, four times as long, whichever is nearest to the recorded
-ones, for each length is compiled anew; s. The publisher takes ten to wind up."""
+ones; s. The publisher takes ten to wind up."""
 
 
 def write_knowledge(folder: Path, job: Job, examination: Examination, fitted: Fitted) -> Knowledge:
