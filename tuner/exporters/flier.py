@@ -11,19 +11,19 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jax.experimental import io_callback
 
-from sim_jax.frames import estimated
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import SwitchedLag
-from sim_jax.numeric import Array as JaxArray
 from sim_jax.numeric import replaced
-from sim_jax.plant import Plant, Sample
+from sim_jax.plant import Plant
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
-from sim_jax.sensing import packed, push, switched
 from sim_jax.state import Limits, State
 from tuner.core.numerics import Array
 from tuner.objective.segments import Segments
@@ -71,7 +71,7 @@ def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
         start, inlet, environment = beginning_of(
             model, segments, schedule, states=states, conditions=conditions
         )
-        plant, state = begun(
+        own, state = begun(
             model.vehicle,
             model.controller,
             schedule,
@@ -80,79 +80,50 @@ def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
             environment=environment,
             limits=limits,
         )
-        per_block = schedule.steps_per_block
-        blocks = samples * schedule.blocks_per_sample
-        count = int(np.size(state.crash_time))
-        bodies = [make(schedule.step) for _ in range(count)]
         begin = state.motion
         parts = (begin.position, begin.velocity, begin.attitude, begin.body_rate)
         moving = np.concatenate([np.asarray(part.stacked()) for part in parts])
         turning = np.stack(state.rotor_speed)
+        bodies = [make(schedule.step) for _ in range(segments.count)]
         for number, body in enumerate(bodies):
             body.begin(moving[:, number], turning[:, number])
-        crash_time = np.full(count, np.inf)
-        log: list[dict[str, JaxArray]] = []
-        for block in range(blocks):
-            if block % schedule.blocks_per_sample == 0:
-                row = Sample(state.motion, state.rotor_speed, state.command, state.setpoints)
-            for step in range(block * per_block, (block + 1) * per_block):
-                at = jnp.asarray(step)
-                state, asked = _commanded(plant, state, at, step % per_block == 0)
-                if step % per_block == 0 and block % schedule.blocks_per_sample == 0:
-                    row = eqx.tree_at(lambda r: r.command, row, state.command)
-                    log.append(_logged(row, model, environment, conditions, channels))
-                wanted = np.asarray(asked)
-                moving, turning = moving.copy(), turning.copy()
-                for number, body in enumerate(bodies):
-                    if np.isinf(crash_time[number]):
-                        moving[:, number] = body.step(wanted[:, number])
-                        turning[:, number] = body.rotor_speed()
-                state = _moved(plant, state, moving, turning, at)
-            broken = np.asarray(limits.broken_by(state.motion))
-            now = (block + 1) / schedule.block_rate
-            crash_time = np.where(broken & np.isinf(crash_time), now, crash_time)
-            if not np.isinf(crash_time).any():
-                log += [log[-1]] * (samples - len(log))
-                break
-        stacked = {name: np.stack([np.asarray(row[name]) for row in log], 1) for name in channels}
-        return Flown(stacked, dict.fromkeys(channels), crash_time)
+
+        def turn(asked: Any, flies: Any) -> tuple[Array, Array]:
+            wanted = np.asarray(asked)
+            for number in np.flatnonzero(flies):
+                moving[:, number] = bodies[number].step(wanted[:, number])
+                turning[:, number] = bodies[number].rotor_speed()
+            return moving, turning
+
+        plant = _Elsewhere(**vars(own), turn=turn)
+
+        def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
+            after, row = plant.sample(state, number)
+            return after, recorded_of(row, model, environment, conditions, channels)
+
+        last, log = jax.jit(lambda: lax.scan(sample, state, jnp.arange(samples)))()
+        flown = {name: np.asarray(rows).swapaxes(0, 1) for name, rows in log.items()}
+        return Flown(flown, dict.fromkeys(channels), np.asarray(last.crash_time))
 
     return fly
 
 
-@eqx.filter_jit
-def _commanded(plant: Plant, state: State, step: Any, begins_block: bool) -> tuple[State, Any]:
-    """Return the state with its commands, and the rotor speeds that they ask for, (rotors, F)."""
-    if begins_block:
-        state = replaced(state, setpoints=plant.inlet.next_setpoints(plant, state, step))
-    state = plant.inlet.next_command(plant, state, step)
-    asked: Any = jnp.stack(state.reference_speed)
-    if state.reference_history is not None:
-        history = push(state.reference_history, asked, step)
-        state = replaced(state, reference_history=history)
-        assert isinstance(plant.lag, SwitchedLag)
-        age = plant.vehicle.setup.actuator_latency * plant.schedule.physics_rate
-        before, after = switched(history, step, age)
-        asked = plant.lag.share * before + (1.0 - plant.lag.share) * after
-    return state, asked
+class _Elsewhere(Plant):
+    """A plant whose physics is another simulator's."""
 
+    turn: Callable[..., tuple[Array, Array]] = eqx.field(static=True, kw_only=True)
+    """Asked rotor speeds (rotors, F), and which segments have not crashed (F,) -> states (13, F)
+    and rotor speeds (rotors, F) a step later."""
 
-@eqx.filter_jit
-def _moved(plant: Plant, state: State, rows: Any, speeds: Any, step: Any) -> State:
-    """Return the state with another motion, remembered for those who see it late."""
-    motion = Motion(Vec3(*rows[0:3]), Vec3(*rows[3:6]), Quaternion(*rows[6:10]), Vec3(*rows[10:13]))
-    state = replaced(state, motion=motion, rotor_speed=tuple(speeds))
-    if state.estimate_history is not None:
-        seen = estimated(plant.vehicle, plant.controller, motion)
-        history = push(state.estimate_history, packed(seen), step + 1)
-        state = replaced(state, estimate_history=history)
-    return state
-
-
-@eqx.filter_jit
-def _logged(
-    row: Sample, model: Model, environment: Any, conditions: Any, channels: tuple[str, ...]
-) -> dict[str, JaxArray]:
-    """Return channel -> (F, c)."""
-    logged: dict[str, JaxArray] = recorded_of(row, model, environment, conditions, channels)
-    return logged
+    def physics(self, state: State, step: Any) -> State:
+        """Return the state after one step of the other simulator."""
+        held = [jnp.stack(tuple(speeds)) for speeds in self._asked(state, step)]
+        share = self.lag.share if isinstance(self.lag, SwitchedLag) else 1.0
+        asked: Any = share * held[0] + (1.0 - share) * held[-1]
+        dtype, batch = asked.dtype, asked.shape[1:]
+        shapes = jax.ShapeDtypeStruct((13, *batch), dtype), jax.ShapeDtypeStruct(asked.shape, dtype)
+        rows, speeds = io_callback(self.turn, shapes, asked, jnp.isinf(state.crash_time))
+        motion = Motion(
+            Vec3(*rows[0:3]), Vec3(*rows[3:6]), Quaternion(*rows[6:10]), Vec3(*rows[10:13])
+        )
+        return replaced(state, motion=motion, rotor_speed=tuple(speeds))
