@@ -23,11 +23,12 @@ from tests import memory
 from tests.demo import demo
 from tests.memory import MOST_IN_A_MODULE, MOST_MEMORY
 from tuner.core.disk import cache_folder
-from tuner.core.runtime import collect_rarely
+from tuner.core.runtime import collect_rarely, keep_memory
 
 __all__ = ["demo"]
 
 collect_rarely()
+keep_memory()
 threadpool_limits(1, user_api="blas")
 KERNELS = cache_folder() / "kernels"
 """The program's own: commands that a test runs, in this process or another, find what it built."""
