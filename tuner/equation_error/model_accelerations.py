@@ -118,8 +118,9 @@ class ModelAccelerations:
             for number, (part, high, low) in enumerate(zip(flights, above, below, strict=True)):
                 span = 2.0 * SPEED_STEP * part.rotor_speed[::EVERY, rotor, None]
                 slope, by = (high[0] - low[0]) / span, (high[1] - low[1]) / span[..., None]
-                moved[number] += np.einsum("nak,nal->akl", by, by) / len(by)
-                crossed[number] += np.einsum("nak,na->ak", by, slope) / len(by)
+                by = by.swapaxes(0, 1)
+                moved[number] += by.mT @ by / len(slope)
+                crossed[number] += (by.mT @ slope.T[..., None])[..., 0] / len(slope)
         return tuple(map(Linear, flights, left, columns, moved, crossed))
 
     def _model(self, point: Array) -> Model:
