@@ -14,6 +14,7 @@ from statistics import fmean
 from types import MappingProxyType
 
 from sim_jax.constants import GRAVITY
+from tuner.core.errors import ExportError
 from tuner.vehicle import (
     COEFFICIENTS,
     REGISTRY,
@@ -296,9 +297,21 @@ def with_speeds_in(vehicle: VehicleFile, unit: float) -> VehicleFile:
 
 
 def _between_whole_speeds(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle whose commands go by a line between whole rad/s, in gz-sim's unit."""
+    """Return a vehicle whose commands go by a line between whole rad/s, in gz-sim's unit.
+
+    Commands below which rotors stand still are on the line, too.
+
+    Raises
+    ------
+    ExportError
+        The rotors turn too slowly for whole rad/s.
+    """
     unit = gz_unit(vehicle)
-    low, high = (round(unit * rotor_speed(vehicle, command)) / unit for command in (0.0, 1.0))
+    speeds = (max(rotor_speed(vehicle, command), 0.0) for command in (0.0, 1.0))
+    low, high = (round(unit * speed) / unit for speed in speeds)
+    if low == high:
+        what = f"has rotors of {low:g} to {high:g} rad/s, and gz-sim is told of whole rad/s"
+        raise ExportError(vehicle.name, what, "correct its motor")
     motor = vehicle.motor.replace(
         input_scaling=high - low, zero_position_armed=low, input_offset=0.0, quadratic=0.0
     )

@@ -36,6 +36,19 @@ def test_full_thrust_and_torque(vehicle):
     assert parameters(limited, SIH)["SIH_T_MAX"] == pytest.approx(14.5, rel=1e-6)
 
 
+def test_rotors_that_begin_above_no_command_stand_still_below(vehicle):
+    dead = vehicle.replace(motor=vehicle.motor.replace(input_offset=-0.2))
+    values = parameters(dead, GZ_SIM)
+    assert (values["SIM_GZ_EC_MIN1"], values["SIM_GZ_EC_MAX1"]) == (0, 860)
+    assert GZ_SIM.flown(GZ_SIM.flown(dead)) == GZ_SIM.flown(dead)
+
+
+def test_rotors_too_slow_for_whole_speeds_are_refused(vehicle):
+    slow = vehicle.replace(motor=vehicle.motor.replace(max_rotor_velocity=0.001))
+    with pytest.raises(ExportError, match="told of whole rad/s; correct its motor"):
+        parameters(slow, GZ_SIM)
+
+
 def test_the_simulation_in_hardware_gets_the_body(vehicle):
     values = parameters(vehicle, SIH)
     assert (values["SIH_MASS"], values["SIH_IXX"], values["SIH_IYY"], values["SIH_IZZ"]) == (
