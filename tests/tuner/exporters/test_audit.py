@@ -137,6 +137,22 @@ def test_what_has_no_hover_is_no_internal_error(mass, parameters, said, tmp_path
     assert said in "\n".join(audit(model, params).faults)
 
 
+@pytest.mark.parametrize(
+    ("pattern", "text", "said"),
+    [
+        (r"<ixx>[^<]*<", "<ixx>inf<", "no body has a moment of inertia of 0 kg m²"),
+        (r"<motorConstant>[^<]*<", "<motorConstant>nan<", "it has no motorConstant"),
+        (r"<mass>[^<]*<", "<mass>nan<", "has no mass that is a number; write it as one"),
+        (r"<pose>[^<]*<", "<pose>0 0 nan 0 0 0<", "has the pose '0 0 nan 0 0 0'; write six"),
+    ],
+)
+def test_what_is_not_finite_is_no_number(pattern, text, said, tmp_path, capsys):
+    model = tmp_path / "quad.sdf"
+    model.write_text(re.sub(pattern, text, GZ.read_text()))
+    main(["audit", str(model)])
+    assert said in "".join(capsys.readouterr())
+
+
 def test_coefficients_are_compared_with_a_runs(make_run, capsys):
     run = make_run()
     assert main(["audit", str(CLASSIC), "--run", str(run.folder), "--json"]) == 0

@@ -8,6 +8,7 @@ the model's own folder; what lies elsewhere is left as it stands.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -60,11 +61,12 @@ class Element:
 
     @property
     def number(self) -> float | None:
-        """The number that it holds, None if it holds something else."""
+        """The number that it holds, None if it holds something else, or none that is finite."""
         try:
-            return float(self.value)
+            number = float(self.value)
         except ValueError:
             return None
+        return number if math.isfinite(number) else None
 
     def all(self, tag: str) -> Iterator[Element]:
         """Yield every element of a tag inside, at any depth, in the order of the text."""
@@ -324,7 +326,7 @@ def pose_numbers(element: Element) -> list[float]:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = [0.0]
-    if len(numbers) not in (0, 6):
+    if len(numbers) not in (0, 6) or not all(map(math.isfinite, numbers)):
         what = f"has the pose '{' '.join(words)}'"
         raise ExportError(element.source.path, what, "write six numbers")
     return numbers
