@@ -89,6 +89,7 @@ OFFLINE = {
     "PIP_NO_DEPS": "1",
     "PIP_NO_BUILD_ISOLATION": "0",  # as pip reads it: without one
     "PIP_IGNORE_INSTALLED": "1",
+    "PIP_NO_COMPILE": "0",  # as pip reads it: none
     "PIP_QUIET": "1",
     "PIP_DISABLE_PIP_VERSION_CHECK": "1",
 }
