@@ -11,9 +11,9 @@ from sim_jax.frames import Markers, markers_of
 from sim_jax.geometry import Quaternion, Vec3, rotation
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rigid_body import Motion
-from sim_jax.rollout import rollout
 from sim_jax.state import Start, hover
 from tests.sim_jax.derivatives import assert_derivatives
+from tests.sim_jax.support import compiled_rollout
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
 from tuner.vehicle.model import model_of, schedule_of
 
@@ -93,7 +93,9 @@ def hovered(effects, *, sees_markers):
     start = hover(model.vehicle, Vec3.of(jnp.asarray([0.0, 0.0, 1.0])))
     schedule = schedule_of(file, log_rate=100)
     inlet = ReferenceInlet(ReferencePoint(point, still, still))
-    return rollout(model.vehicle, model.controller, schedule, inlet, start, samples=800).log
+    return compiled_rollout(
+        model.vehicle, model.controller, schedule, inlet, start, samples=800
+    ).log
 
 
 def test_who_sees_a_tilted_frame_hovers_level_and_away_from_where_it_is_sent():

@@ -11,13 +11,20 @@ from scipy.integrate import solve_ivp
 from sim_jax.environment import Air, Environment
 from sim_jax.motor import Lag, LagSlope, SwitchedLag
 from sim_jax.rigid_body import Motion, angular_acceleration
-from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import Tachometer
 from sim_jax.state import hover_speed
 from sim_jax.terms.rotor import lifting
 from sim_jax.terms.total import total_wrench, wrench_of_each_term
-from tests.sim_jax.support import controller, moving_start, quaternion, vec, vehicle, wobble
+from tests.sim_jax.support import (
+    compiled_rollout,
+    controller,
+    moving_start,
+    quaternion,
+    vec,
+    vehicle,
+    wobble,
+)
 from tuner.vehicle import REGISTRY
 
 CRAFT = vehicle()
@@ -232,7 +239,8 @@ def test_a_second_lag_of_nothing_changes_no_bit_of_a_flight_and_another_delays_i
         craft = with_effects(**effects)
         schedule = Schedule(log_rate=100, longest_actuator_latency=0.01)
         start = moving_start(craft)
-        log = rollout(craft, controller(), schedule, wobble(craft, 30), start, samples=30).log
+        inlet = wobble(craft, 30)
+        log = compiled_rollout(craft, controller(), schedule, inlet, start, samples=30).log
         return np.asarray(jnp.stack(log.rotor_speed))
 
     base = flown()
@@ -271,7 +279,8 @@ def test_late_tachometers_change_what_is_read_and_no_bit_of_the_flight():
         craft = with_effects(**effects)
         start = moving_start(craft)
         schedule = Schedule(log_rate=400)
-        return rollout(craft, controller(), schedule, wobble(craft, 60), start, samples=60).log
+        inlet = wobble(craft, 60)
+        return compiled_rollout(craft, controller(), schedule, inlet, start, samples=60).log
 
     true, late = (np.stack(flown(tachometer_lag=lag).read_speed) for lag in (0.0, 0.01))
     log = flown(tachometer_lag=0.01)
