@@ -7,14 +7,15 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer, field_validator
 
 from tuner.core.disk import exists
 from tuner.core.errors import InputError
 from tuner.core.files import FiniteOrNone, Part, ResultFile
+from tuner.core.yaml_section import refuse
 from tuner.design.proposals import LogProposal
 from tuner.evaluate.records import AxesRmse, PredictedErrors
-from tuner.findings.findings import Finding
+from tuner.findings.findings import Finding, one_line
 from tuner.uncertainty.records import ErrorParts, Sources
 from tuner.uncertainty.verdict import Reason, Verdict
 from tuner.uncertainty.verdict_texts import judgement_in_words
@@ -254,6 +255,17 @@ class RunResult(ResultFile):
     effective: EffectiveResult | None = None
     next_log: tuple[LogProposal, ...] = ()
     sources: dict[str, Sources] = Field(default_factory=dict)
+
+    @field_validator("findings")
+    @classmethod
+    def _can_be_worded(cls, findings: tuple[Finding, ...]) -> tuple[Finding, ...]:
+        for finding in findings:
+            try:
+                one_line(finding)
+            except (KeyError, IndexError, ValueError, TypeError):
+                what = f"finding '{finding.code.value}' lacks what its sentence needs"
+                raise refuse(what, "was it edited?") from None
+        return findings
 
 
 @dataclass(frozen=True)

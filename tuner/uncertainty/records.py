@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from tuner.core.disk import write_text
 from tuner.core.files import FiniteOrNone, Part, ResultFile, csv_text
+from tuner.core.yaml_section import refuse
 from tuner.evaluate.records import AxesRmse
 from tuner.uncertainty.verdict import Direction, Reason, Verdict
 
@@ -367,6 +368,21 @@ class Knowledge(ResultFile):
     correlation: list[list[float]]
     covariance: list[list[float]]
     information: list[list[float]]
+
+    @model_validator(mode="after")
+    def _hold_all_of_each_coefficient(self) -> Self:
+        outputs = self.outputs
+        for name in {name for output in outputs for name in output.change}:
+            known = self.coefficients.get(name)
+            if known is None or not all(
+                name in output.change
+                and name in output.rmse_up
+                and name in output.rmse_down
+                and output.flight in known.shares.get(output.channel, ())
+                for output in outputs
+            ):
+                raise refuse(f"lacks a part of what is known of {name}", "was it edited?")
+        return self
 
 
 SENSITIVITY_FILE = "sensitivity.csv"

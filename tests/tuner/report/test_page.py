@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -134,6 +135,20 @@ def test_a_damaged_file_is_named(report: Path, tmp_path: Path) -> None:
         (tmp_path / name).write_bytes((report.parent / name).read_bytes())
     (tmp_path / "sensitivity.json").write_text('{"schema_version": 2}')
     with pytest.raises(InputError, match=r"sensitivity\.json"):
+        render(tmp_path)
+
+
+def test_a_file_whose_parts_do_not_agree_is_named(tmp_path: Path) -> None:
+    making.write_run(tmp_path, FREE, ROLLING)
+    knowledge = json.loads((tmp_path / "sensitivity.json").read_text())
+    name = knowledge["outputs"][0]["change"].popitem()[0]
+    (tmp_path / "sensitivity.json").write_text(json.dumps(knowledge))
+    with pytest.raises(InputError, match=rf"sensitivity\.json: lacks .* known of {name}"):
+        render(tmp_path)
+    result = json.loads((tmp_path / "result.json").read_text())
+    result["findings"] = [{"code": "pose_gap", "level": "warning", "subject": "swing"}]
+    (tmp_path / "result.json").write_text(json.dumps(result))
+    with pytest.raises(InputError, match=r"result\.json: finding 'pose_gap' lacks"):
         render(tmp_path)
 
 
