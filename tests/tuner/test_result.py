@@ -35,11 +35,12 @@ def test_a_verdict_is_a_code_with_the_numbers_of_its_reason(make_run):  # noqa: 
 
 def test_findings_come_back_as_they_were(make_run):  # noqa: F811
     run = make_run()
-    finding = Finding(Code.SALVAGED, "warning", "circle", {"lost": 7, "start": 1.5}, ("x", ""))
+    numbers = {"far_off": 7, "flights": 9.0}
+    finding = Finding(Code.FLIGHTS_FAR_OFF, "warning", "circle", numbers, ("x", ""))
     run.result.model_copy(update={"findings": (finding,)}).write(run.folder)
     (again,) = read_run(run.folder).result.findings
     assert again == finding
-    assert repr(again.numbers["lost"]) == "7"
+    assert repr(again.numbers["far_off"]) == "7"
 
 
 @pytest.mark.parametrize(
