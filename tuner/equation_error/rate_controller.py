@@ -51,20 +51,22 @@ class Signals(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """How a gain differs from the file's.
+    """How a gain compares with the file's.
 
     ``part`` is of `PARTS`; ``value`` the gain over the file's, or s by which an axis answers its
-    gyro later than the file's filters and D let it; ``sd`` its standard error.
+    gyro later than the file's filters and D let it; ``sd`` its standard error; ``differs`` whether
+    they differ by more than chance.
     """
 
     axis: str
     part: str
     value: float
     sd: float
+    differs: bool
 
 
 def answers(recorded: Sequence[Signals], simulated: Sequence[Signals]) -> tuple[Answer, ...]:
-    """Return which gains differ by more than chance.
+    """Return how each gain that flights tell compares with the file's.
 
     Parameters
     ----------
@@ -75,10 +77,15 @@ def answers(recorded: Sequence[Signals], simulated: Sequence[Signals]) -> tuple[
     _share_lateness(known)
     told = sum(len(parts) for parts in known)
     return tuple(
-        Answer(name, part, one.value, one.sd)
+        Answer(
+            name,
+            part,
+            one.value,
+            one.sd,
+            one.is_sure(LEVEL / told) and abs(one.value - one.neutral) > SMALLEST[part],
+        )
         for name, parts in zip(AXES, known, strict=True)
         for part, one in parts.items()
-        if one.is_sure(LEVEL / told) and abs(one.value - one.neutral) > SMALLEST[part]
     )
 
 

@@ -24,7 +24,7 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected, candidate_groups, groups_around, groups_named, start_of
 from tuner.terms.selection import Selection
-from tuner.uncertainty.model_error import lack_of
+from tuner.uncertainty.model_error import GAINS, lack_of
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.selection_table import Groups, SelectionCode
 
@@ -34,8 +34,6 @@ LEAST_TILT = 3e-3
 """rad of tilt in hover below which markers are not freed for it."""
 SIGNIFICANT = 3.0
 """Standard errors, over the flights, by which the tilt exceeds zero."""
-GAINS = {"rate_gain_roll_pitch": ("roll", "pitch"), "rate_gain_yaw": ("yaw",)}
-"""Coefficient -> axes of the rate controller whose gains it scales."""
 SAME_GAIN = 0.02
 """Share of a gain within which it is the file's."""
 FILES_GAINS = "Recorded commands have the file's gains: fitting again without {}."

@@ -128,9 +128,11 @@ def examine(
             objective.space.names,
             len(full_problem.fitted),
         )
-    if in_doubt:
-        moves = [in_doubt.get(name, 0.0) for name in objective.space.names]
-        information = replace(information, in_doubt=np.array(moves))
+    gains = {} if lack is None else lack.gains
+    if in_doubt or gains:
+        moves = np.array([in_doubt.get(name, 0.0) for name in objective.space.names])
+        apart = np.array([gains.get(name, 0.0) for name in objective.space.names]) * reference
+        information = replace(information, in_doubt=np.hypot(moves, apart))
     searched = set(full_problem.fitted) - set(fitted.held.values()) if at_minimum else set[str]()
     information = information.resting(at_rest(objective.space, point, searched))
     information = replace(information, astray=astray)

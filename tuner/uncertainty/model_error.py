@@ -9,7 +9,7 @@ file (`tuner.equation_error.rate_controller`) flies them so.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
@@ -57,6 +57,10 @@ SMALLEST = 0.03
 """Share of what varies along an axis below which a law is none to speak of."""
 
 
+GAINS = {"rate_gain_roll_pitch": ("roll", "pitch"), "rate_gain_yaw": ("yaw",)}
+"""Coefficient -> axes of the rate controller whose gains it scales."""
+
+
 @dataclass(frozen=True)
 class Lack:
     """What the model of a fit lacks.
@@ -71,12 +75,21 @@ class Lack:
         Which of the rate controller's gains are not the file's.
     late
         s by which recorded rotor speeds come after the turning that they make; zero for not.
+    gains
+        Fitted coefficient of `GAINS` -> share by which recorded commands put it elsewhere, chance
+        apart.
     """
 
     laws: tuple[Law, ...]
     disturbance: Disturbance | None
     answers: tuple[Answer, ...] = ()
     late: float = 0.0
+    gains: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def is_none(self) -> bool:
+        """Whether there is nothing to say or to widen."""
+        return not (self.laws or self.answers or self.late or self.gains)
 
     def acting_on(self, objective: Objective) -> Objective:
         """Return a problem whose simulated flights it pushes, and whose gains are those found.
@@ -141,19 +154,27 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         channels=(*_CHANNELS, MOTION, TURNED, SETPOINTS),
     )
     rate = float(schedule.log_rate)
-    heard = _heard(flights, flown, model.controller.mixer, rate)
+    told = _heard(flights, flown, model.controller.mixer, rate)
+    heard = tuple(answer for answer in told if answer.differs)
+    apart = {
+        name: apart
+        for name in set(GAINS) & set(objective.space.names)
+        if (apart := _apart(name, told)) > 0.0
+    }
     pairs = {
         number: Pair(one, _simulated(one, flown.channels, conditions, number, rate), by_command)
         for number, (one, by_command) in enumerate(zip(read, driven, strict=True))
         if one is not None and not np.isfinite(flown.crash_time[number])
     }
     if not pairs:
-        return Lack((), None, heard) if heard else None
+        lack = Lack((), None, heard, gains=apart)
+        return None if lack.is_none else lack
     scaled = np.asarray(objective.space.scaled(point.coefficients))
     parameters = objective.space.parameters
     found = unexplained(model, parameters, scaled, tuple(pairs.values()))
     if not found.laws:
-        return Lack((), None, heard, found.late) if heard or found.late else None
+        lack = Lack((), None, heard, found.late, apart)
+        return None if lack.is_none else lack
     body = model.vehicle.body
     by = np.array([*[body.mass] * 3, body.inertia_xx, body.inertia_yy, body.inertia_zz], float)
     ticks = np.arange(objective.samples + 2) / rate
@@ -166,7 +187,18 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         for axis, column in enumerate(acting.T):
             pushes[axis, :, number] = np.interp(ticks, one.time, column)
     force, moment = (Vec3(*map(jnp.asarray, rows)) for rows in (pushes[:3], pushes[3:]))
-    return Lack(found.laws, Disturbance(force=force, moment=moment, rate=rate), heard, found.late)
+    pushed = Disturbance(force=force, moment=moment, rate=rate)
+    return Lack(found.laws, pushed, heard, found.late, apart)
+
+
+def _apart(name: str, told: Sequence[Answer]) -> float:
+    """Return by which share recorded commands put a coefficient of `GAINS` elsewhere than a fit."""
+    those = [one for one in told if one.part == "P" and one.axis in GAINS[name]]
+    weights = np.array([one.sd**-2.0 for one in those])
+    if not those:
+        return 0.0
+    found = float(np.average([one.value for one in those], weights=weights))
+    return float(np.sqrt(max((found - 1.0) ** 2 - 1.0 / weights.sum(), 0.0)))
 
 
 def alternatives_of(
@@ -306,7 +338,7 @@ def _answering(gains: RateGains, answer: Answer) -> RateGains:
 def _heard(
     flights: Sequence[Flight], flown: Flown, mixer: MixerSettings, rate: float
 ) -> tuple[Answer, ...]:
-    """Return how the rate controllers of recorded flights answer otherwise than the fit's."""
+    """Return how the rate controllers of recorded flights answer, beside those of the fit's."""
     recorded, simulated = [], []
     for number, flight in enumerate(flights):
         series = flight.series

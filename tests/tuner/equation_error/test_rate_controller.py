@@ -36,7 +36,8 @@ def flight(random, *, p=P_GAIN, i=I_GAIN, d=D_GAIN, late=0.0, gusts=0.0, noise=0
 def told(seed, d=D_GAIN, **changed):
     random = np.random.default_rng(seed)
     simulated = [flight(random, d=d)]
-    return answers([flight(random, d=d, gusts=0.2, noise=0.01, **changed)], simulated)
+    found = answers([flight(random, d=d, gusts=0.2, noise=0.01, **changed)], simulated)
+    return [answer for answer in found if answer.differs]
 
 
 @pytest.mark.parametrize(
@@ -81,4 +82,4 @@ def test_one_step_of_a_set_point_tells_nothing():
             np.interp(time - 0.004, time, torque[:, 0])[:, None].repeat(3, 1),
         )
 
-    assert answers([flown(0.1)], [flown(0.12)]) == ()
+    assert not any(answer.differs for answer in answers([flown(0.1)], [flown(0.12)]))

@@ -70,12 +70,13 @@ def problem(
     *,
     random: np.random.Generator | None = None,
     sees_markers: bool = False,
+    free: tuple[str, ...] = FREE,
 ) -> Objective:
     """Return the problem of a vehicle with some effects, in gusts where they are drawn."""
     vehicle, controller = with_values(making.vehicle_file(), effects), making.controller_file()
     sensing = controller.sensing.replace(sees_markers=sees_markers)
     controller = controller.replace(sensing=sensing)
-    space = space_of(vehicle, controller, JobFile(free=FREE))
+    space = space_of(vehicle, controller, JobFile(free=free))
     model = model_of(vehicle, controller)
     schedule = schedule_of(controller, log_rate=RATE)
     at_rest = Vec3(jnp.zeros(FLIGHTS), jnp.zeros(FLIGHTS), jnp.ones(FLIGHTS))
@@ -244,8 +245,8 @@ def test_what_a_logger_filters_sample_by_sample_is_half_a_period_off():
 
 def test_gains_that_were_found_fly_the_other_model():
     objective = problem({})
-    found = (Answer("roll", "P", 1.05, 0.01), Answer("yaw", "I", 0.7, 0.01))
-    late = Answer("pitch", "late", 2e-3, 1e-4)
+    found = (Answer("roll", "P", 1.05, 0.01, True), Answer("yaw", "I", 0.7, 0.01, True))
+    late = Answer("pitch", "late", 2e-3, 1e-4, True)
     before = objective.model.controller.rate
     other = Lack((), None, (*found, late)).acting_on(objective)
     rate = other.model.controller.rate
@@ -259,7 +260,7 @@ def test_gains_that_were_found_fly_the_other_model():
 @pytest.mark.parametrize(("late", "said"), [(1e-3, False), (-2e-3, True)])
 def test_lateness_within_a_period_of_the_loop_is_not_said(late, said):
     """Stamps do not tell when in a period a sample was taken."""
-    lack = Lack((), None, (Answer("roll", "late", late, 1e-4),))
+    lack = Lack((), None, (Answer("roll", "late", late, 1e-4, True),))
     assert bool(lack_found(lack, SimpleNamespace(estimates={}))) is said
 
 
@@ -297,6 +298,21 @@ def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
         assert parts.lack > parts.noise
     said = lack_found(examination.lack, examination.uncertainty)
     assert said[0].code is Code.CONTROLLER_ANSWERS
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.98])
+def test_the_interval_of_a_gain_holds_the_one_of_recorded_commands(gain):
+    name = "rate_gain_roll_pitch"
+    measured, flights = flown(problem({}), 0, loop=True)
+    objective = problem({name: gain}, free=(*FREE, name))
+    objective = replace(objective, segments=replace(objective.segments, measured=measured))
+    fitted = fitted_at(objective, making.truth(objective), flights)
+    lack = lack_of(fitted, flights)
+    apart = 0.0 if lack is None else lack.gains.get(name, 0.0)
+    assert apart == pytest.approx(1.0 / gain - 1.0, abs=0.006)
+    known = examine(fitted, lack=lack).uncertainty.estimates[name]
+    assert (known.parts.terms or 0.0) == pytest.approx(apart * gain)
+    assert known.std_error >= apart * gain
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.012])
