@@ -74,7 +74,7 @@ def _summary(
         lines.append(flights_table(found.checks[:MOST_FLIGHTS]))
     lines += _warnings(result)
     end = [Text(line) for line in (*_rest(result), *_written(folder, exports, seconds))]
-    words, command = next_step(result, found, folder)
+    words, command = next_step(result, found, folder, exports)
     end.append(Text(f"Next: {words} {command}"))
     taken = sum(1 + len(line.rows) if isinstance(line, Table) else 1 for line in (*lines, *end))
     return [*lines, *_coefficients(result, max(LINES - taken - 1, LEAST_COEFFICIENTS)), *end]

@@ -132,7 +132,7 @@ def holding_better(finding: Finding) -> str:
         ]
     )
     return (
-        f"That it stays as it is predicts better: {numbers['seconds']:g} s ahead the fitted "
+        f"Holding its state predicts better {numbers['seconds']:g} s ahead: the fitted "
         f"coefficients miss {lost} in the mean."
     )
 

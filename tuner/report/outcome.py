@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from tuner.core.phrases import listed, listed_within
+from tuner.core.phrases import as_sentence, listed, listed_within
 from tuner.findings.findings import Code, Finding, remedy, sentence
 from tuner.ground.bench_json import BenchRecord, bench_in_words
 from tuner.report.result_texts import metres, simulator_lacks
 from tuner.report.section import Cell, Table
-from tuner.result import FlightResult, RunResult
+from tuner.result import ExportRecord, FlightResult, RunResult
 from tuner.uncertainty.records import Knowledge
 from tuner.uncertainty.verdict import Verdict
 from tuner.uncertainty.verdict_texts import verdict_in_words
@@ -149,8 +149,16 @@ def warnings_of(findings: Sequence[Finding]) -> list[Cell]:
     return [Cell(sentence(f), small=remedy(f), look=f.level, link=f.subject) for f in found]
 
 
-def next_step(result: RunResult, found: Outcome, folder: Path) -> tuple[str, str]:
-    """Return what to do next with a fit: in words, and the command."""
+def next_step(
+    result: RunResult, found: Outcome, folder: Path, exports: Sequence[ExportRecord] = ()
+) -> tuple[str, str]:
+    """Return what to do next with a fit: in words, and the command.
+
+    Parameters
+    ----------
+    exports
+        What was asked for; where all were refused, why comes first.
+    """
     name = shlex.quote(str(folder))
     doubts = [warning for warning in warnings_of(result.findings) if warning.small]
     if found.usability is Usability.UNUSABLE:
@@ -160,6 +168,10 @@ def next_step(result: RunResult, found: Outcome, folder: Path) -> tuple[str, str
         return "Hold a flight out, which then checks the fit.", f"tune ... --holdout {flight}"
     if not found.flights:
         return "Fit flights from it.", f"tune --flights FLIGHT... --bench {name}"
+    refused = [one.refused for one in exports if one.refused]
+    if refused and len(refused) == len(exports):
+        why = refused[0].partition(": ")[2].partition("; ")[0]
+        return as_sentence(why), f"tune report {name} --open"
     return "Put it into your model.", f"tune export {name} --format sdf --into model.sdf"
 
 

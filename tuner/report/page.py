@@ -122,7 +122,9 @@ def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
         about=contents.about,
         outcome=found,
         checks=flights_table(found.checks if found else ()),
-        next=next_step(run.result, found, contents.folder) if run and found else None,
+        next=next_step(run.result, found, contents.folder, contents.exports)
+        if run and found
+        else None,
         said=_said(contents),
         warnings=warnings_of(contents.about.findings),
         exports=contents.exports,

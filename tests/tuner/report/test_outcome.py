@@ -8,6 +8,7 @@ from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.evaluate.records import AxesRmse
 from tuner.findings.findings import Code, Finding
 from tuner.report.outcome import Usability, counted, next_step, outcome, warnings_of
+from tuner.result import ExportRecord
 from tuner.uncertainty.verdict import Verdict
 
 CRASHED = AxesRmse(x=None, y=None, z=None, roll=None, pitch=None, yaw=None)
@@ -88,6 +89,18 @@ def test_what_nothing_checks_or_something_doubts_is_used_with_care(result, tmp_p
     assert outcome(doubted).usability is Usability.WITH_CARE
     gap = noticing(result, Finding(Code.POSE_GAP, "warning", "checks", {"seconds": 0.2}))
     assert outcome(gap).usability is Usability.USABLE
+
+
+def test_where_every_export_was_refused_the_next_step_is_why(result, tmp_path):
+    why = f"{tmp_path}: its numbers are not fit to export: mass 2 is its lower bound; fit again"
+    refused, written = (
+        ExportRecord(format="sdf", refused=why),
+        ExportRecord(format="yaml", file="a"),
+    )
+    words, command = next_step(result, outcome(result), tmp_path, (refused,))
+    assert words == "Its numbers are not fit to export: mass 2 is its lower bound."
+    assert command.startswith("tune report")
+    assert next_step(result, outcome(result), tmp_path, (refused, written))[0].startswith("Put")
 
 
 def test_what_doubts_the_numbers_comes_before_what_does_not():
