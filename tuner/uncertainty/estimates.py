@@ -28,6 +28,10 @@ LOGGED = "logged"
 READINGS = "readings"
 """The battery's voltmeter read again, `DRAWS` times."""
 LACK = "lack"
+LIMIT = "limit"
+LIMIT_STEP, LIMIT_SD = 0.01, 0.25
+"""Share by which the rotors' limit is lowered to see what it moves, and to which it is known where
+nothing recorded tells rotor speeds: a vehicle file has a nominal one."""
 """With what pushes the flights along and is none of the model."""
 DRAWS = 6
 """How many times: an error that is told by so many is told to a third."""
@@ -399,6 +403,7 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
         "step": moved.get(STEP),
         "readings": STUDENT_FACTOR * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None,
         "lack": moved.get(LACK),
+        "limit": moved[LIMIT] * LIMIT_SD / LIMIT_STEP if LIMIT in moved else None,
         "search": np.abs(inverse.matrix @ information.slope),
     }
     return {name: part for name, part in parts.items() if part is not None}

@@ -22,7 +22,7 @@ from sim_jax.control.mixer import torque_of
 from sim_jax.environment import Disturbance, Environment
 from sim_jax.frames import markers_of
 from sim_jax.geometry import Quaternion, Vec3
-from sim_jax.inlet import ReferenceInlet
+from sim_jax.inlet import ReferenceInlet, RotorSpeedInlet
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
@@ -40,7 +40,15 @@ from tuner.objective.simulation import MOTION, SETPOINTS, SPEEDS, TURNED, Flown,
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
 from tuner.search.progress import Fitted
-from tuner.uncertainty.estimates import DRAWS, LOGGED, READINGS, STEP, Uncertainty
+from tuner.uncertainty.estimates import (
+    DRAWS,
+    LIMIT,
+    LIMIT_STEP,
+    LOGGED,
+    READINGS,
+    STEP,
+    Uncertainty,
+)
 from tuner.vehicle.model import Model
 
 MATTERS = 0.5
@@ -215,15 +223,31 @@ def alternatives_of(
         Those that are flown whole in it, to have their voltmeters read again where the fit has a
         battery; none for a fit in which that is not asked.
     """
+    limited = _limited(objective)
     if not isinstance(objective.segments.inlet, ReferenceInlet):
-        return {}
+        return limited
     schedule = objective.schedule
     finer = replace(schedule, physics_rate=2 * schedule.physics_rate)
     return {
         STEP: replace(objective, schedule=finer),
+        **limited,
         **_filtered_by_samples(objective),
         **_read_again(objective, point, flights),
     }
+
+
+def _limited(objective: Objective) -> dict[str, Objective]:
+    """Return the problem whose rotors reach less speed, if nothing recorded tells rotor speeds.
+
+    Thrust and drag tell rotors that turn faster from ones that give more by nothing but their
+    limit.
+    """
+    segments, model = objective.segments, objective.model
+    if "rotor_speed" in segments.measured or isinstance(segments.inlet, RotorSpeedInlet):
+        return {}
+    lower = (1.0 - LIMIT_STEP) * model.vehicle.motor.max_rotor_velocity
+    limited = eqx.tree_at(lambda m: m.vehicle.motor.max_rotor_velocity, model, lower)
+    return {LIMIT: replace(objective, model=limited)}
 
 
 def _filtered_by_samples(objective: Objective) -> dict[str, Objective]:

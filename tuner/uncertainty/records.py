@@ -46,6 +46,9 @@ class ErrorParts(Part):
         None where none was found.
     search
         How far one more linear step would move it: a search ends where its steps gain nothing.
+    limit
+        How far it would move were the rotors' limit, ``max_rotor_velocity``, a quarter off; None
+        where rotor speeds were recorded.
     astray
         The standard deviation of its prior, where the fitted vehicle crashes on a fitted flight,
         or flies most of them otherwise than they were recorded; None where it does not.
@@ -59,6 +62,7 @@ class ErrorParts(Part):
     readings: FiniteOrNone = None
     lack: FiniteOrNone = None
     search: FiniteOrNone = None
+    limit: FiniteOrNone = None
     astray: FiniteOrNone = None
 
 

@@ -78,6 +78,7 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
         "voltmeter": parts.readings,
         "what the model lacks": parts.lack,
         "rest of the search": parts.search,
+        "the rotors' limit": parts.limit,
         "a vehicle that flies otherwise": parts.astray,
     }
     least = NEGLIGIBLE * max(error or 0.0 for error in named.values())

@@ -243,6 +243,31 @@ def test_what_a_logger_filters_sample_by_sample_is_half_a_period_off():
     assert inertia.parts.step < 0.005 * inertia.value  # the lag takes it up
 
 
+def test_rotors_whose_speed_nothing_tells_are_known_as_well_as_their_limit():
+    """Twice as fast, with a quarter of the motor constant and twice the limit, flies alike."""
+    truth = problem({}, free=(*FREE, "zero_position_armed"))
+    fastest = np.asarray(flown(truth, 0)[0]["rotor_speed"].values).max()
+    limited = eqx.tree_at(
+        lambda m: m.vehicle.motor.max_rotor_velocity, truth.model, jnp.asarray(0.97 * fastest)
+    )
+    truth = replace(truth, model=limited)
+    measured, flights = flown(truth, 0)
+
+    def known(measured):
+        objective = replace(truth, segments=replace(truth.segments, measured=measured))
+        fitted = fitted_at(objective, making.truth(objective), flights)
+        return examine(fitted, otherwise=alternatives_of(objective, fitted.point)).uncertainty
+
+    told = known(measured).estimates["motor_constant"]
+    assert told.parts.limit is None
+    assert told.std_error < 0.01 * told.value
+    silent = known({name: m for name, m in measured.items() if name != "rotor_speed"})
+    for name, power in (("motor_constant", 2.0), ("input_scaling", 1.0)):
+        estimate = silent.estimates[name]
+        assert estimate.parts.limit == pytest.approx(0.25 * power * estimate.value, rel=0.3)
+        assert estimate.std_error >= estimate.parts.limit
+
+
 def test_gains_that_were_found_fly_the_other_model():
     objective = problem({})
     found = (Answer("roll", "P", 1.05, 0.01, True), Answer("yaw", "I", 0.7, 0.01, True))
