@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim_jax.constants import GRAVITY
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
+from tuner.config.job import InletName
 from tuner.core.numerics import Array
 from tuner.objective.inlets import MISSED, linear_interpolation, zero_order_hold
 from tuner.objective.noise import white_noise
@@ -189,6 +190,21 @@ def read_commands(
         commands.append(every)
         coarser.append(second)
     return tuple(steps), (tuple(commands), tuple(coarser))
+
+
+def steps_fed(
+    inlet: InletName, model: Model, flights: Sequence[tuple[Flight, float]], rate: float
+) -> tuple[tuple[Steps, ...], tuple[Commands, ...]] | None:
+    """Return the steps of flights that enter by an inlet, and as `read_commands` what drives them.
+
+    None where neither rotor speeds nor commands are fed in, or a flight says too little. Parameters
+    are those of `read_commands`.
+    """
+    if inlet == "rotor_speed":
+        parts = [steps_of(flight, input_late=late) for flight, late in flights]
+        known = tuple(part for part in parts if part is not None)
+        return (known, ()) if len(known) == len(parts) else None
+    return read_commands(model, flights, rate) if inlet == "actuator" else None
 
 
 def rotor_response(model: Model, command: Series) -> Series:

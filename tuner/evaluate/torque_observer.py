@@ -21,7 +21,7 @@ from sim_jax.geometry import Vec3
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
 from tuner.equation_error.model_accelerations import ModelAccelerations
-from tuner.equation_error.recorded_accelerations import Steps, read_commands, steps_of
+from tuner.equation_error.recorded_accelerations import Steps, steps_fed
 from tuner.objective.battery import with_reference_voltage
 from tuner.recordings.flight import Flight
 from tuner.vehicle import ControllerFile, VehicleFile
@@ -108,16 +108,11 @@ def _unseen(
     Zero where it is unknown. None where rotors do not turn the vehicle, or too little is known.
     """
     flight, inlet, late = fed
-    if inlet not in FED:
+    model = model_of(with_reference_voltage(vehicle, [flight]), controller)
+    rate = float(schedule_of(controller).rate_control_rate)
+    found = steps_fed(inlet, model, [(flight, late)], rate)
+    if found is None:
         return None
-    model, part = model_of(with_reference_voltage(vehicle, [flight]), controller), None
-    if inlet == "rotor_speed":
-        part = steps_of(flight, input_late=late)
-    else:
-        rate = float(schedule_of(controller).rate_control_rate)
-        driven = read_commands(model, [(flight, late)], rate)
-        part = None if driven is None else driven[0][0]
-    if part is None:
-        return None
+    (part,) = found[0]
     (one,) = ModelAccelerations(model, (), (part,)).noiseless.at(np.zeros(0))
     return part, np.where(part.known[:, None], np.nan_to_num(one.left[:, 3:]), 0.0)

@@ -15,12 +15,7 @@ import numpy as np
 from tuner.core.errors import ConfigError
 from tuner.equation_error.estimate import GAINS, Estimate, estimate
 from tuner.equation_error.model_accelerations import moves_rotors
-from tuner.equation_error.recorded_accelerations import (
-    Commands,
-    Steps,
-    read_commands,
-    steps_of,
-)
+from tuner.equation_error.recorded_accelerations import steps_fed
 from tuner.findings.findings import Code, Finding
 from tuner.objective.space import extended
 from tuner.search.problem import Job, job_of
@@ -46,7 +41,9 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     free_choice = own.terms == "auto" and own.free is None and own.search.criterion != "output"
     if not free_choice or len(set(job.inlets)) > 1:
         return job, ()
-    steps = _steps(job)
+    fitted = [(r.flight, r.input_late) for r in job.recordings if not r.holdout]
+    rate = float(job.objective.schedule.rate_control_rate)
+    steps = steps_fed(job.inlets[0], job.objective.model, fitted, rate)
     if steps is None:
         return job, ()
     candidates = dict(candidate_groups(job))
@@ -61,23 +58,6 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
         return job, ()
     begun = _begun(job, found)
     return (job, ()) if begun is None else (begun, (_finding(found),))
-
-
-def _steps(job: Job) -> tuple[tuple[Steps, ...], tuple[Commands, ...]] | None:
-    """Return the steps of the fitted flights, with commands where these turn the rotors.
-
-    None where they say too little.
-    """
-    fitted = [(r.flight, r.input_late) for r in job.recordings if not r.holdout]
-    if job.inlets[0] == "rotor_speed":
-        parts = [steps_of(flight, input_late=late) for flight, late in fitted]
-        known = tuple(part for part in parts if part is not None)
-        return (known, ()) if len(known) == len(parts) else None
-    if job.inlets[0] != "actuator":
-        return None
-    return read_commands(
-        job.objective.model, fitted, float(job.objective.schedule.rate_control_rate)
-    )
 
 
 def _begun(job: Job, found: Estimate) -> Job | None:

@@ -24,7 +24,7 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected, candidate_groups, groups_around, groups_named, start_of
 from tuner.terms.selection import Selection
-from tuner.uncertainty.model_error import GAINS, lack_of
+from tuner.uncertainty.model_error import GAINS, gain_told, lack_of
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.selection_table import Groups, SelectionCode
 
@@ -169,15 +169,11 @@ def refuted_by_commands(selected: Selected, fitted: Fitted) -> tuple[str, ...]:
     kept = {row.group: row.names for row in selected.rows if row.kept and row.names[0] in GAINS}
     if not kept or (lack := lack_of(fitted, selected.job.fitted)) is None:
         return ()
-    heard = {one.axis: one for one in lack.answers if one.part == "P"}
     numbers = fitted.objective.space.numbers(fitted.point.coefficients)
 
     def are_files(name: str) -> bool:
-        those = [heard[axis] for axis in GAINS[name] if axis in heard]
-        if len(those) < len(GAINS[name]):
-            return False
-        of_fit = np.average([one.value for one in those], weights=[one.sd**-2.0 for one in those])
-        return bool(abs(numbers[name] * of_fit - 1.0) < SAME_GAIN)
+        told = gain_told(name, lack.answers)
+        return told is not None and abs(numbers[name] * told[0] - 1.0) < SAME_GAIN
 
     return tuple(group for group, names in kept.items() if any(map(are_files, names)))
 

@@ -95,9 +95,9 @@ class Lack:
     gains: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def is_none(self) -> bool:
-        """Whether there is nothing to say or to widen."""
-        return not (self.laws or self.answers or self.late or self.gains)
+    def or_none(self) -> Lack | None:
+        """None if there is nothing to say or to widen."""
+        return self if self.laws or self.answers or self.late or self.gains else None
 
     def acting_on(self, objective: Objective) -> Objective:
         """Return a problem whose simulated flights it pushes, and whose gains are those found.
@@ -164,25 +164,22 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
     rate = float(schedule.log_rate)
     told = _heard(flights, flown, model.controller.mixer, rate)
     heard = tuple(answer for answer in told if answer.differs)
-    apart = {
-        name: apart
-        for name in set(GAINS) & set(objective.space.names)
-        if (apart := _apart(name, told)) > 0.0
-    }
+    apart = {}
+    for name in set(GAINS) & set(objective.space.names):
+        if (gain := gain_told(name, told)) is not None and abs(gain[0] - 1.0) > gain[1]:
+            apart[name] = float(np.sqrt((gain[0] - 1.0) ** 2 - gain[1] ** 2))
     pairs = {
         number: Pair(one, _simulated(one, flown.channels, conditions, number, rate), by_command)
         for number, (one, by_command) in enumerate(zip(read, driven, strict=True))
         if one is not None and not np.isfinite(flown.crash_time[number])
     }
     if not pairs:
-        lack = Lack((), None, heard, gains=apart)
-        return None if lack.is_none else lack
+        return Lack((), None, heard, gains=apart).or_none
     scaled = np.asarray(objective.space.scaled(point.coefficients))
     parameters = objective.space.parameters
     found = unexplained(model, parameters, scaled, tuple(pairs.values()))
     if not found.laws:
-        lack = Lack((), None, heard, found.late, apart)
-        return None if lack.is_none else lack
+        return Lack((), None, heard, found.late, apart).or_none
     body = model.vehicle.body
     by = np.array([*[body.mass] * 3, body.inertia_xx, body.inertia_yy, body.inertia_zz], float)
     ticks = np.arange(objective.samples + 2) / rate
@@ -199,14 +196,17 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
     return Lack(found.laws, pushed, heard, found.late, apart)
 
 
-def _apart(name: str, told: Sequence[Answer]) -> float:
-    """Return by which share recorded commands put a coefficient of `GAINS` elsewhere than a fit."""
-    those = [one for one in told if one.part == "P" and one.axis in GAINS[name]]
+def gain_told(name: str, answers: Sequence[Answer]) -> tuple[float, float] | None:
+    """Return a coefficient of `GAINS` by recorded commands, over the fit's, and its error.
+
+    None where they do not tell it of all its axes.
+    """
+    those = [one for one in answers if one.part == "P" and one.axis in GAINS[name]]
+    if len(those) < len(GAINS[name]):
+        return None
     weights = np.array([one.sd**-2.0 for one in those])
-    if not those:
-        return 0.0
-    found = float(np.average([one.value for one in those], weights=weights))
-    return float(np.sqrt(max((found - 1.0) ** 2 - 1.0 / weights.sum(), 0.0)))
+    value = float(np.average([one.value for one in those], weights=weights))
+    return value, float(weights.sum() ** -0.5)
 
 
 def alternatives_of(

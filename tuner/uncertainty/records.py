@@ -33,7 +33,8 @@ class ErrorParts(Part):
         None where there are no three.
     terms
         As it would move with terms that were tried and not kept, and where errors of measured
-        rotor speeds pass for inertia; None where neither was tried.
+        rotor speeds pass for inertia; for a gain of the rate controller how far off recorded
+        commands put it. None where none was tried.
     step
         Its move when the physics step is halved, and for a rotor's lag that it may be off by half
         of the finest step in which simulators take it, for that of recorded rotor speeds by half of

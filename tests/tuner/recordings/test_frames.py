@@ -164,15 +164,17 @@ def test_a_vehicle_that_leans_by_more_than_60_degrees_is_not_doubted() -> None:
 
 
 @pytest.mark.parametrize("wind", [3.0, 6.0, 12.0])
-def test_a_velocity_in_body_axes_is_turned_into_the_worlds(wind: float) -> None:
-    """Of a vehicle that keeps its heading both are alike, the more so the less it leans."""
+@pytest.mark.parametrize("axes", ["in body axes", "in NED axes"])
+def test_a_velocity_in_other_axes_is_turned_into_the_worlds(axes: str, wind: float) -> None:
+    """Body axes of a vehicle that keeps its heading are like the world's, the less it leans."""
     signals = circle(speed=4.0, wind=wind)
     world, attitude = signals["velocity"].values, signals["attitude"].values
     body = Rotation.from_quat(attitude, scalar_first=True).inv().apply(world)
+    recorded = {"in body axes": body, "in NED axes": world[:, [1, 0, 2]] * [1.0, 1.0, -1.0]}
     noise = 0.05 * np.random.default_rng(1).normal(size=world.shape)
-    signals["velocity"] = Series(TIME, body + noise)
+    signals["velocity"] = Series(TIME, recorded[axes] + noise)
     fixed, (note,) = correct_frames(signals, {})
-    assert (note.code, note.names) == (NoteCode.FRAME_TURNED, ("velocity", "in body axes"))
+    assert (note.code, note.names) == (NoteCode.FRAME_TURNED, ("velocity", axes))
     assert np.allclose(fixed["velocity"].values, world, atol=0.3)
     signals["velocity"] = Series(TIME, world + noise)
     assert correct_frames(signals, {})[1] == ()
