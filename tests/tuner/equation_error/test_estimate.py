@@ -13,6 +13,7 @@ from tuner.config.job import Search
 from tuner.equation_error.estimate import GAINS
 from tuner.equation_error.recorded_accelerations import (
     read_commands,
+    steps_fed,
     steps_of,
     without_gaps_of,
 )
@@ -71,7 +72,7 @@ def test_errors_hold_tachometers_whose_noise_is_a_quarter_more(flown, begun, mon
         steps = steps_of(flight, **given)
         return replace(steps, noise=np.sqrt(1.25) * steps.noise)
 
-    monkeypatch.setattr("tuner.job.accelerations.steps_of", noisier)
+    monkeypatch.setattr("tuner.equation_error.recorded_accelerations.steps_of", noisier)
     other = with_accelerations(job)[0].accelerations
     for name in TILTING:
         moved = abs(np.log(other.values[name] / found.values[name]))
@@ -112,9 +113,20 @@ def test_commands_that_were_recorded_seldom_leave_more_unknown(commanded, monkey
         steps, (commands, _) = read_commands(*given)
         return steps, (commands, commands)
 
-    monkeypatch.setattr("tuner.job.accelerations.read_commands", as_if_all)
+    monkeypatch.setattr("tuner.equation_error.recorded_accelerations.read_commands", as_if_all)
     seldom, often = job.accelerations.errors, with_accelerations(given)[0].accelerations.errors
     assert all(seldom[name] > often[name] for name in (*TILTING, "actuator_latency"))
+
+
+def test_rotor_speeds_that_are_stamped_late_are_taken_on_time(flown):
+    flight, late = flown[2][0].flight, 0.02
+    rotors = flight.series["rotor_speed"]
+    stamped = {**flight.series, "rotor_speed": Series(rotors.time + late, rotors.values)}
+    (taken,), _ = steps_fed("rotor_speed", None, [(replace(flight, series=stamped), late)], 0.0)
+    true = steps_of(flight)
+    inside = (true.time > 1.0) & (true.time < SECONDS - 1.0)
+    for row, time in zip(true.rotor_speed[inside], true.time[inside], strict=True):
+        assert taken.rotor_speed[np.argmin(np.abs(taken.time - time))] == pytest.approx(row)
 
 
 def test_steps_in_a_gap_of_the_commands_are_unknown(flown):

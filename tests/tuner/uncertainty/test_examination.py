@@ -82,6 +82,22 @@ def test_flights_that_the_fitted_vehicle_does_not_fly_say_nothing(
     assert not flights_refute(looked_at)
 
 
+@pytest.mark.parametrize(
+    ("astray", "crashed", "refuted"),
+    [
+        ([True, False, False], [True, False, False], True),
+        ([True, False, False], [False, False, True], False),
+        ([True, True, False], [False, False, False], True),
+    ],
+)
+def test_a_crash_or_most_flights_refute_a_fit(
+    objective: Objective, astray: list[bool], crashed: list[bool], refuted: bool
+) -> None:
+    information = examine(making.fitted_of(objective, making.truth(objective))).information
+    seen = replace(information, astray=np.array(astray), crashed=np.array(crashed))
+    assert seen.refuted is refuted
+
+
 def test_flights_that_are_disturbed_as_much_as_they_move_still_tell(objective: Objective) -> None:
     random, shaken = np.random.default_rng(0), {}
     for channel, old in objective.segments.measured.items():
