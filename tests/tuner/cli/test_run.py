@@ -39,6 +39,7 @@ def test_the_version_is_printed(capsys):
         (["lab/a.bag"], "for a fit write: tune --flights lab/a.bag"),
         (["simulate", "--trajectory", "square", "--out", "x.csv"], "no trajectory 'square'"),
         (["simulate", "--trajectory", "circle", "--rate", "fast", "--out", "x.csv"], "--rate"),
+        (["simulate", "--trajectory", "circle", "--workers", "1.7", "--out", "x.csv"], '"1.7"'),
         (["simulate", "--trajectory", "circle", "--oot", "x.csv"], "--out"),
         (["simulate", "--trajectory", "circle", "--out", "x.csv", "extra"], "extra"),
         (["simulate", "--trajectory", "circle", "--out", "x.csv", "--vehicle", "no"], "no: is"),
