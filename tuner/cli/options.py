@@ -14,6 +14,7 @@ from tuner.core.errors import InputError
 #: The command line as the user typed it, for the record of a run.
 TYPED: ContextVar[str] = ContextVar("TYPED", default="")
 
+
 def _exactly(kind: Any, words: Sequence[Token]) -> Any:
     """Return what words mean, none of them rounded: ``1.7`` is no whole number."""
     if int in (kind, *get_args(kind)) and not all(w.value.strip("+-").isdecimal() for w in words):

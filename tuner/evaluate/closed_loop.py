@@ -42,10 +42,12 @@ from tuner.vehicle import (
     COEFFICIENTS,
     ControllerFile,
     VehicleFile,
+    check_filter,
     check_mixer,
     check_names,
     read_controller,
     read_vehicle,
+    with_values,
 )
 from tuner.vehicle.model import Model, model_of, schedule_of, with_coefficients
 
@@ -99,6 +101,8 @@ def fly(
         vehicle = read_vehicle(find_config("vehicles", vehicle, Path()))
     if isinstance(controller, str):
         controller = read_controller(find_config("controllers", controller, Path()))
+    for values in zip(*grid.values(), strict=True):
+        check_filter(with_values(vehicle, dict(zip(grid, values, strict=True))), controller)
     trajectory, speed = plan.trajectory, asked.speed
     return simulate(
         vehicle,

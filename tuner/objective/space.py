@@ -15,7 +15,7 @@ from tuner.config import JobFile
 from tuner.config.job import CoefficientSettings
 from tuner.core.errors import ConfigError
 from tuner.core.numerics import Array
-from tuner.vehicle import ControllerFile, VehicleFile, initial_values
+from tuner.vehicle import ControllerFile, VehicleFile, check_value, initial_values
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.joint_prior import JointPrior
 from tuner.vehicle.registry import COEFFICIENTS
@@ -250,6 +250,9 @@ def parameter_of(
         raise ConfigError(
             name, f"its lower bound {lower:g} is not below its upper bound {upper:g}", "widen them"
         )
+    for bound in (given.lower, given.upper):
+        if bound:  # none is reached, so that zero holds for what is above zero
+            check_value(name, bound, f"bound of {name}")
 
     def scaled(value: float) -> float:
         return float(np.log(max(value, 1e-300))) if scale == "log" else value

@@ -15,8 +15,10 @@ from tuner.vehicle.registry import (
 )
 from tuner.vehicle.vehicle import (
     VehicleFile,
+    check_filter,
     check_mixer,
     check_names,
+    check_value,
     initial_values,
     read_vehicle,
     values_of,
@@ -34,8 +36,10 @@ __all__ = [
     "NotCarried",
     "VehicleFile",
     "Written",
+    "check_filter",
     "check_mixer",
     "check_names",
+    "check_value",
     "conditions",
     "initial_values",
     "of_scope",

@@ -25,6 +25,8 @@ from tuner.core.yaml_section import (
 )
 
 Gains = tuple[NonNegative, NonNegative, NonNegative]
+Rate = Annotated[Number, Interval(ge=1, le=10_000)]
+"""Hz of a loop."""
 
 
 class PositionControl(Section):
@@ -47,7 +49,7 @@ class PositionControl(Section):
     kp: Gains = (10.0, 10.0, 20.0)
     kv: Gains = (5.0, 5.0, 10.0)
     max_feedback_acceleration: Positive = 10.0
-    rate: Positive = 100.0
+    rate: Rate = 100.0
     velocity_yaw: Flag = False
     reference_drag: Vector = (0.0, 0.0, 0.0)
 
@@ -109,7 +111,7 @@ class RateControl(Section):
     pitch: AxisGains = AxisGains()
     yaw: YawGains = YawGains()
     integrator_limit: NonNegative = 0.3
-    rate: Positive = 400.0
+    rate: Rate = 400.0
 
 
 class Filters(Section):
@@ -153,7 +155,7 @@ class Mixer(Section):
 class Physics(Section):
     """How the simulation steps: rate in Hz, and the integrator."""
 
-    rate: Positive = 400.0
+    rate: Rate = 400.0
     integrator: Literal["midpoint", "semi_implicit"] = "midpoint"
 
 
@@ -170,7 +172,7 @@ class Sensing(Section):
         it knows where the markers sit. A fit that finds them elsewhere tries both.
     """
 
-    pose_rate: Positive | None = None
+    pose_rate: Rate | None = None
     sees_markers: Flag = False
 
 

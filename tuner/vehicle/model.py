@@ -22,7 +22,7 @@ from sim_jax.numeric import Scalar
 from sim_jax.schedule import Schedule
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 from tuner.vehicle import COEFFICIENTS, Coefficient, ControllerFile, VehicleFile, initial_values
-from tuner.vehicle.vehicle import size_of
+from tuner.vehicle.vehicle import check_filter, longest, size_of
 
 RADIUS = 0.13
 """m of the rotors of a vehicle of the registry's size; those of others are in proportion."""
@@ -169,7 +169,14 @@ def controller_of(file: ControllerFile) -> Controller:
 
 
 def model_of(vehicle: VehicleFile, controller: ControllerFile) -> Model:
-    """Return both files as one value to fly; of what both give, the vehicle file's holds."""
+    """Return both files as one value to fly; of what both give, the vehicle file's holds.
+
+    Raises
+    ------
+    ConfigError
+        Their rates do not go together.
+    """
+    check_filter(vehicle, controller)
     volts = vehicle.battery.reference_voltage
     reference = None if volts is None else jnp.asarray(volts)
     model = Model(vehicle_of(vehicle), controller_of(controller), reference)
@@ -196,16 +203,9 @@ def schedule_of(file: ControllerFile, *, log_rate: int | None = None) -> Schedul
         log_rate=physics if log_rate is None else log_rate,
         integrator=file.physics.integrator,
         pose_rate=file.sensing.pose_rate,
-        longest_estimate_latency=_longest("estimate_latency"),
-        longest_actuator_latency=_longest("actuator_latency"),
+        longest_estimate_latency=longest("estimate_latency"),
+        longest_actuator_latency=longest("actuator_latency"),
     )
-
-
-def _longest(latency: str) -> float:
-    """Return the s that the delay line of a fit reaches back, as far as the latency's bound."""
-    bounds = COEFFICIENTS[latency].bounds
-    assert isinstance(bounds, tuple)
-    return bounds[1]
 
 
 def _vector(values: tuple[float, float, float]) -> Vec3:

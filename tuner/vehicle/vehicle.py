@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field, JsonValue, model_validator
+from annotated_types import Le
+from pydantic import AfterValidator, Field, JsonValue, create_model, model_validator
 
 from tuner.core.disk import write_text
 from tuner.core.errors import ConfigError, did_you_mean
@@ -170,6 +171,13 @@ class Aerodynamics(Section):
     thrust_law: Literal["linear"] | None = None
 
 
+def longest(latency: str) -> float:
+    """Return the s that the simulation's delay line reaches back, as far as a latency's bound."""
+    bounds = COEFFICIENTS[latency].bounds
+    assert isinstance(bounds, tuple)
+    return bounds[1]
+
+
 class Setup(Section):
     """What the set-up adds to the vehicle.
 
@@ -183,8 +191,8 @@ class Setup(Section):
         Hz of the gyro's low-pass filter; None where the controller file's holds.
     """
 
-    estimate_latency: NonNegative = 0.0
-    actuator_latency: NonNegative = 0.0
+    estimate_latency: Annotated[NonNegative, Le(longest("estimate_latency"))] = 0.0
+    actuator_latency: Annotated[NonNegative, Le(longest("actuator_latency"))] = 0.0
     gyro_cutoff: Positive | None = None
 
 
@@ -296,6 +304,24 @@ def check_mixer(vehicle: VehicleFile) -> None:
         )
 
 
+def check_filter(vehicle: VehicleFile, controller: ControllerFile) -> None:
+    """Refuse a filter of the gyro that the simulated rate loop cannot have.
+
+    Raises
+    ------
+    ConfigError
+        The vehicle file's cutoff is not below half of the loop's rate.
+    """
+    cutoff, half = vehicle.setup.gyro_cutoff, controller.rate.rate / 2
+    if cutoff is not None and cutoff >= half:
+        raise ConfigError(
+            vehicle.name,
+            f"setup.gyro_cutoff is {cutoff:g} Hz, not below half of rate.rate of the controller "
+            f"file ({half:g} Hz)",
+            "lower it, or leave it out for the controller file's",
+        )
+
+
 def read_vehicle(path: str | Path) -> VehicleFile:
     """Read a vehicle file.
 
@@ -363,6 +389,22 @@ def check_names(names: Iterable[str], where: str) -> None:
             raise ConfigError(
                 where, f"unknown coefficient '{name}'", did_you_mean(name, COEFFICIENTS)
             )
+
+
+def check_value(name: str, value: float, where: str) -> None:
+    """Refuse a value that no vehicle file can give a coefficient.
+
+    Raises
+    ------
+    ConfigError
+        It is negative, say, or no number; ``where`` says of what.
+    """
+    section, key = COEFFICIENTS[name].place
+    if not COEFFICIENTS[name].is_effect:  # those are any numbers
+        holder = VehicleFile.model_fields[section].annotation if section else VehicleFile
+        field = holder.model_fields[key]  # type: ignore[union-attr]
+        alone: dict[str, Any] = {key: (field.annotation, field)}
+        build(create_model(key, __base__=Section, **alone), {key: value}, where)
 
 
 def values_of(vehicle: VehicleFile) -> dict[str, float]:

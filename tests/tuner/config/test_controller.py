@@ -52,6 +52,8 @@ def test_parts_left_out_keep_their_defaults(tmp_path):
         ("rate: {roll: {p: -1}}", "rate.roll.p is -1"),
         ("position: {kp: 10}", "position.kp is 10"),
         ("mixer: {airmode: 3}", "mixer.airmode is 3"),
+        ("position: {rate: 0.4}", "position.rate is 0.4; it should be at least 1"),
+        ("physics: {rate: 1.0e+9}", "physics.rate is 1000000000.0; it should be at most 10000"),
         ("rate: {rate: 1000}", "rate.rate is 1000 Hz, faster than physics.rate 400 Hz"),
         ("filters: {gyro_cutoff: 200}", "filters.gyro_cutoff is 200 Hz, not below half"),
         ("position: {velocity_yaw: 1}", "position.velocity_yaw is 1"),

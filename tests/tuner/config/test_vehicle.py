@@ -90,6 +90,7 @@ def test_every_coefficient_comes_back_bit_for_bit(numbers, tmp_path):
     vehicle = read_vehicle(ORIGINAL)
     values = dict(zip(COEFFICIENTS, numbers, strict=False))
     values |= dict.fromkeys(("inertia_xx", "inertia_yy", "inertia_zz"), values["inertia_xx"])
+    values |= {name: min(values[name], 0.04) for name in ("estimate_latency", "actuator_latency")}
     write_vehicle(with_values(vehicle, values), tmp_path / "v.yaml")
     assert values_of(read_vehicle(tmp_path / "v.yaml")) == values
 
@@ -141,6 +142,11 @@ def test_provenance_is_kept(tmp_path):
         ("[0.17678, -0.17678, 0.06]", "[0.17678, -0.17678]", "rotors[0].position[2]"),
         ("time_constant_up: 0.0125", "time_constant_up: 0", "motor.time_constant_up is 0"),
         ("inertia: {xx: 0.021, yy: 0.021, zz: 0.040}", "inertia: 5", "inertia is 5"),
+        (
+            "mass: 2.079",
+            "mass: 2.079\nsetup: {actuator_latency: 0.2}",
+            "setup.actuator_latency is 0.2; it should be at most 0.04",
+        ),
     ],
 )
 def test_a_wrong_value_is_named_in_one_line(vehicle_text, tmp_path, old, new, expected):
@@ -169,7 +175,8 @@ def test_every_coefficient_has_a_place_of_its_own():
     assert len({coefficient.place for coefficient in COEFFICIENTS.values()}) == len(COEFFICIENTS)
     for name, value in values_of(vehicle).items():
         if not name.startswith("inertia"):
-            assert values_of(with_values(vehicle, {name: value + 1}))[name] == value + 1
+            other = value + 0.01
+            assert values_of(with_values(vehicle, {name: other}))[name] == other
 
 
 def test_every_number_of_a_vehicle_file_is_a_coefficient_or_known_not_to_be():

@@ -96,6 +96,10 @@ def test_a_rate_that_is_no_whole_number_is_that_of_the_samples(vehicle, rate):
         ({}, {"mass": [2.0, 2.1], "inertia_xx": [0.02]}, "holds 2 of mass and 1 of inertia_xx"),
         ({}, {"mass": []}, "holds 0 of mass"),
         ({}, {"mass": [[2.0, 2.1]]}, "holds 2 of mass"),
+        ({}, {"mass": [2.0, -1.0]}, "mass is -1.0; it should be more than 0"),
+        ({}, {"inertia_xx": [0.02, 1.0]}, "inertia.xx is 1.0, more than the other two"),
+        ({}, {"estimate_latency": [0.05, 0.2]}, "latency is 0.2; it should be at most 0.1"),
+        ({}, {"gyro_cutoff": [40.0, 200.0]}, "cutoff is 200 Hz, not below half of rate.rate"),
     ],
 )
 def test_what_makes_no_flight_is_refused(given, grid, expected):

@@ -154,11 +154,11 @@ def test_a_coefficient_that_is_zero_is_fitted_linearly_between_given_bounds(vehi
     free = ("zero_position_armed",)
     with pytest.raises(ConfigError, match="no logarithm"):
         space_of(off, ControllerFile(), JobFile(free=free))
-    settings = CoefficientSettings(lower=-50.0, upper=200.0, scale="linear")
+    settings = CoefficientSettings(lower=0.0, upper=200.0, scale="linear")
     job = JobFile(free=free, coefficients={"zero_position_armed": settings})
     space = space_of(off, ControllerFile(), job)
     (parameter,) = space.parameters
-    assert parameter.initial == 0.0
+    assert parameter.initial == pytest.approx(10.0)  # off the bound
     assert parameter.prior_sd > 0.0
     assert np.isfinite(space.prior_residuals(space.initial)).all()
 
@@ -194,3 +194,16 @@ def test_every_row_is_complete():
 
 def test_the_table_of_the_reference_is_the_registrys():
     assert markdown_table() in PAGE.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "bounds", "expected"),
+    [
+        ("moment_constant", (-0.1, 0.1), "moment_constant is -0.1; it should be at least 0"),
+        ("estimate_latency", (0.0, 0.5), "estimate_latency is 0.5; it should be at most 0.1"),
+    ],
+)
+def test_bounds_that_no_vehicle_file_can_hold_are_refused(vehicle, name, bounds, expected):
+    given = dict(zip(("lower", "upper"), bounds, strict=True)) | {"scale": "linear"}
+    with pytest.raises(ConfigError, match=expected):
+        space_of(vehicle, ControllerFile(), JobFile(coefficients={name: given}))
