@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from tuner.cli.options import EACH, TYPED, Quiet, Verbose
 from tuner.core.errors import InputError
+from tuner.core.phrases import visible
 from tuner.options import (
     ExaminationOptions,
     ExportOptions,
@@ -73,7 +74,7 @@ def inspect(
         console().print(render(inspections, words))
     if errors:
         for error in errors[:-1]:
-            sys.stderr.write(f"tune: {error}\n")
+            sys.stderr.write(visible(f"tune: {error}") + "\n")
         raise errors[-1]
 
 
@@ -268,11 +269,11 @@ def audit(
 
         screen = console()
         for fault in found.faults:
-            screen.print(f"{found.path.name}: {fault}", markup=False, soft_wrap=True)
+            screen.print(f"{found.path.name}: {fault}", soft_wrap=True)
         for line in found.differences:
-            screen.print(line, markup=False, soft_wrap=True)
+            screen.print(line, soft_wrap=True)
         if not found.faults and not quiet:
-            screen.print(f"{found.path.name}: no fault found, {found.mass:.4g} kg", markup=False)
+            screen.print(f"{found.path.name}: no fault found, {found.mass:.4g} kg")
     return 1 if found.faults else 0
 
 

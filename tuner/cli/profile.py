@@ -88,10 +88,10 @@ def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
     beside = {name: f"{spent:.1f}" for name, spent in beside_of(recorder.spans).items()}
     parts = [f"{name} {seconds} s" for name, seconds in beside.items() if float(seconds)]
     if parts:
-        screen.print(f"Beside it, by other threads and processes: {listed(parts)}.", markup=False)
+        screen.print(f"Beside it, by other threads and processes: {listed(parts)}.")
     for program in recorder.fallbacks:
-        screen.print(f"Through XLA, not as a kernel: {program}.", markup=False)
-    screen.print(f"profile: {folder / TABLE_FILE}, {folder / TRACE_FILE}", markup=False)
+        screen.print(f"Through XLA, not as a kernel: {program}.")
+    screen.print(f"profile: {folder / TABLE_FILE}, {folder / TRACE_FILE}")
 
 
 def _table(rows: Sequence[Row]) -> Table:

@@ -117,7 +117,7 @@ class _MovingLine:
         self._doing = _iteration(iteration)
 
     def line(self, text: str) -> None:
-        self._screen.print(text, markup=False)
+        self._screen.print(text)
 
     def table(self, table: object) -> None:
         self._screen.print(table)
@@ -146,7 +146,7 @@ class _StageLines:
     def line(self, text: str) -> None:
         self.close()
         seconds = time.perf_counter() - self._began
-        self._screen.print(f"{seconds:5.0f} s  {text}", markup=False, soft_wrap=True)
+        self._screen.print(f"{seconds:5.0f} s  {text}", soft_wrap=True)
 
     def table(self, table: object) -> None:
         self.close()

@@ -191,7 +191,7 @@ def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
     screen = console()
     record = bench_record(bench.combination, bench.measurements)
     for experiment in record.experiments:
-        screen.print(f"{experiment.name}: {'; '.join(numbers_in_words(experiment))}", markup=False)
+        screen.print(f"{experiment.name}: {'; '.join(numbers_in_words(experiment))}")
     screen.print(agreement_in_words(record))
     print_run(bench.folder, bench.result, verbose=verbose)
 
@@ -208,7 +208,7 @@ def print_sensitivity(result: SensitivityResult, *, verbose: bool = False) -> No
         if verbose or section.key in ("coefficients", "next_flight"):
             _print_section(screen, section)
     for finding in result.findings:
-        screen.print(one_line(finding), markup=False)
+        screen.print(one_line(finding))
     for direction in result.knowledge.directions[:1]:
         screen.print(
             f"The worst determined combination of coefficients: {direction_in_words(direction)}"

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Table as DrawnTable
 from rich.text import Text
 
+from tuner.core.phrases import visible
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.report.section import Cell, Table
 
@@ -26,10 +28,22 @@ if TYPE_CHECKING:
 WIDTH = 140
 
 
+class _Screen(Console):
+    """A terminal on which a text that others wrote is a text, neither markup nor control codes."""
+
+    def render(
+        self, renderable: RenderableType, options: ConsoleOptions | None = None
+    ) -> Iterable[Segment]:
+        for text, style, control in super().render(renderable, options):
+            yield Segment(text if control else visible(text), style, control)
+
+
 def console(width: int = WIDTH) -> Console:
     """Return a console of at least so many columns, so that no number is cut."""
-    fitting = Console(highlight=False)
-    return fitting if fitting.width >= width else Console(highlight=False, width=width)
+    fitting = _Screen(highlight=False, markup=False)
+    if fitting.width >= width:
+        return fitting
+    return _Screen(highlight=False, markup=False, width=width)
 
 
 STYLES = {
@@ -74,7 +88,7 @@ def print_flights(summaries: Sequence[Summary], path: Path) -> None:
     ]
     screen = console()
     screen.print(rich_table(Table((*summaries[0].coefficients, *measures), rows)))
-    screen.print(f"written to {path}", markup=False)
+    screen.print(f"written to {path}")
 
 
 def print_export(done: Exported) -> None:
@@ -85,12 +99,12 @@ def print_export(done: Exported) -> None:
         name = (
             gate.name if gate.ran else f"{gate.name} (not looked at: it needs a run's recordings)"
         )
-        screen.print(f"{met if gate.ran else '---'}  {name}", markup=False)
+        screen.print(f"{met if gate.ran else '---'}  {name}")
         for objection in gate.objections:
-            screen.print(f"     {objection}", markup=False)
+            screen.print(f"     {objection}")
     for note in done.notes:
-        screen.print(f"note: {note}", markup=False)
-    screen.print(f"written to {done.path} and read back", markup=False)
+        screen.print(f"note: {note}")
+    screen.print(f"written to {done.path} and read back")
 
 
 def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
@@ -104,7 +118,7 @@ def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
     columns = ("coefficient", "value", "±", "unit", "source")
     screen = console()
     screen.print(rich_table(Table(columns, rows, words=("coefficient", "unit", "source"))))
-    screen.print(f"written to {path} and {path.stem}.job.yaml", markup=False)
+    screen.print(f"written to {path} and {path.stem}.job.yaml")
 
 
 def print_comparison(
@@ -112,13 +126,13 @@ def print_comparison(
 ) -> None:
     """Print the RMSE of every vehicle and flight, the lowest in bold and starred."""
     screen = console()
-    screen.print(f"controller: {settings.origin['controller']}", markup=False)
+    screen.print(f"controller: {settings.origin['controller']}")
     columns = ("flight", "vehicle", *(f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()))
     rows = [_cells(row, comparison) for row in comparison.rows if laps or row.lap is None]
     screen.print(rich_table(Table(columns, rows, words=("flight", "vehicle"))))
     screen.print(f"best over all flights: {comparison.best or 'none, all of them crashed'}")
     for path in written:
-        screen.print(f"written to {path}", markup=False)
+        screen.print(f"written to {path}")
 
 
 def _cells(row: Row, comparison: Comparison) -> list[Cell | str]:

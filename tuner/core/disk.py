@@ -148,6 +148,10 @@ def _check_writable(folder: Path) -> None:
 def _stands(path: Path) -> bool:
     """Return whether something has this path; a refusal to look is raised as it is."""
     try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:  # it could stand in no report
+        raise OSError(errno.EILSEQ, "its name is not UTF-8") from None
+    try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a null byte
         return False
@@ -164,6 +168,7 @@ _REFUSALS = {
     errno.ENAMETOOLONG: ("the path is too long", "give a shorter one"),
     errno.ENOTDIR: ("it lies inside a file", "name a place in a folder"),
     errno.EEXIST: ("it is a file", "name a folder"),
+    errno.EILSEQ: ("its name is not UTF-8", "give another name"),
     errno.EISDIR: ("it is a folder", "name a file"),
     errno.ENOENT: ("its folder does not exist", "make the folder first"),
 }
@@ -256,7 +261,7 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
         else:
             raise InputError(path, "does not exist", "check the path")
         for match in matches:
-            if match.is_dir() and not (match / "metadata.yaml").exists():
+            if exists(match) and match.is_dir() and not (match / "metadata.yaml").exists():
                 raise InputError(
                     match, "is a folder", f"give the recordings in it: '{match}/*.bag'"
                 )

@@ -22,6 +22,17 @@ class Worded(StrEnum):
         return code
 
 
+#: What moves a terminal's cursor, colours it or turns its writing around -> a picture of it.
+_PICTURES = {code: 0x2400 + code for code in range(32) if chr(code) not in "\n\t"}
+_UNPRINTED = ((0x7F, 0xA0), (0x202A, 0x202F), (0x2066, 0x206A), (0xD800, 0xE000))
+_PICTURES |= {code: 0xFFFD for bounds in _UNPRINTED for code in range(*bounds)}
+
+
+def visible(text: str) -> str:
+    """Return a text, which a recording or a name may have chosen, as a terminal may show it."""
+    return text.translate(_PICTURES)
+
+
 def listed(words: Sequence[str]) -> str:
     """Return words with commas and a last "and"."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

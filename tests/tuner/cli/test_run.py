@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.tuner.recordings import making
 from tuner.cli import main
 from tuner.cli.app import COMMANDS
 
@@ -152,3 +153,27 @@ def test_inspect_reports_which_recording_cannot_be_read(tmp_path, capsys):
     assert "broken.bag" in err
     assert err.count("\n") == 1
     assert "/optitrack/pose" in out
+
+
+def test_names_in_a_recording_neither_steer_the_terminal_nor_style_it(tmp_path, capsys):
+    named = "/\x1b]0;title\x07[/no]\u202eed"
+    bag = making.rewrite(
+        making.FLIGHTS / "yaw_spin_3rps.bag",
+        tmp_path / "spin.bag",
+        rename=lambda topic: topic if "optitrack" not in topic else named,
+    )
+    assert main(["inspect", str(bag)]) == 0
+    out = capsys.readouterr().out
+    assert "/␛]0;title[/no]�ed" in out
+    assert not {"\x1b", "\x07", "\u202e"} & set(out)
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="its names are all UTF-8")
+@pytest.mark.parametrize("arguments", [["inspect"], ["new-vehicle", "--like=crazyflie", "--out"]])
+def test_a_name_that_is_not_utf_8_is_refused(arguments, tmp_path, capsys):
+    named = tmp_path / os.fsdecode(b"fl\xfcg.bag")
+    named.write_bytes((making.FLIGHTS / "yaw_spin_3rps.bag").read_bytes())
+    assert main([*arguments, str(named)]) == 2
+    err = capsys.readouterr().err
+    assert "its name is not UTF-8" in err
+    assert err.count("\n") == 1
