@@ -435,10 +435,10 @@ class Code(Worded):
     NO_TACHOMETER = (
         "no_tachometer",
         (
-            "No rotor speed was recorded: the curve from command to rotor speed stays as it is, "
-            "and motor_constant goes with the inverse square of input_scaling."
+            "No rotor speed tells the curve from command to rotor speed, which stays the vehicle "
+            "file's: motor_constant goes with the inverse square of input_scaling."
         ),
-        "One tachometer reading at a known command closes that; thrust and torque do not need it.",
+        "Set input_scaling by one tachometer reading; thrust and torque do not need it.",
     )
     YAW_OPEN = (
         "yaw_open",

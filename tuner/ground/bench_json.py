@@ -300,9 +300,9 @@ def numbers_in_words(experiment: ExperimentRecord) -> list[str]:
     for row, scaled, deviation in zip(
         experiment.rows, experiment.value, experiment.std_error, strict=True
     ):
-        if list(row.values()) == [1.0]:
-            (name,) = row
-            value, error = value_of(name, scaled), error_of(name, scaled, deviation)
+        if len(row) == 1:
+            ((name, power),) = row.items()
+            value, error = value_of(name, scaled / power), error_of(name, scaled / power, deviation)
             phrases.append(f"{name} {value:.5g} ± {error:.2g} {COEFFICIENTS[name].unit}".rstrip())
         elif all(factor == 1.0 for factor in row.values()):
             value = math.exp(scaled)

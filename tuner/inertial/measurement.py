@@ -4,13 +4,13 @@ Thrust over mass and torque over inertia are all that specific force and body ra
 weighed mass and the vehicle file's curve of rotor speed over command, that is the motor constant
 and two moments of inertia; about z the moment constant over the third. The angular acceleration
 that no command asks for is a steady moment over inertia: the vehicle's trim. Without a tachometer
-the curve stays as it is, and the motor constant goes with the inverse square of its scale.
+the curve stays as it is, and only the motor constant times the square of its scale is known.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,26 +18,27 @@ import numpy as np
 from tuner.core.errors import RecordingError
 from tuner.core.phrases import clause
 from tuner.findings.findings import remedy, sentence
-from tuner.ground.measurement import Curve, Measurement, Remark
+from tuner.ground.measurement import Curve, Measurement, Remark, scaled_of
 from tuner.inertial.fit import NAMES, OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
 from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.loader import InertialFlight
 from tuner.vehicle import VehicleFile
 
-NUMBERS = (
-    ("time_constant_up",),
-    ("time_constant_down",),
-    ("actuator_latency",),
-    ("inertia_xx",),
-    ("inertia_yy",),
-    ("motor_constant", "moment_constant", "inertia_zz"),
-    ("motor_constant",),
-    ("torque_trim_x",),
-    ("torque_trim_y",),
-    ("torque_trim_z",),
+NUMBERS: tuple[Mapping[str, float], ...] = (
+    {"time_constant_up": 1.0},
+    {"time_constant_down": 1.0},
+    {"actuator_latency": 1.0},
+    {"inertia_xx": -1.0},
+    {"inertia_yy": -1.0},
+    {"moment_constant": 1.0, "inertia_zz": -1.0, "motor_constant": 1.0, "input_scaling": 2.0},
+    {"motor_constant": 1.0, "input_scaling": 2.0},
+    {"torque_trim_x": 1.0},
+    {"torque_trim_y": 1.0},
+    {"torque_trim_z": 1.0},
 )
-"""The coefficients of each number of a `Response`: inertias divide, the others multiply."""
+"""Powers of the coefficients in each number of a `Response`: nothing recorded tells the scale of
+the rotors' curve, whose square goes with the motor constant."""
 OUTPUT_OF = dict(zip(STEADY, OUTPUTS, strict=False))
 """The angular acceleration that each constant is of."""
 LEAST_EXPLAINED = 0.1
@@ -108,14 +109,15 @@ def _measurement(
     name: str, response: Response, used: Sequence[str], vehicle: VehicleFile
 ) -> Measurement:
     lags, gains = response.lags, response.gains
+    curve = 2.0 * scaled_of("input_scaling", vehicle.motor.input_scaling)
     values = {
         "up": math.log(lags.up),
         "down": math.log(lags.down),
         "late": lags.late,
         "roll": math.log(max(gains["roll"] / vehicle.mass, 1e-300)),
         "pitch": math.log(max(gains["pitch"] / vehicle.mass, 1e-300)),
-        "yaw": math.log(max(gains["yaw"] * vehicle.aerodynamics.moment_constant, 1e-300)),
-        "thrust": math.log(max(gains["thrust"] * vehicle.mass, 1e-300)),
+        "yaw": curve + math.log(max(gains["yaw"] * vehicle.aerodynamics.moment_constant, 1e-300)),
+        "thrust": curve + math.log(max(gains["thrust"] * vehicle.mass, 1e-300)),
     }
     thrust = gains["thrust"] * vehicle.mass if "thrust" in used else None
     constant = vehicle.aerodynamics.motor_constant if thrust is None else thrust
@@ -130,12 +132,9 @@ def _measurement(
         [1.0 / gains[n] if n in OUTPUTS else inertia[n] if n in STEADY else 1.0 for n in used]
     )
     covariance = response.covariance[np.ix_(places, places)] * np.outer(slope, slope)
-    rows = [
-        {c: -1.0 if c.startswith("inertia") else 1.0 for c in NUMBERS[place]} for place in places
-    ]
     return Measurement(
         experiment=name,
-        rows=tuple(rows),
+        rows=tuple(NUMBERS[place] for place in places),
         value=np.array([values[number] for number in used]),
         covariance=covariance,
         remarks=(

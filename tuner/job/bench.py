@@ -263,7 +263,7 @@ def _judged(
 ) -> tuple[Verdict, Reason]:
     """Return how well the experiments determine a coefficient, and why."""
     if not combination.determined[place]:
-        rows = [row for m in measurements for row in m.rows if name in row]
+        rows = sorted((row for m in measurements for row in m.rows if name in row), key=len)
         partners = [n for row in rows for n in row if n != name]
         places = {n: i for i, n in enumerate(combination.names)}
         partners.sort(key=lambda n: bool(combination.determined[places[n]]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,6 +27,8 @@ from tuner.vehicle import VehicleFile, values_of, with_values
 
 BY_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
 """What a flight without a pose gives over the mass."""
+CURVE = "input_scaling"
+"""The scale of the rotors' curve, which it leaves open."""
 
 
 def fit_without_pose(
@@ -68,13 +70,13 @@ def fit_without_pose(
     known = known_of(start)
     alone = combine(measured, known)
     measurements = agreeing(measured, alone.chi_square, alone.degrees_of_freedom)
-    combination = combine(measurements, known)
+    combination = _combined(measurements, known)
     path = Path(used[0].path)
     try:
         vehicle = vehicle_of(path, start, combination)
     except ConfigError:  # moment_constant over inertia_zz, shared out, gave what no body can have
         measurements = tuple(_without_yaw(m) for m in measurements)
-        combination = combine(measurements, known)
+        combination = _combined(measurements, known)
         vehicle = vehicle_of(path, _as_flat(start, combination), combination)
     return written(
         folder,
@@ -113,6 +115,16 @@ def _measured(
         what, to_do = "holds out all flights that can be used", "leave one to fit"
         raise errors[0][1] if errors else InputError("--holdout", what, to_do)
     return measured, used, [left_out_of(name, error) for name, error in errors]
+
+
+def _combined(measurements: Sequence[Measurement], known: Mapping[str, float]) -> Combination:
+    """Return what flights say together, of vehicles with the file's curve of rotor speeds."""
+    combination = combine(measurements, known)
+    if CURVE not in combination.names:
+        return combination
+    held = Measurement("curve", ({CURVE: 1.0},), np.array([known[CURVE]]), np.array([[1e-6]]))
+    scaled = combine((*measurements, held), known).scaled
+    return combination.model_copy(update={"scaled": scaled})
 
 
 def _predicted(

@@ -12,7 +12,7 @@ from tuner.core.errors import InputError, RecordingError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.closed_loop import fly, simulate
 from tuner.findings.findings import Code, one_line
-from tuner.ground.bench_json import Combination
+from tuner.ground.bench_json import Combination, joint_prior
 from tuner.inertial.prediction import rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.bench import least_noticed, vehicle_of
@@ -23,12 +23,13 @@ from tuner.recordings.loader import read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.result import BEST_FIT_FILE
 from tuner.search.job_flights import read_usable, without_pose
+from tuner.uncertainty.verdict import Verdict
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, with_values
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 LATENCY = 0.004
 WRONG = {"motor_constant": 1.3, "inertia_xx": 0.7, "inertia_yy": 1.2, "time_constant_up": 2.0}
-SHOWN = ("motor_constant", "inertia_xx", "inertia_yy", "time_constant_up", "time_constant_down")
+SHOWN = ("inertia_xx", "inertia_yy", "time_constant_up", "time_constant_down")
 G = 9.80665
 ORDER = (1, 3, 4, 2)
 """Where the Crazyflie's motors m1 to m4 stand in PX4's order, from 1."""
@@ -135,6 +136,27 @@ def test_air_that_drags_at_the_rotors_is_not_taken_for_inertia(name, tmp_path):
     for coefficient in ("inertia_xx", "inertia_yy", "motor_constant"):
         found = fitted.result.coefficients[coefficient]
         assert found.best == pytest.approx(truth[coefficient], rel=0.1), coefficient
+
+
+def test_a_motor_constant_is_known_only_with_the_curve_of_rotor_speeds(simulation, flown, tmp_path):
+    """Rotors that turn at 0.8 of the speeds and give more fly what was flown."""
+    truth = values_of(flown)
+    slower = {name: 0.8 * truth[name] for name in ("input_scaling", "zero_position_armed")}
+    settings = settings_for(log_file(simulation, tmp_path / "log00"), with_values(flown, slower))
+    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
+    result = fitted.result.coefficients
+    motor, curve = result["motor_constant"], result["input_scaling"]
+    assert motor.verdict is curve.verdict is Verdict.NOT_IDENTIFIABLE
+    assert motor.reason.correlated_with == "input_scaling"
+    assert curve.best == pytest.approx(slower["input_scaling"], rel=1e-9)
+    assert motor.best == pytest.approx(truth["motor_constant"] / 0.8**2, rel=0.02)
+    for name in ("inertia_xx", "inertia_yy"):
+        assert abs(result[name].best - truth[name]) < 3.0 * result[name].std_error, name
+    prior = joint_prior(fitted.folder)
+    places = [prior.names.index(name) for name in ("motor_constant", "input_scaling")]
+    along = np.array([2.0, -1.0])
+    information = prior.information[np.ix_(places, places)]
+    assert along @ information @ along < 1e-9 * np.trace(information)
 
 
 def test_a_vehicle_file_of_another_size_gives_a_rigid_body(simulation, flown, tmp_path):
