@@ -96,9 +96,10 @@ def submit(
     from tuner.core.disk import folder_for
 
     with client_of(server, token) as client:
-        folder = folder_for(out) if wait else None
+        if wait:
+            folder_for(out)
         job = client.submit(fitted, name=name)
-        if folder is None:
+        if not wait:
             print(job if quiet else f"job {job}: {client.url}/jobs/{job}")
             return
         try:
@@ -109,9 +110,9 @@ def submit(
                 print(f"Job {job} goes on at the server: tune watch {job}, or tune cancel {job}.")
             raise
         ended_well(client.job(job))
-        run = client.fetch(job, folder)
+        run = client.fetch(job, out)
     if not quiet:
-        print_run(folder, run.result)
+        print_run(run.folder, run.result)
 
 
 def jobs(

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import quote
 
 from tuner.config import Settings, settle
-from tuner.core.disk import folder_for, inside, make_folder, whole_file
+from tuner.core.disk import folder_for, inside, make_folder, result_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.core.shipped import Kind, configs_folder, find_config
 from tuner.core.yaml_document import read_yaml
@@ -105,10 +105,10 @@ class Client:
             The server could not finish the job.
         """
         given = FitOptions.of(flights, **options)
-        folder = folder_for(None if out is None else Path(out))
+        folder_for(None if out is None else Path(out))
         job = self.submit(given, name=name)
         self.wait(job)
-        return self.fetch(job, folder)
+        return self.fetch(job, out)
 
     def submit(
         self,
@@ -231,7 +231,7 @@ class Client:
         found = ended_well(self.job(job))
         if found["state"] != "done":
             raise InputError(f"job {job}", f"is {found['state']}", f"tune watch {job}")
-        folder = folder_for(None if out is None else Path(out))
+        folder = result_folder(None if out is None else Path(out))
         for name in found["files"]:
             target = inside(folder, name)
             make_folder(target.parent)

@@ -9,13 +9,14 @@ import datetime
 import errno
 import glob
 import hashlib
+import itertools
 import os
 import re
 import stat
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from tuner.core.errors import InputError, OutputError, RecordingError
@@ -274,6 +275,8 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
 def folder_for(out: Path | None, *, resume: bool = False) -> Path:
     """Return the folder to write into: the one named, or a new one under ``runs/``.
 
+    `result_folder` makes it, once there is something to write.
+
     Parameters
     ----------
     resume
@@ -292,3 +295,23 @@ def folder_for(out: Path | None, *, resume: bool = False) -> Path:
     if resume and not exists(out):
         raise InputError(out, "does not exist, so there is nothing to resume", "leave --resume out")
     return out
+
+
+def result_folder(out: Path | None) -> Path:
+    """Make the folder of `folder_for`, and return it.
+
+    A new one is of this process alone, whatever else began within the same second.
+
+    Raises
+    ------
+    OutputError
+        A file is in the way, or the system refuses.
+    """
+    folder = folder_for(out)
+    make_folder(folder if out is not None else folder.parent)
+    for number in itertools.count(2) if out is None else ():
+        with _refusals(folder), suppress(FileExistsError):
+            folder.mkdir()
+            break
+        folder = folder.with_name(f"{folder.name.partition('.')[0]}.{number}")
+    return folder

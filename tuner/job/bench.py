@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
-from tuner.core.disk import folder_for, make_folder
+from tuner.core.disk import folder_for, result_folder
 from tuner.core.errors import ConfigError
 from tuner.core.numerics import Z95
 from tuner.core.runtime import PROGRAM, versions
@@ -21,6 +21,7 @@ from tuner.ground.experiments import measure, names_of
 from tuner.ground.measurement import Measurement, error_of, scaled_of, value_of
 from tuner.ground.plan import BenchFile, YawSpin, read_bench
 from tuner.report import render
+from tuner.report.contents import forget
 from tuner.result import (
     BEST_FIT_FILE,
     CoefficientResult,
@@ -80,12 +81,13 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
         The result folder cannot be written to.
     """
     began = time.perf_counter()
-    plan, folder = read_bench(path), folder_for(out)
+    plan = read_bench(path)
+    folder_for(out)
     given = read_vehicle(find_config("vehicles", plan.vehicle, path.parent))
     start = given if plan.weighed_mass is None else given.replace(mass=plan.weighed_mass)
     measurements, combination, vehicle = _estimate(path, plan, start)
     return written(
-        folder,
+        out,
         given,
         vehicle.replace(name=f"{start.name}_bench"),
         measurements,
@@ -99,7 +101,7 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
 
 
 def written(
-    folder: Path,
+    out: Path | None,
     given: VehicleFile,
     vehicle: VehicleFile,
     measurements: tuple[Measurement, ...],
@@ -115,6 +117,8 @@ def written(
 
     Parameters
     ----------
+    out
+        The folder; None makes one under ``runs/``.
     given, vehicle
         As the user has it, and with the measured coefficients.
     measurements, combination, findings
@@ -145,7 +149,8 @@ def written(
             message=Ending.NO_FURTHER_GAIN,
         ),
     )
-    make_folder(folder)
+    folder = result_folder(out)
+    forget(folder)
     made_by = {"made_by": f"{PROGRAM} {result.versions[PROGRAM]}", **source}
     write_vehicle(vehicle.replace(source=made_by), folder / BEST_FIT_FILE, header=header)
     bench_record(combination, measurements).write(folder)

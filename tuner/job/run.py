@@ -14,7 +14,7 @@ from math import nan
 from pathlib import Path
 
 from tuner.config import Options, Settings, settle
-from tuner.core.disk import folder_for, make_folder
+from tuner.core.disk import folder_for, result_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.core.phrases import clause
 from tuner.core.spans import span
@@ -45,6 +45,7 @@ from tuner.job.results import (
     write_next_flight,
 )
 from tuner.report import render, write_search, write_traces
+from tuner.report.contents import forget
 from tuner.report.result_texts import export_sentence
 from tuner.result import BEST_FIT_FILE, Run, RunResult
 from tuner.search.estimation import OnProgress
@@ -101,19 +102,24 @@ def run(
     settings, logged = as_logged(settle(options))
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
+    if options.bench and folder.resolve() == Path(options.bench).resolve():
+        raise InputError("--out", "is the folder of --bench", "name another folder")
     job, findings = prepared(settings)
     findings = (*logged, *findings)
     explanation = Explanation(listener.on_message)
     _check(findings, explanation, force=options.force)
+    with span("check"):
+        at_start = tuple(check_information(job))
+    _check(at_start, explanation, force=options.force)
+    folder = result_folder(out)
     found, validation, (selected, fitted, examination) = _fitted(
         job,
-        findings,
+        (*findings, *at_start),
         folder,
         explanation,
         listener,
         command=command,
         resume=resume,
-        force=options.force,
     )
     job = selected.job
     fitted, examination, inertia = _balanced(selected, fitted, examination, explanation, listener)
@@ -201,17 +207,13 @@ def _fitted(
     *,
     command: str,
     resume: bool,
-    force: bool,
 ) -> tuple[Selected, Validation, Examined]:
     """Return where the search of a job ends, how it meets the flights, and how well that is known.
 
     What was found is written before it is examined.
     """
-    with span("check"):
-        at_start = tuple(check_information(job))
-    _check(at_start, explanation, force=force)
-
-    make_folder(folder)
+    if not resume:
+        forget(folder)
     on_progress = _keeping_best(folder, listener)
     try:
         found = search_with_terms(
@@ -221,7 +223,7 @@ def _fitted(
             on_progress=on_progress,
             on_message=listener.on_message,
             on_estimates=listener.on_estimates,
-            findings=(*findings, *at_start),
+            findings=findings,
         )
     except (KeyboardInterrupt, OutputError, EngineError):
         listener.on_stop(

@@ -62,7 +62,8 @@ def fit_without_pose(
         The result folder cannot be written to.
     """
     began = time.perf_counter()
-    start, folder = settings.vehicle, folder_for(out)
+    start = settings.vehicle
+    folder_for(out)
     held_out = [flight for flight in flights if flight.name in settings.job.holdout]
     to_fit = [flight for flight in flights if flight.name not in settings.job.holdout]
     measured, used, unusable = _measured(to_fit, start, listener)
@@ -79,7 +80,7 @@ def fit_without_pose(
         combination = _combined(measurements, known)
         vehicle = vehicle_of(path, _as_flat(start, combination), combination)
     return written(
-        folder,
+        out,
         start,
         vehicle.replace(name=f"{start.name}_inertial"),
         measurements,

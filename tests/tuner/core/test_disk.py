@@ -9,7 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from tuner.core.disk import cache_folder, check_folder, exists, make_folder, whole_file, write_text
+from tuner.core.disk import (
+    cache_folder,
+    check_folder,
+    exists,
+    make_folder,
+    result_folder,
+    whole_file,
+    write_text,
+)
 from tuner.core.errors import ConfigError, InputError, OutputError
 from tuner.core.files import read_arrays
 from tuner.core.shipped import configs_folder, find_config
@@ -111,3 +119,11 @@ def test_a_path_is_a_path_and_a_bare_name_is_a_shipped_file(tmp_path):
     assert find_config("vehicles", "hovergames", tmp_path) == tmp_path / "hovergames"
     with pytest.raises(ConfigError, match="did you mean 'hovergames'"):
         find_config("vehicles", "hovergaems", tmp_path)
+
+
+def test_runs_that_begin_within_a_second_get_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folders = {result_folder(None) for _ in range(5)}
+    assert len(folders) == 5
+    assert {folder.parent for folder in folders} == {Path("runs")}
+    assert result_folder(tmp_path / "named") == result_folder(tmp_path / "named")

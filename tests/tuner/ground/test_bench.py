@@ -63,7 +63,11 @@ def test_the_result_is_exported_like_a_fit_s(example, tmp_path):
 
 def test_the_terminal_gets_each_experiment_and_the_agreement(tmp_path, capsys):
     plan = {"experiments": [HOVER]}
+    left = tmp_path / "out" / "sensitivity.json"  # of an earlier run
+    left.parent.mkdir()
+    left.write_text("{}")
     assert run(tmp_path, plan, "--out", str(tmp_path / "out")) == 0
+    assert not left.exists()
     out = capsys.readouterr().out
     assert "hover_weights: motor_constant 1.4" in out
     assert "nothing checks the experiments" in out

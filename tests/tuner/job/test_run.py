@@ -262,6 +262,8 @@ def test_an_interrupted_run_goes_on_elsewhere_to_the_same_numbers(broken, salvag
             raise KeyboardInterrupt
 
     job = Options([str(broken)], **SHORT)
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut" / "result.json").write_text("of an earlier run")
     with pytest.raises(KeyboardInterrupt):
         run(job, out=tmp_path / "cut", listener=Listener(on_iteration=interrupt))
     assert (tmp_path / "cut" / "best_fit.yaml").exists()

@@ -47,6 +47,13 @@ def test_the_folder_holds_tables_matrices_and_the_report(examined):
     assert len(about["flights"][0]["sha256"]) == 64
 
 
+def test_the_folder_of_a_fit_is_left_alone(bag, tmp_path):
+    (tmp_path / "result.json").write_text("{}")
+    with pytest.raises(InputError, match="holds the result of a fit"):
+        tuner.sensitivity([bag], out=tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
+
+
 def test_the_report_says_that_nothing_was_fitted(examined):
     text = (examined.folder / "report.html").read_text()
     assert "nothing fitted" in text
