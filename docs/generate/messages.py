@@ -120,8 +120,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.SETPOINTS_FOREIGN: "Another controller flew, or another reference: the recorded rate "
     "set-points do not follow from reference, state and controller file. Give the controller that "
     "flew (--controller), or enter below it (inlet: body_rate).",
-    Code.HOLDING_BETTER: "Holding its recorded state predicts this flight better than the "
-    "fitted coefficients do. Predict less far ahead, or with more recorded.",
+    Code.HOLDING_BETTER: "Holding what was recorded of this flight's state, all of it or what the "
+    "line names, predicts it better than the fitted coefficients do, by more than chance. Predict "
+    "less far ahead, or with more recorded.",
     Code.INERTIA_BALANCED: "Errors in rotor speeds would pass for inertia: it is the one at which "
     "recorded motion and rotor speeds balance. Nothing to do.",
     Code.INERTIA_NOT_BALANCED: "Errors in rotor speeds pass for inertia: what predicts the "

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
 from sim_jax.schedule import Schedule
 from sim_jax.state import AIRBORNE
@@ -31,6 +32,9 @@ from tuner.vehicle.model import Model, model_of, schedule_of
 
 AT_ONCE = 4096
 """Predictions that are simulated side by side."""
+SHARED = 2.0
+"""s over which predictions share their errors: the half second that they overlap in, and what then
+disturbs the flight."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +59,34 @@ class Predictions:
 
     def mean(self, seconds: float) -> dict[str, float]:
         """Return each quantity's mean error so many s ahead, NaN of what is not predicted."""
-        (step,) = np.flatnonzero(np.isclose(self.ahead, seconds, atol=1e-6))
+        step = self._step(seconds)
         means = {name: float(np.nanmean(errors[step])) for name, errors in self.errors.items()}
         return dict.fromkeys(PREDICTED, np.nan) | means
+
+    def worse_than(self, other: Predictions, seconds: float) -> tuple[str, ...]:
+        """Return which quantities another predicts better so many s ahead, from the same states.
+
+        In the mean, and by more than chance: the test of Diebold and Mariano ("Comparing predictive
+        accuracy", 1995) on differences of errors, 95 %. Predictions share their errors for
+        `SHARED`, so that means over so much scatter, by Student's t; of one nothing can be said.
+        """
+        step = self._step(seconds)
+        count = round((self.begins[-1] - self.begins[0]) / SHARED)
+        if count < 2:
+            return ()
+        allowed = stdtrit(count - 1, 0.975) / np.sqrt(count)
+        worse = []
+        for name, errors in self.errors.items():
+            apart = errors[step] - other.errors[name][step]
+            parts = np.array_split(apart[np.isfinite(apart)], count)
+            means = np.array([np.mean(part) for part in parts if len(part)])
+            if len(means) == count and np.mean(means) > allowed * np.std(means, ddof=1):
+                worse.append(name)
+        return tuple(worse)
+
+    def _step(self, seconds: float) -> int:
+        (step,) = np.flatnonzero(np.isclose(self.ahead, seconds, atol=1e-6))
+        return int(step)
 
 
 def predict(

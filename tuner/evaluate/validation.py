@@ -18,7 +18,6 @@ from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, Pose
 from tuner.evaluate.torque_observer import FED, TorqueObserver
 from tuner.findings.findings import Code, Finding
-from tuner.findings.sentences import PREDICTED
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import CLOCKS, OFFSETS
@@ -133,6 +132,8 @@ class Validation:
         Likewise by the fitted vehicle, with the torque that fed rotors do not show before them.
     predicted_holding
         That the state stays as it was recorded, at the times of these predictions.
+    worse_than_holding
+        s ahead -> the quantities that the fitted vehicle predicts worse than that, chance apart.
     turning_explained
         Share of the squared change of body rate that the fitted vehicle predicts; flights in
         windows only.
@@ -145,6 +146,7 @@ class Validation:
     predicted_best: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     predicted_with_observer: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     predicted_holding: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
+    worse_than_holding: Mapping[str, Mapping[float, tuple[str, ...]]] = field(default_factory=dict)
     turning_explained: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -162,6 +164,10 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
         predicted_best=_errors(predictions),
         predicted_with_observer=_errors(_observed(job, fitted, vehicle)),
         predicted_holding=_errors(held),
+        worse_than_holding={
+            name: {seconds: of.worse_than(held[name], seconds) for seconds in AHEAD}
+            for name, of in predictions.items()
+        },
         turning_explained={
             name: 1.0 - _turning_missed(of) / _turning_missed(held[name])
             for name, of in predictions.items()
@@ -326,7 +332,7 @@ def _beyond_limit(flight: Flight, control: PositionControl, time: Array, positio
 
 
 def holding_better(job: Job, validation: Validation) -> tuple[Finding, ...]:
-    """Return what of a flight is predicted no better than by leaving it as it is, in the mean."""
+    """Return what of a flight is predicted worse than by leaving it as it is, chance apart."""
     findings = []
     for recording in job.recordings:
         name = recording.flight.name
@@ -336,12 +342,14 @@ def holding_better(job: Job, validation: Validation) -> tuple[Finding, ...]:
             strict=True,
         )
         for best, held in pairs:
+            lost = validation.worse_than_holding[name][best.seconds]
+            if not lost:
+                continue
             numbers = {"seconds": best.seconds}
-            for quantity in PREDICTED:
-                of_best, of_held = getattr(best, quantity), getattr(held, quantity)
-                if of_best is not None and of_held is not None and of_best > of_held:
-                    numbers |= {quantity: of_best, f"{quantity}_held": of_held}
-            lost = tuple(quantity for quantity in PREDICTED if quantity in numbers)
-            if lost:
-                findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, lost))
+            for quantity in lost:
+                numbers |= {
+                    quantity: getattr(best, quantity),
+                    f"{quantity}_held": getattr(held, quantity),
+                }
+            findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, lost))
     return tuple(findings)

@@ -121,18 +121,21 @@ def setpoints_foreign(finding: Finding) -> str:
 
 
 def holding_better(finding: Finding) -> str:
-    """Return what is predicted worse than by holding the recorded state."""
-    numbers = finding.numbers
+    """Return what is predicted worse than by holding it as it was recorded."""
+    numbers, names = finding.numbers, finding.names
     lost = listed(
         [
-            f"{name.replace('_', ' ')} to {numbers[name]:.3g} {unit} instead of "
+            f"{name.replace('_', ' ')} by {numbers[name]:.3g} {unit} instead of "
             f"{numbers[f'{name}_held']:.3g} {unit}"
             for name, unit in PREDICTED.items()
-            if name in finding.names
+            if name in names
         ]
     )
+    some = listed([name.replace("_", " ") for name in names])
+    what = "state" if set(names) == set(PREDICTED) else some
+    it = "it" if len(names) in (1, len(PREDICTED)) else "them"
     return (
-        f"Holding its state predicts better {numbers['seconds']:g} s ahead: the fitted "
+        f"Holding its {what} predicts {it} better {numbers['seconds']:g} s ahead: the fitted "
         f"coefficients miss {lost} in the mean."
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.prediction import hold, predict
+from tuner.evaluate.prediction import Predictions, hold, predict
 from tuner.findings.sentences import PREDICTED
 from tuner.recordings.flight import Series
 from tuner.recordings.states import FILTER_HALF_WIDTH
@@ -132,3 +132,29 @@ def test_fitted_starts_meet_a_flight_no_worse_than_recorded_ones(full_flight, up
     predicted = comparison.fly(wrong)[full_flight.name]
     met = comparison.fly(wrong, fitted_starts=True)[full_flight.name]
     assert met.rmse.length("attitude") < predicted.rmse.length("attitude")
+
+
+def of_attitude(error, seconds=0.5):
+    begins = 0.1 * np.arange(len(error))
+    return Predictions(begins, np.array([seconds]), {"attitude": np.asarray(error)[None]})
+
+
+def test_another_predicts_better_where_its_errors_are_smaller_by_more_than_chance():
+    random = np.random.default_rng(0)
+    held = 0.07 + 0.02 * random.standard_normal(300)
+    worse = of_attitude(held + 0.02 + 0.02 * random.standard_normal(300))
+    assert worse.worse_than(of_attitude(held), 0.5) == ("attitude",)
+    assert of_attitude(held).worse_than(worse, 0.5) == ()
+    lost = np.where(np.arange(300) < 30, np.nan, worse.errors["attitude"][0])
+    assert of_attitude(lost).worse_than(of_attitude(held), 0.5) == ("attitude",)
+    few = of_attitude(worse.errors["attitude"][0, :20])
+    assert few.worse_than(of_attitude(held[:20]), 0.5) == ()
+
+
+def test_errors_that_predictions_share_are_chance_but_once():
+    found = []
+    for seed in range(200):
+        random = np.random.default_rng(seed)
+        disturbed = np.repeat(random.standard_normal(30), 10)  # 1 s each, all of 30 s
+        found.append(of_attitude(0.1 + 0.02 * disturbed).worse_than(of_attitude([0.1] * 300), 0.5))
+    assert 0.0 < np.mean([bool(names) for names in found]) < 0.06  # 2.5 % to one side

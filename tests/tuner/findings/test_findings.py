@@ -3,6 +3,7 @@
 import pytest
 
 from tuner.findings.findings import Code, Finding, one_line, remedy, sentence
+from tuner.findings.sentences import PREDICTED
 
 #: What each code's maker gives beside it.
 MADE = {
@@ -280,3 +281,19 @@ def test_a_lag_is_of_what_comes_late(lag: float, says: str) -> None:
     assert says in sentence(
         Finding(Code.TERM_SHOWS, "warning", "tachometer_lag", numbers, ("tachometer_lag",))
     )
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (("attitude",), "Holding its attitude predicts it better 0.5 s ahead"),
+        (("velocity", "body_rate"), "Holding its velocity and body rate predicts them better"),
+        (tuple(PREDICTED), "Holding its state predicts it better"),
+    ],
+)
+def test_what_is_predicted_worse_than_held_is_named(names: tuple[str, ...], says: str) -> None:
+    numbers = {"seconds": 0.5} | dict.fromkeys(names, 0.08)
+    numbers |= {f"{name}_held": 0.0663 for name in names}
+    found = sentence(Finding(Code.HOLDING_BETTER, "warning", "a", numbers, names))
+    assert found.startswith(says)
+    assert found.count("instead of 0.0663") == len(names)
