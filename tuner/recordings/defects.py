@@ -44,6 +44,9 @@ RANGES: Mapping[str, tuple[float, float]] = {
 WRONG_UNIT_SHARE = 0.5
 """Share of samples out of range above which a signal is in another unit rather than corrupt."""
 
+COARSE_SHARE = 0.5
+"""Share of stamps on which samples differ, above which stamps are too coarse for a flight."""
+
 LONGEST_RECORDING = 43_200.0
 """No recording lasts longer, in s, to either side of its middle."""
 OUTLIER_THRESHOLD = 6.0
@@ -116,8 +119,12 @@ def clean(
     )
     note(int(apart.sum()), NoteCode.FAR_IN_TIME)
     time, values = time[~apart], values[~apart]
-    time, values, doubles = _merge_equal_times(time, values)
-    note(doubles, NoteCode.STAMPED_TWICE)
+    time, values, doubles, unlike = _merge_equal_times(time, values)
+    if signal != "rotor_speed" and unlike > COARSE_SHARE * len(time):
+        step = float(np.median(np.diff(time)))
+        note(doubles, NoteCode.STAMPS_COARSE, "warning", seconds=step)
+    else:
+        note(doubles, NoteCode.STAMPED_TWICE)
     note(0 if signal == "lap" else _missing(time), NoteCode.SAMPLES_MISSING)
 
     if signal == "attitude":
@@ -166,19 +173,28 @@ def _missing(time: Array) -> int:
     return int(np.sum(np.rint(steps[~near] / usual) - 1, where=steps[~near] > usual))
 
 
-def _merge_equal_times(time: Array, values: Array) -> tuple[Array, Array, int]:
-    """Keep one row of each time; the columns that a row lacks are filled from its twins."""
+def _merge_equal_times(time: Array, values: Array) -> tuple[Array, Array, int, int]:
+    """Keep one row of each time; the columns that a row lacks are filled from its twins.
+
+    Returns
+    -------
+    tuple
+        The times, the rows, how many were left out, and how many times have rows that differ.
+    """
     if len(time) < 2 or np.all(np.diff(time) > 0):
-        return time, values, 0
-    kept, start = np.unique(time, return_index=True)
+        return time, values, 0, 0
+    kept, start, first_of = np.unique(time, return_index=True, return_inverse=True)
     merged = values[start]
+    both = np.isfinite(values) & np.isfinite(merged[first_of])
+    other = ((values != merged[first_of]) & both).any(axis=1)
+    unlike = len(np.unique(first_of[other]))
     filled = 0
     for row, (first, last) in enumerate(zip(start, [*start[1:], len(time)], strict=True)):
         for twin in range(first + 1, last):
             lacking = np.isnan(merged[row]) & np.isfinite(values[twin])
             merged[row, lacking] = values[twin, lacking]
             filled += bool(lacking.any())
-    return kept, merged, len(time) - len(kept) - filled
+    return kept, merged, len(time) - len(kept) - filled, unlike
 
 
 def _unit_quaternions(time: Array, values: Array) -> tuple[Array, Array, int]:
@@ -337,13 +353,14 @@ def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list
         time, values = series[name].time, series[name].values
         changes = np.flatnonzero((values[1:] != values[:-1]).any(axis=1))
         last = int(changes[-1]) + 1 if len(changes) else 0
-        if (
-            not last
-            or time[-1] - time[last] < SHORTEST_STALE
-            or not _is_moving(series, name, time[last])
-        ):
+        if time[-1] - time[last] < SHORTEST_STALE or not _is_moving(series, name, time[last]):
             continue
-        kept[name] = Series(time[: last + 1], values[: last + 1])
+        if last:
+            kept[name] = Series(time[: last + 1], values[: last + 1])
+        elif name == "body_rate":  # nothing was ever measured; an attitude is doubted elsewhere
+            del kept[name]
+        else:
+            continue
         numbers = {"seconds": float(time[-1] - time[last])}
         notes.append(
             Note(NoteCode.STALE, count=len(time) - last - 1, numbers=numbers, names=(name,))

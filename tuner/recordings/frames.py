@@ -141,7 +141,8 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
             carried = (up * pull).sum(axis=1) / np.linalg.norm(pull, axis=1)
         else:
             carried = rotate(turned, force)[:, 2] / GRAVITY
-        return (min(scores) if scores else 1.0), float(np.nanmean(carried))
+        known = carried[np.isfinite(carried)]
+        return min(scores, default=1.0), float(known.mean()) if len(known) else 1.0
 
     fit, upright = agreement(lambda values: values)
     if fit > GOOD_AGREEMENT and upright > 0.5:
@@ -189,7 +190,9 @@ def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
     here = _residual_share(turning, gyro)
     best = min(_RATES, key=lambda r: _residual_share(turning, r.read(gyro)))
     there = _residual_share(turning, best.read(gyro))
-    of_another_unit = there < here / 20 and correlation(turning, best.read(gyro)) > GOOD_AGREEMENT
+    alike = correlation(turning, best.read(gyro))
+    slope = alike * rms(best.read(gyro)) / rms(turning)  # whatever the gyro's noise
+    of_another_unit = there < here / 20 and alike > GOOD_AGREEMENT and slope < LARGEST_RATIO
     if (there < 0.7 and there < here / 2) or of_another_unit:
         return best, None
     doubt = Note(NoteCode.BODY_RATE_DOUBTED, numbers={"left": here})

@@ -86,6 +86,13 @@ class NoteCode(Worded):
     OUT_OF_ORDER = "out_of_order", "{samples} out of order, put in order"
     FAR_IN_TIME = "far_in_time", "{samples} stamped hours away from the others dropped"
     STAMPED_TWICE = "stamped_twice", "{samples} with a stamp seen before dropped"
+    STAMPS_COARSE = (
+        "stamps_coarse",
+        (
+            "{samples} differ from another with the same stamp and are dropped: the stamps, "
+            "{milliseconds:.3g} ms apart, have too few digits"
+        ),
+    )
     SAMPLES_MISSING = "samples_missing", "{samples} seem to be missing between those recorded"
     NO_UNIT_QUATERNION = (
         "no_unit_quaternion",

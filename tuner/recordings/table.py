@@ -311,7 +311,7 @@ def _dates(path: Path, column: pyarrow.ChunkedArray, field: str) -> Nanoseconds:
         whole = compute.fill_null(compute.cast(stamps, pyarrow.int64()), NO_TIME)
         times = np.asarray(np.from_dlpack(whole), dtype=np.int64)
         return _over_midnight(times) if only_of_day else times
-    first = next((cell for cell in text.to_pylist() if cell), "")
+    first = next((cell for cell in column.to_pylist() if cell), "")
     raise RecordingError(
         path,
         f"its '{field}' holds {first[:40]!r}, which is neither a number nor a date",

@@ -212,6 +212,26 @@ def test_a_last_pose_that_is_sent_for_good_is_no_pose_while_the_gyro_turns() -> 
     assert without_stale(signals | {"body_rate": Series(TIME, noise)})[1] == []
 
 
+def test_a_gyro_that_never_changes_measured_nothing_where_the_vehicle_moves() -> None:
+    signals = flight(20.0, moves=True) | {"body_rate": Series(TIME, np.zeros((len(TIME), 3)))}
+    kept, (note,) = without_stale(signals)
+    assert (note.code, note.names) == (NoteCode.STALE, ("body_rate",))
+    assert set(kept) == {"position", "attitude"}
+    rest = {name: Series(TIME, 0 * s.values + s.values[0]) for name, s in signals.items()}
+    assert without_stale(rest) == (rest, [])
+
+
+@pytest.mark.parametrize(("digits", "code"), [(1, NoteCode.STAMPS_COARSE), (2, None)])
+def test_stamps_of_too_few_digits_are_a_warning(digits, code) -> None:
+    moving = np.column_stack([np.cos(TIME), np.sin(TIME), 1.0 + 0.0 * TIME])
+    _, _, notes = clean("position", "rows", np.round(TIME, digits), moving)
+    assert [note.code for note in notes if note.kind == "warning"] == ([code] if code else [])
+    still = np.repeat(moving[::10], 10, axis=0)  # what a logger repeats was measured then
+    _, _, notes = clean("position", "rows", np.floor(10 * TIME + 1e-6) / 10, still)
+    assert NoteCode.STAMPED_TWICE in {note.code for note in notes}
+    assert not any(note.kind == "warning" for note in notes)
+
+
 @pytest.mark.parametrize("lost", [np.s_[:300], np.s_[:]])
 def test_where_no_position_is_seen_nothing_is_taken_for_motion(lost) -> None:
     signals = flight(6.0, moves=True)

@@ -367,3 +367,7 @@ def test_degrees_per_second_are_noticed_however_noisy_the_gyro() -> None:
     unlike = Series(time, np.degrees(noise[::-1]) * 5.0)
     _, (*_, note) = correct_frames({**series, "body_rate": unlike}, {})
     assert note.code is NoteCode.BODY_RATE_DOUBTED
+    milli = Series(time, 1e3 * np.degrees(turning + noise))
+    read, (*_, note) = correct_frames({**series, "body_rate": milli}, {})
+    assert note.code is NoteCode.BODY_RATE_DOUBTED
+    np.testing.assert_array_equal(read["body_rate"].values, milli.values)
