@@ -15,7 +15,7 @@ import signal
 import threading
 import uuid
 from collections.abc import Callable, Collection, Iterator
-from concurrent.futures import CancelledError, Executor, Future
+from concurrent.futures import CancelledError, Future, InvalidStateError
 from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import resource_tracker
@@ -170,7 +170,6 @@ class OnDask(Engine):
 
     def __init__(self, client: Client, at_once: int, store: ContentStore) -> None:
         self.at_once = self.ahead = at_once
-        self.executor: Executor = client.get_executor(pure=False)
         self._client, self._store = client, store
         self._topic = f"tune-{uuid.uuid4().hex}"
         self._listeners: dict[str, Report] = {}
@@ -186,17 +185,18 @@ class OnDask(Engine):
         with self._translated():
             # bytes, lest the scheduler, which looks at arguments, import and hold all of it
             content = cloudpickle.dumps((function, task))
-            inner = self.executor.submit(run_task, content, identity, self._topic)
+            inner = self._client.submit(run_task, content, identity, self._topic, pure=False)
 
-        def ended(inner: Future[R]) -> None:
-            self._listeners.pop(identity, None)
-            if outcome.cancelled():
-                return
-            try:
-                with self._translated():
-                    outcome.set_result(inner.result())
-            except BaseException as error:
-                outcome.set_exception(error)
+        async def follow() -> None:
+            # a worker that is lost with its result, once that was announced, is an error here too
+            with contextlib.suppress(InvalidStateError):  # nobody wants it any longer
+                try:
+                    with self._translated():
+                        outcome.set_result(await inner.result())
+                except BaseException as error:
+                    outcome.set_exception(error)
+                finally:
+                    self._listeners.pop(identity, None)
 
         def cancelled(outcome: Future[R]) -> None:
             if outcome.cancelled():
@@ -204,7 +204,7 @@ class OnDask(Engine):
                     Event(stop_name(identity), client=self._client).set()
                 inner.cancel()
 
-        inner.add_done_callback(ended)
+        self._client.loop.add_callback(follow)
         outcome.add_done_callback(cancelled)
         return outcome
 

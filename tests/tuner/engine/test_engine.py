@@ -3,9 +3,10 @@ import os
 import time
 
 import pytest
+from distributed import Client
 
 from tests.tuner.engine import tasks
-from tuner.core.errors import InputError, RecordingError
+from tuner.core.errors import EngineError, InputError, RecordingError
 from tuner.engine import HERE, current, engine_for, using
 from tuner.engine.engine import Here
 
@@ -119,3 +120,12 @@ def test_no_scheduler_is_one_line(monkeypatch):
         engine_for(None, "tcp://127.0.0.1:1"),
     ):
         pass
+
+
+def test_a_result_that_is_lost_on_its_way_is_an_error(two_workers, monkeypatch):
+    async def lost(*_, **__):
+        raise OSError("the worker that had it is gone")
+
+    monkeypatch.setattr(Client, "_gather", lost)
+    with pytest.raises(EngineError, match="does not answer any more"):
+        two_workers.submit(tasks.square, 3).result(timeout=60)
