@@ -56,7 +56,7 @@ ONE_THREAD: Callable[[F], F] = threadpool_limits.wrap(limits=1, user_api="blas")
 
 @taking(Options)
 @ONE_THREAD
-def fit(flights: Sequence[Named], **options: Any) -> Run:
+def fit(flights: Named | Sequence[Named], **options: Any) -> Run:
     """Fit the coefficients of a vehicle to recordings, as ``tune --flights`` does.
 
     Parameters
@@ -94,8 +94,8 @@ def fit(flights: Sequence[Named], **options: Any) -> Run:
 
 @taking(RecordingOptions)
 def compare(
-    flights: Sequence[Named],
-    vehicles: Sequence[Named] | Mapping[str, Named | VehicleFile],
+    flights: Named | Sequence[Named],
+    vehicles: Named | Sequence[Named] | Mapping[str, Named | VehicleFile],
     *,
     out: Sequence[Named] = (),
     **options: Any,
@@ -127,7 +127,8 @@ def compare(
     from tuner.evaluate.comparison import compare as compare_vehicles  # noqa: PLC0415 (jax)
 
     given = RecordingOptions.of(flights, **options)
-    labelled = vehicles if isinstance(vehicles, Mapping) else {str(name): name for name in vehicles}
+    names = [vehicles] if isinstance(vehicles, Named) else vehicles
+    labelled = names if isinstance(names, Mapping) else {str(name): name for name in names}
     sets: dict[str, str | VehicleFile] = {k: text_of(v) for k, v in labelled.items()}
     table, _ = compare_vehicles(given, sets, [Path(path) for path in out])
     return table
@@ -136,7 +137,7 @@ def compare(
 @taking(ExaminationOptions)
 @ONE_THREAD
 def sensitivity(
-    flights: Sequence[Named],
+    flights: Named | Sequence[Named],
     *,
     arena: Sequence[float] | None = None,
     **options: Any,

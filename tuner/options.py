@@ -46,7 +46,7 @@ class FlightOptions:
     """Read settings from this job file. Default: tune.yaml beside the flights, if there is one."""
 
     @classmethod
-    def of(cls, flights: Sequence[str | Path], **given: Any) -> Self:
+    def of(cls, flights: str | Path | Sequence[str | Path], **given: Any) -> Self:
         """Return options as Python gives them: ``free`` and ``fixed``, and paths for text.
 
         Raises
@@ -64,7 +64,8 @@ class FlightOptions:
         }
         if words.get("out") is not None:
             words["out"] = Path(words["out"])
-        return cls([str(path) for path in flights], **words)
+        paths = [flights] if isinstance(flights, str | Path) else flights
+        return cls([str(path) for path in paths], **words)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -84,6 +84,19 @@ def test_compare_takes_vehicles_as_they_are(bag, updated):
     assert table.of("flown", "small_circle").x < 2e-4
 
 
+def test_a_single_recording_and_a_single_vehicle_need_no_list(bag):
+    table = tuner.compare(str(bag), "hovergames", controller=ControllerFile())
+    assert {row.vehicle for row in table.rows} == {"hovergames"}
+    with pytest.raises(InputError, match=r"nowhere\.bag: does not exist"):
+        tuner.fit("nowhere.bag")
+
+
+@pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf"), 1e9])
+def test_a_clock_that_is_none_is_refused(bag, rate):
+    with pytest.raises(InputError, match=r"rate: is .* Hz; give 1 to 10000 Hz"):
+        tuner.load_flight(bag, rate=rate)
+
+
 def test_simulate_flies_what_it_is_given(updated):
     (flight,) = tuner.simulate("circle", vehicle=updated, duration=4.0)
     (same,) = tuner.simulate("circle", vehicle="hovergames_updated", duration=4.0)

@@ -77,7 +77,12 @@ class Client:
 
     @taking(FitOptions)
     def fit(
-        self, flights: Sequence[Named], *, name: str = "", out: Named | None = None, **options: Any
+        self,
+        flights: Named | Sequence[Named],
+        *,
+        name: str = "",
+        out: Named | None = None,
+        **options: Any,
     ) -> Run:
         """Fit the coefficients of a vehicle to recordings, on the server; see `tuner.fit`.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.core.errors import RecordingError
+from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.numerics import Array
 from tuner.recordings.clocks import align_pose, message_times
 from tuner.recordings.defects import clean, without_stale
@@ -104,8 +104,10 @@ class ReadOptions:
         Raises
         ------
         ConfigError
-            The topic map or the side-car is wrong.
+            The topic map, the side-car or the rate is wrong.
         """
+        if not 1.0 <= rate <= 10_000.0:
+            raise ConfigError("rate", f"is {rate:g} Hz", "give 1 to 10000 Hz")
         sidecar = read_sidecar(path)
         if topics is None and sidecar.topics is not None:
             topics = load_topic_map(sidecar.topics, base=sidecar_path(path).parent)
