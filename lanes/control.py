@@ -157,7 +157,7 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     body = p["jaxpr"]
     once = length == 1
     if not once:
-        operands = lower.computed(operands)
+        operands = lower.computed(operands, consts)
         lower.settle(before=True)
     fixed = [_laid_before(lower, v, indexed=False) for v in operands[:consts]]
     rows = [_laid_before(lower, v, indexed=not once) for v in operands[consts + carried :]]
@@ -229,7 +229,7 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
 def _while(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> list[Value]:
     p = eqn.params
     conds, consts = p["cond_nconsts"], p["body_nconsts"]
-    operands = lower.computed(operands)
+    operands = lower.computed(operands, conds + consts)
     lower.settle(before=True)
     operands = [
         *(_laid_before(lower, v, indexed=False) for v in operands[: conds + consts]),

@@ -31,7 +31,7 @@ from lanes.rules import (
     mangled,
     type_of,
 )
-from lanes.tangents import Factors, Graph, Node
+from lanes.tangents import Factor, Factors, Graph, Node
 from lanes.values import (
     OF_COLUMN,
     OF_LANE,
@@ -57,6 +57,8 @@ FEW = 512
 MOST_COLUMNS = 15
 """Columns that a block of lanes takes at most; odd, for what lies an even number of lines apart
 meets in a few sets of the cache."""
+FEWEST = 2
+"""Sums from which it is asked whether a number moves before it is added to them."""
 SPILLED = 24
 """Elements above which an array that enters a loop is laid in memory."""
 
@@ -331,13 +333,14 @@ class Lowering:
         def of_column(number: ir.Value) -> None:
             found: dict[Node, ir.Value] = {}
             self._column, self.e.flags = number, LINEAR
+            begun = self._begun(graph, shared)
             for node in graph.nodes:
                 if node.terms is not None:
-                    found[node] = self._sum_of(node, shared, [found[x] for x in node.terms])
+                    found[node] = self._sum_of(node, shared, found, *begun.get(node, ()))
                 elif not isinstance(node.of, Tangent):
                     found[node] = node.of
-                elif node.of.is_read:
-                    found[node] = self._read_number(node.of.operands[0], node.of.operands[1:])
+                elif node.is_read:
+                    found[node] = self._number_of(node)
                 else:
                     given = (found[x] if isinstance(x, Node) else x for x in node.operands)
                     found[node] = self.apply(node.of.name, node.of.params, *given)
@@ -350,21 +353,71 @@ class Lowering:
         for node, slot in kept:
             node.operands = slot.operands
 
+    def _begun(
+        self, graph: Graph, factors: Mapping[Any, ir.Value]
+    ) -> dict[Node, tuple[ir.Value, Set[Node]]]:
+        """Begin sums with what moves in a few columns; return them, and what is in them.
+
+        Where it does not move in a column, nothing is computed of it there.
+        """
+        begun: dict[Node, tuple[ir.Value, Set[Node]]] = {}
+        for node in graph.nodes:
+            sums = [reader for reader in node.readers if reader.terms is not None]
+            if not node.is_told or len(sums) < FEWEST:
+                continue
+            for reader in sums:
+                if reader not in begun:
+                    first = next(iter(reader.sum))
+                    ready = reader.sum[first] == 1.0 and first.is_read and not first.is_told
+                    begun[reader] = (
+                        (self._number_of(first), {first})
+                        if ready
+                        else (constant(self.e.vector(node.kind), 0.0), set())
+                    )
+            place = self.b.gep(node.of.operands[0].moves, [self._column])
+            moves = self.b.icmp_unsigned("!=", self.b.load(place), constant(ir.IntType(8), 0))
+            before = self.b.block
+            with self.b.if_then(moves):
+                number, inside = self._number_of(node), self.b.block
+                totals = [
+                    self._plus(begun[reader][0], number, reader.sum[node], factors[reader, node])
+                    for reader in sums
+                ]
+            for reader, total in zip(sums, totals, strict=True):
+                old, held = begun[reader]
+                new = self.b.phi(total.type)
+                new.add_incoming(old, before)
+                new.add_incoming(total, inside)
+                begun[reader] = new, {*held, node}
+        return begun
+
+    def _number_of(self, node: Node) -> ir.Value:
+        """Return a tangent's number that lies in memory."""
+        storage, *index = node.of.operands
+        return self._read_number(storage, index)
+
     def _sum_of(
-        self, node: Node, shared: Mapping[Any, ir.Value], values: Sequence[ir.Value]
+        self,
+        node: Node,
+        factors: Mapping[Any, ir.Value],
+        numbers: Mapping[Node, ir.Value],
+        total: ir.Value | None = None,
+        held: Set[Node] = frozenset(),
     ) -> ir.Value:
-        """Return a sum of numbers times factors."""
-        total: ir.Value | None = None
-        assert node.terms is not None
-        for (operand, factor), value in zip(node.terms.items(), values, strict=True):
-            if factor == 1.0:
-                total = value if total is None else self.apply("add", {}, total, value)
-            elif factor == -1.0 and total is not None:
-                total = self.apply("sub", {}, total, value)
-            else:
-                part = self.apply("mul", {}, value, shared[node, operand])
-                total = part if total is None else self.apply("add", {}, total, part)
+        """Return a sum of numbers times factors, of which some are in a total."""
+        for operand, factor in node.sum.items():
+            if operand not in held:
+                total = self._plus(total, numbers[operand], factor, factors[node, operand])
         return constant(node.kind, 0.0) if total is None else total
+
+    def _plus(
+        self, total: ir.Value | None, number: ir.Value, factor: Factor, value: ir.Value
+    ) -> ir.Value:
+        """Return a total and a number times a factor, which has a value."""
+        if factor == -1.0 and total is not None:
+            return self.apply("sub", {}, total, number)
+        part = number if factor == 1.0 else self.apply("mul", {}, number, value)
+        return part if total is None else self.apply("add", {}, total, part)
 
     def settle(self, *, before: bool = False) -> None:
         """Write what is to be written; before loops and branches read what they may change."""
@@ -377,35 +430,51 @@ class Lowering:
         yield
         self._alive.pop()
 
-    def slot(self, kind: ir.Type) -> Tangent:
-        """Return a tangent's number that lies in memory of its own."""
+    def slot(self, kind: ir.Type, *, tells: bool = False) -> Tangent:
+        """Return a tangent's number that lies in memory of its own; it tells where it moves."""
         storage = self.local((), kind, OF_LANE | OF_COLUMN).storage
         storage.writable = False
+        if tells:
+            storage.moves = self._allocate(ir.IntType(8), MOST_COLUMNS)
         return Tangent(kind, READ, {}, (storage,))
 
     def into(self, slot: Tangent) -> Callable[[ir.Value], None]:
         """Return what writes a column where a tangent's number lies."""
         storage, *index = slot.operands
-        return lambda value: self._write_number(storage, index, value)
 
-    def computed(self, values: Sequence[Value]) -> list[Value]:
-        """Return arrays whose tangents lie in memory: those that do not are computed now."""
+        def write(value: ir.Value) -> None:
+            self._write_number(storage, index, value)
+            if storage.moves is not None:
+                differs = self.b.fcmp_unordered("!=", value, self.e.number(value, 0.0))
+                told = self.b.zext(self.e.any_lane(differs), ir.IntType(8))
+                self.b.store(told, self.b.gep(storage.moves, [self._column]))
+
+        return write
+
+    def computed(self, values: Sequence[Value], fixed: int = 0) -> list[Value]:
+        """Return arrays whose tangents lie in memory: those that do not are computed now.
+
+        The first so many stay as they are while others change, and tell in which columns they move.
+        """
         known: dict[int, Tangent] = {}
         outs = []
 
-        def of(element: Element) -> Element:
+        def of(element: Element, *, tells: bool) -> Element:
             if not isinstance(element, Tangent):
                 return element
-            if element.is_read and not element.operands[0].writable:
+            told = element.is_read and element.operands[0].moves is not None
+            if element.is_read and not element.operands[0].writable and told >= tells:
                 return element
             if element.number not in known:
-                known[element.number] = self.slot(element.kind)
+                known[element.number] = self.slot(element.kind, tells=tells)
                 outs.append((element, self.into(known[element.number])))
             return known[element.number]
 
         found = [
-            array_of([of(e) for e in v.ravel()], v.shape) if isinstance(v, np.ndarray) else v
-            for v in values
+            array_of([of(e, tells=place < fixed) for e in v.ravel()], v.shape)
+            if isinstance(v, np.ndarray)
+            else v
+            for place, v in enumerate(values)
         ]
         self.flushed(outs)
         return found

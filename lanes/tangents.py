@@ -3,7 +3,8 @@
 Derivatives are linear: what a column computes is a graph of sums, from tangents in memory
 to those that are asked for. A node of it whose own terms, put in where it is read, are no more than
 what is saved is eliminated (vertex elimination; Griewank and Walther, Evaluating Derivatives, ch.
-9); products of factors are then computed once, for all columns.
+9); products of factors are then computed once, for all columns. A choice between a sum and zero is
+that sum with chosen factors.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from typing import Any, TypeAlias
 
 from llvmlite import ir
 
-from lanes.rules import constant
+from lanes.rules import constant, is_bool
 from lanes.values import Element, Tangent
 
 _Made: TypeAlias = "_Product | _Sum | _Choice | _Inverse"
 Factor: TypeAlias = "float | ir.Value | _Made"
 SHARED = 0.1
 """What an operation on factors costs, of one that each column needs."""
+MOST_TERMS = 6
+"""Terms up to which a choice is made for each of a sum's."""
 
 
 @dataclass(eq=False)
@@ -53,10 +56,14 @@ def _times(x: Factor, y: Factor) -> Factor:
     if isinstance(y, float):
         x, y = y, x
     if isinstance(x, float):
-        if x == 1.0:
-            return y
+        if x in (0.0, 1.0):
+            return y if x else x
         if isinstance(y, _Product) and isinstance(y.first, float):
             return _times(x * y.first, y.second)
+    if isinstance(x, _Choice):
+        x, y = y, x
+    if isinstance(y, _Choice) and 0.0 in (y.first, y.second):
+        return _Choice(y.which, _times(x, y.first), _times(x, y.second))
     return _Product(x, y)
 
 
@@ -96,6 +103,8 @@ class Node:
         The nodes that it is read by.
     kept
         Whether it is not eliminated.
+    finite
+        Whether it surely is, as long as what it is read from memory for is.
     """
 
     of: Any
@@ -103,11 +112,22 @@ class Node:
     operands: tuple[Any, ...] = ()
     readers: dict[Node, None] = field(default_factory=dict)
     kept: bool = False
+    finite: bool = False
 
     @property
     def kind(self) -> ir.Type:
         """The type of one lane's number."""
         return self.of.kind if isinstance(self.of, Tangent) else self.of.type
+
+    @property
+    def is_read(self) -> bool:
+        """Whether it is a tangent in memory."""
+        return isinstance(self.of, Tangent) and self.terms is None and self.of.is_read
+
+    @property
+    def is_told(self) -> bool:
+        """Whether it lies in memory that tells in which columns it moves."""
+        return self.is_read and self.of.operands[0].moves is not None
 
     @property
     def sum(self) -> dict[Node, Factor]:
@@ -132,6 +152,44 @@ def _number(value: ir.Value) -> Factor:
     return value
 
 
+_CARRIED = frozenset({"phi", "load"})
+_SUMS = frozenset({"fadd", "fsub", "fmul", "fneg", "select", "shufflevector", "insertelement"})
+"""Instructions whose results are finite where what they are made of is."""
+
+
+class _Finite:
+    """Which factors are finite if what loops carry and memory holds is.
+
+    Quotients of what is no constant, roots and functions of a library may not be.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[int, Any] = {}
+        """Those that are, by their numbers."""
+
+    def __call__(self, factor: Factor) -> bool:
+        left: list[Any] = [factor]
+        seen: dict[int, Any] = {}
+        while left:
+            made = left.pop()
+            if isinstance(made, float | ir.Constant) or id(made) in self._known:
+                continue
+            name = getattr(made, "opname", None)
+            if id(made) in seen or name in _CARRIED:
+                continue
+            seen[id(made)] = made
+            if isinstance(made, _Product | _Sum | _Choice):
+                left += [made.first, made.second]
+            elif name in _SUMS:
+                left += [of for of in made.operands if not is_bool(of)]
+            elif name == "fdiv" and isinstance(_number(made.operands[1]), float):
+                left.append(made.operands[0])
+            else:
+                return False
+        self._known |= seen
+        return True
+
+
 class Graph:
     """What a column computes.
 
@@ -153,11 +211,13 @@ class Graph:
         self._plain: dict[int, Node] = {}
         self._known: dict[Any, Node] = {}
         self._found: dict[int, Node] = {}
+        self._finite = _Finite()
         for number in sorted(needed):
             self._found[number] = self._node(needed[number])
         self.outs = [self._of(x) for x in outs]
         for node in self.outs:
             node.kept = True
+        self._drop_unread()
         self._eliminate()
 
     def _of(self, x: Element) -> Node:
@@ -175,7 +235,12 @@ class Graph:
             key: Any = (tangent.name, *map(id, operands))
             if key in self._known and (tangent.is_read or not tangent.params):
                 return self._known[key]
-            node = Node(tangent, None, operands, kept=True)
+            chosen = tangent.name == "select_n" and all(
+                x.finite if isinstance(x, Node) else isinstance(x, ir.Constant)
+                for x in operands[1:]
+            )
+            finite = tangent.is_read or chosen
+            node = Node(tangent, None, operands, kept=True, finite=finite)
             self._known[key] = node
             for operand in operands:
                 if isinstance(operand, Node):
@@ -196,7 +261,8 @@ class Graph:
             )
             if key in self._known:
                 return self._known[key]
-            node = Node(tangent, terms)
+            finite = all(of.finite and self._finite(factor) for of, factor in terms.items())
+            node = Node(tangent, terms, finite=finite)
             self._known[key] = node
             for operand in terms:
                 operand.readers[node] = None
@@ -210,6 +276,8 @@ class Graph:
         found: Sequence[tuple[Any, Factor]] | None = None
         if name == "select_n" and moving == [False, True, True]:
             found = self._chosen(*operands)
+        elif name == "select_n" and _is_zero(operands[1 + moving[1]]):
+            found = self._left_out(*operands)
         elif name in _SIGNS:
             found = list(zip(operands, _SIGNS[name], strict=True))
         elif name == "convert_element_type" and operands[0].kind == tangent.kind:
@@ -232,7 +300,40 @@ class Graph:
             single = node.terms is not None and len(node.terms) == 1
             parts += node.sum.items() if single else [(node, 1.0)]
         (of, factor), (other, own) = parts
-        return [(of, _Choice(which, factor, own))] if of is other else None
+        if of is other:
+            return [(of, _Choice(which, factor, own))]
+        if of.is_told and other.is_told:
+            return [(of, _Choice(which, factor, 0.0)), (other, _Choice(which, 0.0, own))]
+        return None
+
+    def _left_out(self, which: ir.Value, *either: Element) -> Sequence[tuple[Any, Factor]] | None:
+        """Return a choice between a sum and zero as that sum with factors that are chosen.
+
+        Zero times what is no number is none: what is summed must be finite.
+        """
+        first_moves = isinstance(either[0], Tangent)
+        left: list[tuple[Node, Factor]] = [(self._of(either[0 if first_moves else 1]), 1.0)]
+        parts: dict[Node, Factor] = {}
+        while left:
+            node, factor = left.pop()
+            if node.finite:
+                _add(parts, node, factor)
+            elif node.terms is None or len(left) + len(parts) > MOST_TERMS:
+                return None
+            else:
+                left += [(of, _times(factor, own)) for of, own in node.terms.items()]
+        return [
+            (of, _Choice(which, factor, 0.0) if first_moves else _Choice(which, 0.0, factor))
+            for of, factor in parts.items()
+        ]
+
+    def _drop_unread(self) -> None:
+        """Drop sums that choices have put in where they were read."""
+        for node in reversed(self.nodes):
+            if node.terms and not node.readers and not node.kept:
+                for operand in node.sum:
+                    operand.readers.pop(node)
+                node.terms = {}
 
     def _eliminate(self) -> None:
         """Eliminate nodes, alone and together with those that the same nodes read."""
@@ -300,6 +401,10 @@ class Graph:
             for operand in terms:
                 operand.readers[reader] = None
         return True
+
+
+def _is_zero(x: Element) -> bool:
+    return isinstance(x, ir.Value) and _number(x) == 0.0
 
 
 def _add(terms: dict[Node, Factor], node: Node, factor: Factor) -> None:

@@ -121,6 +121,9 @@ class Storage:
     writable: bool = False
     guard: ir.Value | None = None
     """When it is written to; None for always."""
+    moves: ir.Value | None = None
+    """To a byte a column, which is zero where a tangent's number is zero in every lane; None where
+    that is not known."""
     version: int = 0
 
 

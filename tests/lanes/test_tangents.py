@@ -116,6 +116,56 @@ def test_what_is_not_chosen_may_be_no_number():
     np.testing.assert_allclose(got, want, rtol=1e-12)
 
 
+def test_a_choice_between_a_sum_and_zero_is_the_sum_with_chosen_factors():
+    x, y, which = read(), read(), ir.Constant(ir.IntType(1), ir.Undefined)
+    total = tangent("add", tangent("mul", x, factor()), tangent("mul", y, factor()))
+    for either in ((total, ir.Constant(KIND, 0.0)), (ir.Constant(KIND, 0.0), total)):
+        chosen = tangent("mul", tangent("select_n", which, *either), factor())
+        graph = Graph([tangent("add", chosen, x)])
+        assert operations(graph) == 2
+        assert len(graph.nodes) == 3
+
+    def function(x, _):
+        return jnp.where(x > 0, 2.0 * x + x[::-1], 0.0) * x[0] + jnp.where(x > 0, 0.0, x)
+
+    got, want = flown(function, 9, 2)
+    np.testing.assert_allclose(got, want, rtol=1e-12)
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_what_zero_stands_for_may_be_no_number(twice):
+    def function(x, _):
+        size = jnp.sqrt(jnp.sum((x - x) ** 2))
+        far = x / size
+        return jnp.where(size > 0, far * 2.0 + jnp.sin(far) if twice else far, 0.0)
+
+    got, want = flown(function, 3, 2)
+    assert np.isfinite(got).all()
+    np.testing.assert_array_equal(got, want)
+
+
+def test_what_does_not_move_in_a_column_is_not_computed_there():
+    """No number comes of an infinite slope where nothing moves along it."""
+
+    def function(x, lengths):
+        def turn(state, _):
+            state = 0.5 * state + jnp.stack([jnp.sqrt(x[0]) * x[1], jnp.sqrt(x[0]), x[2]])
+            return state, state
+
+        return lax.scan(turn, jnp.zeros(3) + x[2], jnp.arange(lengths["turns"]))[1]
+
+    program = Program(function, Argument((3,), float, lanes=True, moves=True))
+    values, moved = np.abs(RANDOM.normal(size=(3, 16))), [np.eye(3)]
+    runs = [program(values, moved, lanes=16, turns=4), program.by_xla(values, moved, turns=4)]
+    got, want = (joined(np.asarray(run.columns)) for run in runs)
+    np.testing.assert_allclose(got, want, rtol=1e-12)
+    values[0] = 0.0
+    got = joined(np.asarray(program(values, moved, lanes=16, turns=4).columns))
+    assert np.isfinite(got[..., 1:]).all()
+    assert not np.isfinite(got[:, :, :2, 0]).any()
+    np.testing.assert_allclose(got[..., 2], want[..., 2], rtol=1e-12)
+
+
 def test_memory_is_read_as_it_was_before_it_was_changed():
     """What a delay line held is asked for after it is changed, in a sum that is written, too."""
 
