@@ -62,11 +62,12 @@ STAGES: Mapping[str, tuple[str, ...]] = {
         *("attitude_followed", "spins_reversed", "rotor_changed"),
     ),
     "Before the search": (
-        *("wrong_vehicle", "cannot_hover", "still_axes", "no_yaw", "implausible", "start_on_bound"),
+        *("vehicle_not", "mass_not", "wrong_vehicle", "cannot_hover", "still_axes", "no_yaw"),
+        *("implausible", "start_on_bound"),
         *("not_finite", "nothing_has", "no_effect", "singular", "setpoints", "heading_flown"),
         *("input_late", "turning_regressed", "turning_not"),
     ),
-    "Without a pose": ("scales_with", "no_tacho", "yaw_open", "rate_", "vehicle_not_given"),
+    "Without a pose": ("scales_with", "no_tacho", "yaw_open", "rate_"),
     "Of ground measurements": ("ground_conflict", "bench_conflict"),
     "After the search": ("",),
 }

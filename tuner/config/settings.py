@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from tuner.config.job import JobFile, Search, read_job
 from tuner.core.disk import exists, find_flights
 from tuner.core.errors import ConfigError, InputError, did_you_mean
-from tuner.core.shipped import Kind, find_config
+from tuner.core.shipped import Kind, configs_folder, find_config
 from tuner.core.validation import config_error
 from tuner.core.yaml_section import build, section_of
 from tuner.ground.bench_json import joint_prior
@@ -54,6 +54,12 @@ class Settings:
     job_path: Path | None
     origin: Mapping[str, str]
     bench: JointPrior | None = None
+
+    @property
+    def weighed(self) -> bool:
+        """Whether the mass is of the user: an option, or a file that does not ship."""
+        origin = self.origin["mass"]
+        return not (origin.startswith("default") or str(configs_folder()) in origin)
 
 
 def settle(asked: FlightOptions, *, fits: bool = True) -> Settings:

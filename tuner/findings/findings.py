@@ -22,10 +22,12 @@ Text = str | Callable[[Any], str]
 sentence of a finding."""
 
 GIVE_VEHICLE = (
-    "Give the vehicle with --vehicle and what it weighs with --mass; tune new-vehicle writes a "
-    "starting file from its mass, size and propellers."
+    "Give --vehicle and --mass; tune new-vehicle writes a starting file from mass, size and "
+    "propellers."
 )
 
+LEAST_SAID = 55
+"""Letters of what was noticed that stay in a short line."""
 CLAUSE = re.compile(r"[;.] | \(|, (?=and|as|at|or|if)|: (?!false|true)(?=[a-z0-9]+ )")
 """Where the first clause of a sentence ends; not before the value of a setting."""
 
@@ -235,8 +237,8 @@ class Code(Worded):
     SINGULAR_DIRECTION = (
         "singular_direction",  # names: the coefficients
         (
-            "The flights do not tell them apart: a common change of {coefficients} leaves every "
-            "recorded signal as it is."
+            "A common change of {coefficients} leaves every recorded signal as it is: the flights "
+            "do not tell them apart."
         ),
         "Fix one of them to its measured value (--fix {given}).",
     )
@@ -473,12 +475,20 @@ class Code(Worded):
         "Predict less far ahead, or simulate the loop that flew.",
     )
     VEHICLE_NOT_GIVEN = (
-        "vehicle_not_given",
+        "vehicle_not_given",  # mass (kg)
         (
-            "No vehicle was given: these flights were taken for its own, and without a pose mass "
-            "and arms come from the vehicle file."
+            "No vehicle was given, so that its {mass:g} kg and arms were taken: moments of "
+            "inertia, thrust and drag go with them, which no flight shows and no interval holds."
         ),
-        "Give the vehicle with --vehicle, and what it weighs with --mass.",
+        GIVE_VEHICLE,
+    )
+    MASS_NOT_GIVEN = (
+        "mass_not_given",  # mass (kg)
+        (
+            "Its {mass:g} kg are the shipped file's: moments of inertia, thrust and drag "
+            "are in proportion to it, which no flight shows and no interval holds."
+        ),
+        "Give what it weighs at take-off with --mass.",
     )
     BENCH_CONFLICT = (
         "bench_conflict",  # deviation (standard errors); names: the coefficients
@@ -537,7 +547,7 @@ def one_line(finding: Finding) -> str:
 def brief(finding: Finding, width: int) -> str:
     """Return a finding in so many characters: its subject, what was noticed, what to do.
 
-    What does not fit is cut from the middle, what to do last.
+    What was noticed is cut to no less than `LEAST_SAID` letters, then what to do.
     """
     first, *others = finding.subject.split(", ")
     subject = shorten(f"{first} and {len(others)} more" if others else first, 30)
@@ -545,7 +555,7 @@ def brief(finding: Finding, width: int) -> str:
     if len(f"{subject}: {what}. {to_do}") > width and to_do:
         to_do = f"{CLAUSE.split(to_do)[0].removesuffix('.')}."
     left = width - len(f"{subject}: . {to_do}")
-    cut = shorten(what, max(left, 12))
+    cut = shorten(what, max(left, LEAST_SAID))
     end = "" if cut.endswith("…") else "."
     return shorten(f"{subject}: {cut}{end} {to_do}".rstrip(), width)
 

@@ -54,6 +54,7 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
                 *_controllers(job),
             )
         ),
+        *_not_given(job),
         *_wrong_vehicle(job),
         *_excitation(job),
         *_bounds(job),
@@ -113,6 +114,18 @@ def _sparse_inputs(job: Job) -> Iterator[Finding]:
         if rate is not None and sparse([flight], signal, rate):
             numbers = {"recorded": round(flight.series[signal].rate), "needed": float(rate)}
             yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
+
+
+def _not_given(job: Job) -> Iterator[Finding]:
+    """Warn of a mass that no user gave: in all that has a force the scale is the mass's."""
+    settings = job.settings
+    if settings.weighed or "mass" in job.space.free:
+        return
+    mass = {"mass": settings.vehicle.mass}
+    if _is_default(settings.origin, "vehicle"):
+        yield Finding(Code.VEHICLE_NOT_GIVEN, "warning", settings.vehicle.name, mass)
+    else:
+        yield Finding(Code.MASS_NOT_GIVEN, "warning", settings.vehicle.name, mass)
 
 
 def _wrong_vehicle(job: Job) -> Iterator[Finding]:

@@ -205,5 +205,7 @@ def _left_open(settings: Settings, names: Sequence[str]) -> tuple[Finding, ...]:
     if "moment_constant" in names:
         findings.append(Finding(Code.YAW_OPEN, "info", "inertia_zz"))
     if settings.origin.get("vehicle", "").startswith("default"):
-        findings.insert(0, Finding(Code.VEHICLE_NOT_GIVEN, "warning", vehicle.name))
+        findings.insert(0, Finding(Code.VEHICLE_NOT_GIVEN, "warning", vehicle.name, mass))
+    elif not settings.weighed:
+        findings.insert(0, Finding(Code.MASS_NOT_GIVEN, "warning", vehicle.name, mass))
     return tuple(findings)

@@ -22,6 +22,8 @@ from tuner.vehicle.registry import COEFFICIENTS
 from tuner.vehicle.vehicle import Size, size_of, sized
 
 AS_TABLED = Size()
+LEAST_SLOPE = 1e-150
+"""Whose inverse has a square that is a number."""
 OFF_BOUND = 0.05
 """A start on a bound is moved inside by this share of the range."""
 
@@ -131,9 +133,13 @@ class Space:
         return float(np.exp(scaled)) if self.is_log[index] else float(scaled)
 
     def slope(self, vector: Array) -> Array:
-        """Return dx/dz, the scaled coordinate's change with the search vector, shape (K,)."""
+        """Return dx/dz, the scaled coordinate's change with the search vector, shape (K,).
+
+        It is never zero, not even so close to a bound that no number lies between.
+        """
         share = self.share(vector)
-        return np.asarray(self.width * share * (1 - share) / self.stretch)
+        slope = self.width * share * (1 - share) / self.stretch
+        return np.asarray(np.maximum(slope, LEAST_SLOPE))
 
 
 def space_of(

@@ -28,7 +28,20 @@ UNCHANGED = 0.8
 """Share of what it was above which an error is called unchanged."""
 Errors = tuple[float | None, float | None, float | None]
 """Before and after a fit, and of the noise."""
-DOUBTS = frozenset(
+OTHER_INPUTS = frozenset(
+    {
+        Code.VEHICLE_NOT_GIVEN,
+        Code.MASS_NOT_GIVEN,
+        Code.WRONG_VEHICLE,
+        Code.CANNOT_HOVER,
+        Code.MOTOR_ORDER,
+        Code.SPINS_REVERSED,
+        Code.SETPOINTS_FOREIGN,
+        Code.SETPOINTS_SCALED,
+    }
+)
+"""Warnings that what was given is not what flew: all numbers follow from that."""
+DOUBTS = OTHER_INPUTS | frozenset(
     {
         Code.MODEL_UNMATCHED,
         Code.FLIGHT_UNMATCHED,
@@ -45,10 +58,6 @@ DOUBTS = frozenset(
         Code.INERTIA_NOT_BALANCED,
         Code.SPARSE_INPUT,
         Code.SINGULAR_DIRECTION,
-        Code.WRONG_VEHICLE,
-        Code.CANNOT_HOVER,
-        Code.VEHICLE_NOT_GIVEN,
-        Code.SETPOINTS_FOREIGN,
         Code.FLIGHTS_FAR_OFF,
         Code.STARTS_DISAGREE,
         Code.RATE_WORSE,
@@ -79,6 +88,8 @@ class FlightOutcome:
         together in degrees; None for a crash or what is not simulated.
     word
         ``matched`` to the noise, ``better``, ``unchanged``, ``worse``, or it ``crashes``.
+    horizon
+        s after which each simulation begins anew at the recorded state; None where it never does.
     """
 
     name: str
@@ -86,6 +97,7 @@ class FlightOutcome:
     position: Errors
     attitude: Errors
     word: str
+    horizon: float | None = None
 
 
 @dataclass(frozen=True)
@@ -136,11 +148,13 @@ def outcome(result: RunResult, bench: BenchRecord | None = None) -> Outcome:
 
 
 def by_weight(findings: Sequence[Finding]) -> list[Finding]:
-    """Return failures and warnings: failures first, then what puts the numbers in doubt."""
+    """Return failures and warnings: failures first, other inputs, then what doubts the numbers."""
     found = [finding for finding in findings if finding.level != "info"]
-    return sorted(
-        found, key=lambda finding: (finding.level != "failure", finding.code not in DOUBTS)
-    )
+
+    def weight(finding: Finding) -> tuple[bool, ...]:
+        return finding.level != "failure", *(finding.code not in w for w in (OTHER_INPUTS, DOUBTS))
+
+    return sorted(found, key=weight)
 
 
 def warnings_of(findings: Sequence[Finding]) -> list[Cell]:
@@ -164,8 +178,12 @@ def next_step(
     if found.usability is Usability.UNUSABLE:
         return doubts[0].small if doubts else "Look at its flights.", f"tune report {name} --open"
     if found.flights and not any(flight.held_out for flight in found.flights):
-        flight = shlex.quote(found.flights[-1].name)
-        return "Hold a flight out, which then checks the fit.", f"tune ... --holdout {flight}"
+        if len(found.flights) == 1:
+            return "Record a second flight, and hold it out.", "tune ... --holdout FLIGHT"
+        told = Counter(row.reason.flight for row in result.coefficients.values() if row.fitted)
+        flight = min(reversed(found.flights), key=lambda flight: told[flight.name]).name
+        words = "Hold a flight out, which then checks the fit."
+        return words, f"tune ... --holdout {shlex.quote(flight)}"
     if not found.flights:
         return "Fit flights from it.", f"tune --flights FLIGHT... --bench {name}"
     refused = [one.refused for one in exports if one.refused]
@@ -198,7 +216,11 @@ def flights_table(flights: Sequence[FlightOutcome]) -> Table:
         )
         for flight in flights
     ]
-    columns = ("flight", "position RMSE", "noise", "attitude RMSE", "noise ", "verdict")
+    ahead = sorted({flight.horizon for flight in flights if flight.horizon is not None})
+    ends = dict.fromkeys(f"{seconds:.2g}" for seconds in ahead[:: len(ahead) - 1 or 1])
+    within = f" in {' to '.join(ends)} s" if ahead else ""
+    position, attitude = f"position RMSE{within}", f"attitude RMSE{within}"
+    columns = ("flight", position, "noise", attitude, "noise ", "verdict")
     return Table(columns, rows, words=("flight", "verdict"))
 
 
@@ -227,9 +249,9 @@ def _cells(errors: Errors, write: Callable[[float], str]) -> list[str]:
 def _flight_outcome(flight: FlightResult, result: RunResult) -> FlightOutcome:
     position, attitude = (_errors(flight, result, signal) for signal in ("position", "attitude"))
     codes = {found.code for found in result.findings if found.subject == flight.name}
-    return FlightOutcome(
-        flight.name, flight.split == "holdout", position, attitude, _word(position, attitude, codes)
-    )
+    word = _word(position, attitude, codes)
+    held_out = flight.split == "holdout"
+    return FlightOutcome(flight.name, held_out, position, attitude, word, flight.horizon)
 
 
 def _word(
@@ -328,6 +350,7 @@ def _reasons(result: RunResult, checks: Sequence[FlightOutcome]) -> tuple[str, .
             sentences.append(f"{flight.name}, {what}, crashes in the simulation.")
             continue
         moved = f"{'a crash' if before is None else metres(before)} to {metres(after)}"
+        moved += "" if flight.horizon is None else f" in predictions of {flight.horizon:.2g} s"
         floor = "" if noise is None else f"; the noise of its recording alone is {metres(noise)}"
         sentences.append(f"{flight.name}, {what}: position error from {moved}{floor}.")
     if result.flights and not any(flight.held_out for flight in checks):

@@ -76,6 +76,19 @@ def test_without_a_job_file_the_defaults_hold(lab):
     assert s.origin["controller"] == "default (hovergames.yaml)"
 
 
+def test_a_mass_that_ships_is_not_the_users(lab):
+    def weighed(**given):
+        return settle(Options([f"{lab}/a.bag"], **given)).weighed
+
+    (lab / "tune.yaml").unlink()
+    assert not weighed()
+    assert not weighed(vehicle="crazyflie")
+    assert weighed(vehicle="crazyflie", mass=0.034)
+    own = lab / "own.yaml"
+    own.write_bytes((configs_folder() / "vehicles" / "crazyflie.yaml").read_bytes())
+    assert weighed(vehicle=str(own))
+
+
 def test_fixing_takes_away_from_what_is_free(lab):
     assert settle(Options([f"{lab}/*.bag"], fix=["gyro_cutoff"])).job.fixed == (
         "mass",

@@ -298,6 +298,12 @@ def test_a_job_can_want_physical_coefficients_in_the_simulator(make_run):
     assert any(note.startswith("fuselage_drag 0.03 N s²/m² is not exported") for note in done.notes)
 
 
+def test_where_nothing_is_held_out_fitted_flights_check_the_run(make_run):
+    flights = {"circle": {"rmse_best": rmse(0.2)}, "held": {"split": "fit"}}
+    with pytest.raises(ExportError, match=r"circle position 0\.3 m, before 0\.15"):
+        exported(make_run(flights=flights), "yaml")
+
+
 def test_gates_ask_of_the_effective_coefficients_what_they_ask_of_others(make_run):
     worse = EFFECTIVE.model_copy(update={"flights": {"circle": rmse(0.005), "held": rmse(0.2)}})
     with pytest.raises(ExportError, match=r"held position 0\.3 m, before 0\.15"):

@@ -67,7 +67,7 @@ def test_the_command_exports_and_says_what_it_did(run, capsys, tmp_path):
     model.write_text((MODELS / "quad_x.sdf").read_text())
     assert main(["export", str(run.folder), "--format", "sdf", "--into", str(model)]) == 0
     out = capsys.readouterr().out
-    assert "yes  no held-out flight is worse than before" in out
+    assert "yes  no flight that checks the run is worse than before" in out
     assert "'base_link' gets 2.204 kg" in out
     assert f"written to {model} and read back" in out
     assert "<motorConstant>1.45e-05<" in model.read_text()

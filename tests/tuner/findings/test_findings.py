@@ -117,7 +117,10 @@ MADE = {
         "a",
         {"before": 7.6, "after": 5.2, "hold": 1.8, "seconds": 0.5},
     ),
-    Code.VEHICLE_NOT_GIVEN: Finding(Code.VEHICLE_NOT_GIVEN, "warning", "hovergames"),
+    Code.VEHICLE_NOT_GIVEN: Finding(
+        Code.VEHICLE_NOT_GIVEN, "warning", "hovergames", {"mass": 2.079}
+    ),
+    Code.MASS_NOT_GIVEN: Finding(Code.MASS_NOT_GIVEN, "warning", "crazyflie", {"mass": 0.03}),
     Code.STILL_AXES: Finding(Code.STILL_AXES, "warning", "excitation", names=("x", "roll")),
     Code.NO_YAW: Finding(Code.NO_YAW, "warning", "excitation", {"rate": 0.1}),
     Code.IMPLAUSIBLE_BOUNDS: Finding(

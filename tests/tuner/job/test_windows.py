@@ -8,6 +8,7 @@ import pytest
 from tuner.config import JobFile, Options, settle
 from tuner.config.job import FlightSettings, Search
 from tuner.core.errors import ConfigError
+from tuner.core.shipped import configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.findings.findings import Code
 from tuner.job.check import check_information, check_recordings
@@ -97,6 +98,18 @@ def test_another_vehicle_than_the_one_that_flew_is_named(full_flight, full_bag, 
     (wrong,) = (finding for finding in check(light) if finding.code == Code.WRONG_VEHICLE)
     assert wrong.numbers["weight"] == pytest.approx(0.034 * 9.81, rel=1e-2)
     assert wrong.numbers["lift"] == pytest.approx(updated.mass * 9.81, rel=0.2)
+
+
+def test_a_mass_that_no_user_gave_is_named(full_flight, full_bag, updated):
+    job = job_through("actuator", full_flight, full_bag, updated)
+    noticed = (Code.VEHICLE_NOT_GIVEN, Code.MASS_NOT_GIVEN)
+    assert not {finding.code for finding in check_recordings(job)} & set(noticed)
+    shipped = f"--vehicle {configs_folder() / 'vehicles' / 'hovergames.yaml'}"
+    for origin, code in zip(("default (hovergames.yaml)", shipped), noticed, strict=True):
+        origins = {"vehicle": origin, "mass": origin}
+        of_file = replace(job, settings=replace(job.settings, origin=origins))
+        (said,) = (found for found in check_recordings(of_file) if found.code in noticed)
+        assert (said.code, said.numbers["mass"]) == (code, job.settings.vehicle.mass)
 
 
 @pytest.mark.slow

@@ -7,7 +7,14 @@ import pytest
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.evaluate.records import AxesRmse
 from tuner.findings.findings import Code, Finding
-from tuner.report.outcome import Usability, counted, next_step, outcome, warnings_of
+from tuner.report.outcome import (
+    Usability,
+    counted,
+    flights_table,
+    next_step,
+    outcome,
+    warnings_of,
+)
 from tuner.result import ExportRecord
 from tuner.uncertainty.verdict import Verdict
 
@@ -106,9 +113,31 @@ def test_where_every_export_was_refused_the_next_step_is_why(result, tmp_path):
 def test_what_doubts_the_numbers_comes_before_what_does_not():
     gap = Finding(Code.POSE_GAP, "warning", "a", {"seconds": 0.2})
     info = Finding(Code.YAW_OPEN, "info", "b")
-    doubt = Finding(Code.VEHICLE_NOT_GIVEN, "warning", "c")
-    failure = Finding(Code.NOT_FINITE, "failure", "d")
-    assert [w.link for w in warnings_of((info, gap, doubt, failure))] == ["d", "c", "a"]
+    doubt = Finding(Code.TURNING_UNEXPLAINED, "warning", "c", {"explained": 0.4})
+    other = Finding(Code.VEHICLE_NOT_GIVEN, "warning", "d", {"mass": 2.0})
+    failure = Finding(Code.NOT_FINITE, "failure", "e")
+    assert [w.link for w in warnings_of((info, gap, doubt, other, failure))] == ["e", "d", "c", "a"]
+
+
+def test_the_flight_to_hold_out_is_the_one_that_tells_least_and_never_the_only_one(
+    result, tmp_path
+):
+    unchecked = with_held(result, split="fit")
+    told = unchecked.coefficients["motor_constant"]
+    reason = told.reason.model_copy(update={"flight": "checks"})
+    rows = unchecked.coefficients | {"motor_constant": told.model_copy(update={"reason": reason})}
+    unchecked = unchecked.model_copy(update={"coefficients": rows})
+    other = unchecked.flights[0].name
+    assert next_step(unchecked, outcome(unchecked), tmp_path)[1] == f"tune ... --holdout {other}"
+    alone = unchecked.model_copy(update={"flights": unchecked.flights[:1]})
+    assert next_step(alone, outcome(alone), tmp_path)[0].startswith("Record a second flight")
+
+
+def test_how_far_flights_are_predicted_is_said_where_they_are_not_flown_whole(result):
+    assert flights_table(outcome(result).flights).columns[1] == "position RMSE"
+    found = outcome(with_held(result, horizon=0.51))
+    assert flights_table(found.checks).columns[1] == "position RMSE in 0.51 s"
+    assert "in predictions of 0.51 s" in found.reasons[0]
 
 
 def test_held_coefficients_are_counted_as_held():

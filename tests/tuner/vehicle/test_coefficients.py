@@ -67,6 +67,7 @@ def test_slope_is_the_derivative_of_the_scaled_coordinate(vehicle):
     vector = space.initial + 0.3
     slope = (space.scaled(vector + 1e-6) - space.scaled(vector - 1e-6)) / 2e-6
     np.testing.assert_allclose(slope, space.slope(vector), rtol=1e-7)
+    assert (1.0 / space.slope(np.full(len(space), -1e4)) ** 2 < np.inf).all()  # on every bound
 
 
 def test_a_start_on_its_bound_is_moved_inside_and_remembered(vehicle):
