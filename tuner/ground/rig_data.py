@@ -177,6 +177,8 @@ FASTEST = 4000.0
 SLOWEST = 30.0
 """rad/s below which a rotor that is measured at all does not turn: such rpm are rad/s, or Hz."""
 FULL_COMMAND = 1.5
+VOLTS = (1.0, 100.0)
+"""V of a battery."""
 
 COLUMNS: Mapping[str, Mapping[str, float]] = {
     "angle": {
@@ -287,7 +289,7 @@ def _check_unit(path: Path, quantity: str, column: str, values: Array) -> None:
     known = np.abs(values[np.isfinite(values)])
     if len(known) < FEWEST:
         raise RecordingError(path, f"column {column} holds hardly a number", "check the file")
-    top = float(np.quantile(known, 0.99))
+    top, low = float(np.quantile(known, 0.99)), float(np.nanquantile(values, 0.01))
     complaints = {
         "rotor_speed": (
             (top > FASTEST, f"reaches {top:.0f} rad/s, too fast for a rotor",
@@ -302,6 +304,10 @@ def _check_unit(path: Path, quantity: str, column: str, values: Array) -> None:
         "command": (
             (top > FULL_COMMAND, f"reaches {top:.0f}, commands lie in 0..1",
              "scale it to 0..1 of full command"),
+        ),
+        "voltage": (
+            (not VOLTS[0] <= low <= top <= VOLTS[1], f"goes from {low:.3g} to {top:.3g} V",
+             f"write a battery's volts, {VOLTS[0]:g} to {VOLTS[1]:g}"),
         ),
     }  # fmt: skip
     for wrong, what, remedy in complaints.get(quantity, ()):

@@ -17,6 +17,7 @@ from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.ground.plan import RpmCurve, ThrustStand, TorqueStand
 from tuner.ground.rig_data import kept_levels, mean_and_error, widened
 from tuner.vehicle import VehicleFile
+from tuner.vehicle.vehicle import ARM, size_of
 
 SHORTEST = 1.0
 """s below which a level of the rotor speed is a transient."""
@@ -28,6 +29,8 @@ LEAST_SPEED_RATIO = 1.3
 """Ratio of the fastest to the slowest level without which an offset looks like another slope."""
 LIFT = (0.05, 20.0)
 """Largest thrust of all rotors over the weight, beyond which a unit or lever is wrong."""
+TWIST = (0.005, 20.0)
+"""The same of the largest drag torque of all rotors over the weight at the end of an arm."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +68,8 @@ def stand(
     Raises
     ------
     RecordingError
-        There are too few steps, they are too short, the force does not grow with the speed, or the
-        thrust is none that carries the vehicle.
+        There are too few steps, they are too short, the force does not grow with the speed, or
+        thrust or torque are none of the vehicle's.
     """
     title, row, lever, lever_error = (
         ("Thrust stand", THRUST, given.lever_ratio, given.lever_ratio_error)
@@ -120,10 +123,16 @@ def stand(
     )
     constant, top = slope * lever / given.rotors, float(np.nanquantile(speed, 0.95))
     thrust = len(vehicle.rotors) * constant * top**2
-    lifts = LIFT[0] < thrust / (vehicle.mass * GRAVITY) < LIFT[1]
+    weight = vehicle.mass * GRAVITY
+    lifts = LIFT[0] < thrust / weight < LIFT[1]
     if row == THRUST and not lifts:
         what = f"gives {thrust:.3g} N of thrust at {top:.0f} rad/s to a vehicle of {vehicle.mass:g}"
         raise RecordingError(path, f"{what} kg", "check the force (N) and the lever ratio")
+    turns = TWIST[0] < thrust / (weight * ARM * size_of(vehicle).arm) < TWIST[1]  # of torque, N m
+    if row == TORQUE and not turns:
+        what = f"gives {thrust:.3g} N m of torque at {top:.0f} rad/s to a vehicle of"
+        remedy = "check the force (N) and the lever arm (m)"
+        raise RecordingError(path, f"{what} {vehicle.mass:g} kg", remedy)
     variance = covariance[0, 0] / slope**2 + lever_error**2
     return Measurement(
         name, (row,), np.log([constant]), np.array([[variance]]), tuple(remarks), curves
@@ -214,6 +223,9 @@ def rpm_curve(name: str, path: str, samples: Mapping[str, Array], given: RpmCurv
                              "check the columns")  # fmt: skip
     error = np.maximum(error, 0.5 * np.median(error))
     reference = given.reference_voltage or float(volts.max())
+    if "voltage" in samples and not 0.5 < reference / float(volts.max()) < 2.0:
+        what = f"holds {volts.min():.3g} to {volts.max():.3g} V, far from {reference:g} V"
+        raise RecordingError(path, what, "give a reference_voltage of that battery")
     sags = "voltage" in samples and float(volts.max() / volts.min()) > VOLTAGE_RANGE
     ratio = volts / reference if "voltage" in samples else np.ones_like(u)
     straight = _fit(u, omega, error, ratio, quadratic=False, sags=sags)

@@ -15,7 +15,10 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array, robust_sd, scaled_solve
 from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.ground.rig_data import OUTLIER, student
+from tuner.vehicle.vehicle import longest
 
+LAGS = (0.001, 1.0)
+"""s, of motors with a propeller."""
 STEP = 0.02
 """Change of the command between two samples that counts as a step."""
 FEWEST = 2
@@ -80,8 +83,8 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     up, down, delay = np.exp(lags[0]), np.exp(lags[1]), lags[2]
     shortest = float(np.diff(time[edges]).min(initial=np.inf))
     if shortest < LEAST_TIME_CONSTANTS * max(up, down):
-        longest = max(up, down)
-        what = f"has steps of {shortest:.2g} s, too short for a time constant of {longest:.2g} s"
+        slower = max(up, down)
+        what = f"has steps of {shortest:.2g} s, too short for a time constant of {slower:.2g} s"
         raise RecordingError(path, what, "hold each command longer")
     covariance = _covariance(steps, lags, speed, kept)
     # a step shows at the first sample after it: half an interval late on average, but by as much
@@ -89,6 +92,7 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     interval = float(np.median(np.diff(time)))
     covariance[2, 2] += interval**2 / 12
     latency = delay + 0.5 * interval
+    _check_motor(path, up, down, latency)
     early = max(-latency, 0.0)
     reported = early > REPORT_ABOVE * math.sqrt(covariance[2, 2])
     covariance[2, 2] += early**2  # clocks that differ may do so in either direction
@@ -114,6 +118,16 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
         tuple(remarks),
         (Curve.of(titles, (time, speed), (time, plain), used=kept),),
     )
+
+
+def _check_motor(path: str, up: float, down: float, latency: float) -> None:
+    """Refuse lags, in s, that no motor has."""
+    if not LAGS[0] <= min(up, down) <= max(up, down) <= LAGS[1]:
+        what = f"gives time constants of {up:.2g} s up and {down:.2g} s down, motors have "
+        raise RecordingError(path, f"{what}{LAGS[0]:g} to {LAGS[1]:g} s", "check the time (s)")
+    if latency > (most := longest("actuator_latency")):
+        what = f"shows each command {latency:.2g} s late, motors up to {most:g} s"
+        raise RecordingError(path, what, "stamp command and rotor speed by one clock")
 
 
 def _edges(command: Array) -> NDArray[np.intp]:

@@ -79,6 +79,8 @@ PENDULUM = {"kind": "bifilar", "axis": "x", "mass": 2.243, "wire_distance": 0.34
             "wire_length": 1.14, "recording": "bifilar_x.csv"}  # fmt: skip
 STEP = {"kind": "step_response", "recording": "step.csv"}
 THRUST = {"kind": "thrust_stand", "recording": "thrust.csv", "rotors": 4, "lever_ratio": 1.4231}
+TORQUE = {"kind": "torque_stand", "recording": "torque.csv", "rotors": 2, "lever_arm": 0.37}
+CURVE = {"kind": "rpm_curve", "recording": "steps.csv"}
 
 
 def run(folder, plan, *options):
@@ -97,6 +99,16 @@ def edited(folder, name, change):
 
 def renamed(**names):
     return lambda columns: {names.get(name, name): values for name, values in columns.items()}
+
+
+def scaled(**factors):
+    return lambda columns: {n: factors.get(n, 1.0) * values for n, values in columns.items()}
+
+
+def delayed(columns):
+    """Return the rotor speed as it would be stamped by a clock that is 0.08 s late."""
+    late = round(0.08 / np.median(np.diff(columns["time"])))
+    return columns | {"rpm": np.concatenate([columns["rpm"][:late], columns["rpm"][:-late]])}
 
 
 def first(count):
@@ -126,6 +138,12 @@ def hurried(columns):
         ([STEP], "step.csv", hurried, "too short for a time constant"),
         ([STEP], "step.csv", first(500), "steps up of the command"),
         ([STEP], "step.csv", lambda c: c | {"command": 1000 + 1000 * c["command"]}, "scale it"),
+        ([STEP], "step.csv", scaled(time=1e3), "time constants of 10 s up"),
+        ([STEP], "step.csv", delayed, "shows each command 0.085 s late, motors up to 0.04 s"),
+        ([TORQUE], "torque.csv", scaled(force=1e3), "check the force (N) and the lever arm"),
+        ([CURVE], "steps.csv", scaled(voltage=1e3), "column voltage goes from 1.5"),
+        ([CURVE], "steps.csv", scaled(voltage=-1.0), "column voltage goes from -16.4"),
+        ([CURVE | {"reference_voltage": 50}], "steps.csv", first(600), "far from 50 V"),
         ([STEP], "other.csv", None, "cannot be read"),
         ([HOVER | {"points": [{"mass": 2.2, "rotor_speed": 5900}]}], "", None, "rotor_speed is"),
         ([HOVER | {"points": []}], "", None, "points is"),
