@@ -337,7 +337,7 @@ class Predictor:
             lambda there: flown(self, objective, there),
         )
         changed = {
-            name: flown(self._stepped(other), other, own) for name, other in otherwise.items()
+            name: flown(self.stepped(other), other, own) for name, other in otherwise.items()
         }
         if by_strengths is not None:
             moves = gathered(by_strengths, self.feed.widths, self.rows)
@@ -348,7 +348,7 @@ class Predictor:
                 }
         return information_at(objective, own, unscaled(criterion), jacobian, otherwise=changed)
 
-    def _stepped(self, other: Objective) -> Predictor:
+    def stepped(self, other: Objective) -> Predictor:
         """Return the predictor of another problem: finer steps, pushed along, other readings."""
         segments = self.feed.segments
         times = other.schedule.physics_rate // self.schedule.physics_rate

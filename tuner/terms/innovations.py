@@ -30,6 +30,7 @@ from tuner.terms.candidates import (
 from tuner.terms.linearisation import Columns, Linear, linear_of, neutral_of, vector_after
 from tuner.terms.model_averaging import SMALLEST, in_doubt
 from tuner.terms.score import EARNING, score, surviving
+from tuner.uncertainty.model_error import Lack
 from tuner.vehicle import COEFFICIENTS, conditions
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
@@ -69,17 +70,32 @@ class Innovations:
     linear: Linear
 
     @staticmethod
-    def of(selected: Selected, fitted: Fitted, predictor: Predictor) -> Innovations:
-        """Return what the innovations of a predictor say at a fit, gains as they are."""
+    def of(
+        selected: Selected, fitted: Fitted, predictor: Predictor, lack: Lack | None = None
+    ) -> Innovations:
+        """Return what the innovations of a predictor say at a fit, gains as they are.
+
+        With what the model lacks acting, where that is known.
+        """
         names = [name for group in outside(selected).values() for name in group]
         _, wide = with_free(selected.job, fitted, names)
-        beside = replace(predictor, schedule=wide.objective.schedule)
-        information = beside.information(wide.objective, wide.point, fitted.criterion)
-        space, vector = wide.objective.space, np.asarray(wide.point.coefficients)
+        objective, beside = wide.objective, replace(predictor, schedule=wide.objective.schedule)
+        if lack is not None:
+            objective = lack.acting_on(objective)
+            beside = beside.stepped(objective)
+        information = beside.information(objective, wide.point, fitted.criterion)
+        space, vector = objective.space, np.asarray(wide.point.coefficients)
         scaled = space.scaled(vector)
         linear = linear_of(information, scaled, space.prior_mean, predictor.loss)
         linear = replace(linear, names=space.names, neutral=neutral_of(space))
         return Innovations(selected, fitted, space, vector, linear)
+
+    def with_acting(self, lack: Lack | None, predictor: Predictor) -> Innovations:
+        """Return what they say with what the model lacks acting.
+
+        What no term explains hides some terms, and passes for others.
+        """
+        return self if lack is None else Innovations.of(self.selected, self.fitted, predictor, lack)
 
     def in_doubt(self) -> dict[str, float]:
         """Return how far coefficients would move with terms that were left out.

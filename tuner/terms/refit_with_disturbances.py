@@ -144,7 +144,11 @@ def with_disturbances(
     otherwise = alternatives_of(again.objective, again.point, job.fitted)
     lack = lack_of(again, job.fitted)
     examination = examine(
-        again, otherwise=otherwise, predictor=predictor, in_doubt=seen.in_doubt(), lack=lack
+        again,
+        otherwise=otherwise,
+        predictor=predictor,
+        in_doubt=seen.with_acting(lack, predictor).in_doubt(),
+        lack=lack,
     )
     if seen.selected is not simulated:
         # without a lag that samples surely call for simulated flights tell nothing of the others

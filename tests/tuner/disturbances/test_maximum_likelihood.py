@@ -32,8 +32,8 @@ def test_a_filter_flies_on_the_voltage_that_another_problem_reads():
     predictor = Predictor(fit.schedule, feed, {}, USUAL, {})
     volts = np.full((3, fit.segments.count), 0.1)
     other = replace(fit, segments=replace(fit.segments, log_voltage=volts))
-    assert predictor._stepped(fit).feed.segments.log_voltage is None
-    assert predictor._stepped(other).feed.segments.log_voltage is volts
+    assert predictor.stepped(fit).feed.segments.log_voltage is None
+    assert predictor.stepped(other).feed.segments.log_voltage is volts
 
 
 @pytest.mark.parametrize(

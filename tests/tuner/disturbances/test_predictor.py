@@ -359,7 +359,7 @@ def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has
     own = Predictor.of(finer, point, gusty(problem, 1)[1])
     assert own is not None
     own = replace(own, strengths=predictor.strengths, noise=predictor.noise).at(finer, point)
-    stepped = predictor._stepped(finer)
+    stepped = predictor.stepped(finer)
     here, there = (np.asarray(of.found.gains.gain) for of in (predictor, own))
     commands = here[..., -COUNT - 8 : -COUNT].reshape(*here.shape[:-1], 2, 4).repeat(2, axis=-2)
     expected = there[..., -COUNT - 12 : -COUNT]
@@ -404,7 +404,7 @@ def test_a_push_that_is_known_moves_innovations_in_proportion(fitted) -> None:
             rate=float(problem.schedule.log_rate),
         )
         other = replace(problem, segments=replace(problem.segments, disturbance=known))
-        residuals = predictor._stepped(other).jacobian(other, point, []).residuals
+        residuals = predictor.stepped(other).jacobian(other, point, []).residuals
         return {name: np.asarray(rows) for name, rows in residuals.items()}
 
     here = predictor.jacobian(problem, point, []).residuals
@@ -424,7 +424,7 @@ def test_samples_that_are_stamped_otherwise_move_their_own_innovations_in_propor
         speeds = measured["rotor_speed"]
         measured["rotor_speed"] = eqx.tree_at(lambda m: m.time, speeds, speeds.time + seconds)
         other = replace(problem, segments=replace(problem.segments, measured=measured))
-        residuals = predictor._stepped(other).jacobian(other, point, []).residuals
+        residuals = predictor.stepped(other).jacobian(other, point, []).residuals
         return {name: np.asarray(rows) for name, rows in residuals.items()}
 
     here = {n: np.asarray(r) for n, r in predictor.jacobian(problem, point, []).residuals.items()}
@@ -459,7 +459,7 @@ def test_a_voltage_that_is_read_higher_moves_innovations_as_faster_motors_do(fit
 
     faster = eqx.tree_at(speeds, problem, [s * np.exp(higher) for s in speeds(problem)])
     found, same, expected = (
-        predictor._stepped(other).jacobian(other, point, []).residuals["rotor_speed"]
+        predictor.stepped(other).jacobian(other, point, []).residuals["rotor_speed"]
         for other in (read(higher), read(0.0), faster)
     )
     np.testing.assert_allclose(found, expected, atol=1e-9)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -261,6 +261,39 @@ def test_terms_left_out_are_in_doubt_by_what_innovations_say_of_them(alike: bool
     assert found["estimate_latency"] == 7.0
     assert (found["inertia_xx"] < 2e-3) != alike
     assert found["inertia_xx"] < 9.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A problem and a filter in one: innovations show a drag only where flights are pushed."""
+
+    space: Space
+    schedule: str = "as it was"
+    pushed: bool = False
+    loss: float = 0.5 * FLIGHTS * STRETCHES * STEPS
+
+    def stepped(self, other: Problem) -> Problem:
+        return other
+
+    def information(self, objective: Problem, *_: object) -> FisherInformation:
+        shown = {"fuselage_drag": 2.0} if self.pushed and objective.pushed else {}
+        return information(self.space, shown, alike={"fuselage_drag": "inertia_xx"})
+
+
+def test_terms_are_judged_with_what_the_model_lacks_acting(monkeypatch) -> None:
+    """A force that nothing explains hides a drag: with it the drag may be there."""
+    plain = seen([DRAG], {})
+    there = Problem(plain.space)
+    wide = SimpleNamespace(objective=there, point=SimpleNamespace(coefficients=plain.vector))
+    monkeypatch.setattr(innovations, "with_free", lambda *_: (NOBODY, wide))
+    fitted = cast(Fitted, SimpleNamespace(**vars(plain.fitted), criterion=NOBODY))
+    lack = SimpleNamespace(acting_on=lambda objective: replace(objective, pushed=True))
+    said = Innovations.of(plain.selected, fitted, cast(Any, there))
+
+    def doubt(lack: Any) -> float:
+        return said.with_acting(lack, cast(Any, there)).in_doubt()["inertia_xx"]
+
+    assert doubt(lack) > 10.0 * doubt(None) > 0.0
 
 
 def test_a_steady_wind_is_a_disturbance_like_others() -> None:

@@ -168,7 +168,10 @@ def test_a_fit_with_a_lag_whose_filter_loses_a_flight_is_not_taken(monkeypatch):
     ("others", "titles", "lag"), [(True, 2, False), (False, 1, False), (True, 1, True)]
 )
 def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, others, titles, lag):
-    """A fit of another model cannot contradict this one, nor can one without a lag."""
+    """A fit of another model cannot contradict this one, nor can one without a lag.
+
+    What the model lacks acts as terms that were left out are judged.
+    """
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
     predictor = SimpleNamespace(memory=0, is_lost=False, keeps_track=True, strengths=USUAL)
     predictor.without_gains = predictor
@@ -176,14 +179,14 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
     row = SimpleNamespace(group="fuselage_drag", kept=True)
     begin = Selected(job, fitted(2.0 * COLOURED), (cast(Any, row),))
-    polished, examined, read = [], [], []
+    polished, examined, read, lack = [], [], [], object()
     chosen = iter([replace(begin, rows=()) if others else None, None])
 
     def seen(selected: Selected, *_: Any) -> Any:
         return SimpleNamespace(
             selected=selected,
             selection=lambda *_, **__: next(chosen),
-            in_doubt=dict,
+            with_acting=lambda lack, _: SimpleNamespace(in_doubt=lambda: {"acting": lack}),
         )
 
     def with_lags(found: Any, there: Fitted, own: Any, _: Any) -> Any:
@@ -193,8 +196,9 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
         polished.append(title)
         return replace(fit, wall_time=float(len(polished)))
 
-    def examine(fit: Fitted, **_: Any) -> Any:
+    def examine(fit: Fitted, *, in_doubt: Any, predictor: Any = None, **_: Any) -> Any:
         examined.append(fit)
+        assert predictor is None or in_doubt == {"acting": lack}
         return SimpleNamespace(uncertainty=NOBODY)
 
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
@@ -204,7 +208,7 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     monkeypatch.setattr(disturbances, "free_offsets", lambda _: np.zeros((0, 0), bool))
     monkeypatch.setattr(disturbances, "polished", polish)
     monkeypatch.setattr(disturbances, "alternatives_of", lambda *given: read.append(given[2:]))
-    monkeypatch.setattr(disturbances, "lack_of", lambda *_: None)
+    monkeypatch.setattr(disturbances, "lack_of", lambda *_: lack)
     monkeypatch.setattr(disturbances, "examine", examine)
     monkeypatch.setattr(disturbances, "_with_lags", with_lags)
     monkeypatch.setattr(disturbances, "_agree", lambda *_: not lag)
