@@ -11,7 +11,7 @@ import numpy as np
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.numerics import Array
 from tuner.recordings.clocks import align_pose, message_times
-from tuner.recordings.defects import clean, without_stale
+from tuner.recordings.defects import clean, stays_while_tilting, without_stale
 from tuner.recordings.flight import SIGNALS, Series
 from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.frames import DOUBTS, contradiction, correct_frames
@@ -205,6 +205,10 @@ def read_signals(options: ReadOptions) -> Signals:
     topics = {signal: data.topic for signal, data in raw.items()}
     damage = tuple(part.later(_stamp_delay(raw, contents, epoch)) for part in contents.damage)
     notes += dropped
+    if no_pose is None and stays_while_tilting(series):
+        del series["position"]
+        what = "its position never changes along x and y, though the vehicle tilts"
+        no_pose = RecordingError(path, what, "record where it is")
     for needed in ("position", "attitude"):
         if no_pose is None and needed not in series:
             where = f" in {topics[needed]}" if topics.get(needed) else ""

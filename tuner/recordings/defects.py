@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tuner.core.numerics import Array
 from tuner.recordings.flight import Series
-from tuner.recordings.interpolation import runs
+from tuner.recordings.interpolation import rms, runs, upward
 from tuner.recordings.notes import Kind, Note, NoteCode
 
 RANGES: Mapping[str, tuple[float, float]] = {
@@ -59,6 +59,8 @@ LEAST_MOTION = 0.05
 """m by which the vehicle must have moved meanwhile."""
 LEAST_TURN_RATE = 0.2
 """rad/s of its gyro, root mean square, that show the same."""
+LEAST_TILT = 0.05
+"""rad, root mean square, of a vehicle that must move."""
 MOTION_SIGNALS = ("attitude", "body_rate")
 """Signals that change whenever a vehicle moves."""
 
@@ -366,6 +368,17 @@ def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list
             Note(NoteCode.STALE, count=len(time) - last - 1, numbers=numbers, names=(name,))
         )
     return kept, notes
+
+
+def stays_while_tilting(series: Mapping[str, Series]) -> bool:
+    """Return whether a position that was recorded was never measured: a vehicle that tilts moves.
+
+    An estimator without any position repeats its first for good.
+    """
+    if not {"position", "attitude"} <= set(series):
+        return False
+    still = np.ptp(series["position"].values[:, :2], axis=0).max() == 0.0
+    return bool(still and rms(upward(series["attitude"].values)[:, :2]) > LEAST_TILT)
 
 
 def _is_moving(series: Mapping[str, Series], stuck: str, since: float) -> bool:

@@ -7,7 +7,7 @@ import pytest
 
 from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
-from tuner.recordings.defects import clean, is_stale, without_stale
+from tuner.recordings.defects import clean, is_stale, stays_while_tilting, without_stale
 from tuner.recordings.flight import Series
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
@@ -265,3 +265,18 @@ def test_a_flight_of_which_too_little_is_left_is_read_but_not_fitted(tmp_path) -
     assert not is_stale(longer.series, longer.notes)
     assert not any("attitude" in inlet.missing for inlet in then.inlets)
     assert then.coefficients
+
+
+def test_a_position_that_stays_while_the_vehicle_tilts_is_none(tmp_path) -> None:
+    signals = flight(20.0, moves=True)
+    assert not stays_while_tilting(signals)
+    still = signals["position"].values * [0.0, 0.0, 1.0]
+    assert stays_while_tilting(signals | {"position": Series(TIME, still)})
+    level = np.tile([1.0, 0.0, 0.0, 0.0], (len(TIME), 1))
+    spin = {"position": Series(TIME, still), "attitude": Series(TIME, level)}
+    assert not stays_while_tilting(spin)
+    path = tmp_path / "still.csv"
+    table = np.column_stack([TIME, still, signals["attitude"].values])
+    np.savetxt(path, table, delimiter=",", header="t,px,py,pz,qw,qx,qy,qz", comments="")
+    with pytest.raises(RecordingError, match="its position never changes along x and y"):
+        load_flight(path, cache=False)
