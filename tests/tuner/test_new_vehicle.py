@@ -83,6 +83,12 @@ def test_bad_input_is_one_line_and_nothing_is_asked(
     assert not list(tmp_path.iterdir())
 
 
+def test_the_folder_of_the_first_file_is_made(tmp_path):
+    out = tmp_path / "runs" / "quad.yaml"
+    assert main(["new-vehicle", "--like", "crazyflie", "--out", str(out)]) == 0
+    assert read_vehicle(out).mass < 0.1
+
+
 @pytest.mark.parametrize("out", ["", ".", "/"])
 def test_a_folder_is_no_file(out, capsys):
     assert main(["new-vehicle", "--like", "crazyflie", "--out", out]) == 2

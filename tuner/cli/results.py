@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from tuner.job.bench import BenchResult
     from tuner.job.sensitivity import SensitivityResult
+    from tuner.report.contents import Contents
     from tuner.result import ExportRecord, RunResult
     from tuner.search.iteration import PointEstimate
     from tuner.uncertainty.records import Refit
@@ -49,20 +50,19 @@ def print_run(
     if verbose:
         print_sections(folder)
     screen = console(WIDTH)
-    for line in _summary(folder, result, contents.exports, seconds):
+    for line in _summary(contents, result, seconds):
         if isinstance(line, Table):
             screen.print(rich_table(line))
         else:
             screen.print(line, soft_wrap=True)
 
 
-def _summary(
-    folder: Path, result: RunResult, exports: Sequence[ExportRecord], seconds: float | None
-) -> list[Text | Table]:
+def _summary(contents: Contents, result: RunResult, seconds: float | None) -> list[Text | Table]:
     """Return the lines and tables of a finished job."""
     from tuner.report.outcome import flights_table, next_step, outcome
 
-    found = outcome(result)
+    folder, exports = contents.folder, contents.exports
+    found = outcome(result, contents.bench)
     lines: list[Text | Table] = [
         Text(
             shorten(f"{found.usability.capitalize()}. {found.what}", WIDTH),

@@ -15,6 +15,7 @@ import re
 import stat
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -263,13 +264,19 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
             raise InputError(path, "does not exist", "check the path")
         for match in matches:
             if exists(match) and match.is_dir() and not (match / "metadata.yaml").exists():
-                raise InputError(
-                    match, "is a folder", f"give the recordings in it: '{match}/*.bag'"
-                )
+                within = f"{match}/*{_commonest_suffix(match)}"
+                raise InputError(match, "is a folder", f"give the recordings in it: '{within}'")
             recordings.setdefault(match.resolve(), match)
     if not recordings:
         raise InputError("--flights", "names no recording", "give the recordings to use")
     return tuple(recordings.values())
+
+
+def _commonest_suffix(folder: Path) -> str:
+    """Return the suffix of most files of a folder that may be recordings."""
+    others = {".md", ".txt", ".yaml", ".yml", ".json", ".pdf"}
+    suffixes = Counter(path.suffix for path in folder.glob("*.*") if path.suffix not in others)
+    return suffixes.most_common(1)[0][0] if suffixes else ""
 
 
 def folder_for(out: Path | None, *, resume: bool = False) -> Path:

@@ -326,7 +326,14 @@ def agreement_in_words(record: BenchRecord) -> str:
 def bench_in_words(record: BenchRecord) -> str:
     """Return what ground measurements gave, in one sentence."""
     count = len(record.experiments)
-    return (
-        f"{len(record.names)} coefficients come from {count} ground "
-        f"experiment{'s' if count != 1 else ''}; no flight was used."
-    )
+    s = "s" if count != 1 else ""
+    if of_flights(record):
+        what = f"{count} flight{s} without a pose; none was simulated"
+    else:
+        what = f"{count} ground experiment{s}; no flight was used"
+    return f"{len(record.names)} coefficients come from {what}."
+
+
+def of_flights(record: BenchRecord) -> bool:
+    """Return whether the experiments are flights without a pose, and not on the ground."""
+    return any(remark.code == "explained" for e in record.experiments for remark in e.remarks)

@@ -132,14 +132,13 @@ def _measurement(
         [1.0 / gains[n] if n in OUTPUTS else inertia[n] if n in STEADY else 1.0 for n in used]
     )
     covariance = response.covariance[np.ix_(places, places)] * np.outer(slope, slope)
+    explained = {name: 100.0 * max(response.explained[name], 0.0) for name in OUTPUTS}
     return Measurement(
         experiment=name,
         rows=tuple(NUMBERS[place] for place in places),
         value=np.array([values[number] for number in used]),
         covariance=covariance,
-        remarks=(
-            Remark("explained", {name: 100.0 * response.explained[name] for name in OUTPUTS}),
-        ),
+        remarks=(Remark("explained", explained),),
         curves=tuple(
             Curve.of(
                 (title, "time, s", title.split(", ")[0]),

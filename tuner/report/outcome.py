@@ -41,6 +41,8 @@ OTHER_INPUTS = frozenset(
     }
 )
 """Warnings that what was given is not what flew: all numbers follow from that."""
+CAUSES = OTHER_INPUTS | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS}
+"""Warnings that say why others arise."""
 DOUBTS = OTHER_INPUTS | frozenset(
     {
         Code.MODEL_UNMATCHED,
@@ -148,11 +150,11 @@ def outcome(result: RunResult, bench: BenchRecord | None = None) -> Outcome:
 
 
 def by_weight(findings: Sequence[Finding]) -> list[Finding]:
-    """Return failures and warnings: failures first, other inputs, then what doubts the numbers."""
+    """Return failures and warnings: failures first, causes, then what doubts the numbers."""
     found = [finding for finding in findings if finding.level != "info"]
 
     def weight(finding: Finding) -> tuple[bool, ...]:
-        return finding.level != "failure", *(finding.code not in w for w in (OTHER_INPUTS, DOUBTS))
+        return finding.level != "failure", *(finding.code not in w for w in (CAUSES, DOUBTS))
 
     return sorted(found, key=weight)
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+
 from tuner.core.numerics import Z95
 from tuner.core.phrases import listed, percent, quantity
 from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict
 from tuner.vehicle import scale_group
 
+MOST = 100.0
+"""Of a logarithm's interval, more than any prior leaves."""
 NEGLIGIBLE = 0.01
 """Share of the largest part of an error below which another is not worth a word."""
 
@@ -120,7 +124,11 @@ def _main_clause(reason: Reason) -> str:
 
 
 def _half_width(reason: Reason) -> str:
-    return "" if reason.half_width is None else quantity(reason.half_width, reason.unit)
+    """Return the longer side of an interval; of a logarithm, in shares of the value."""
+    half, unit = reason.half_width, reason.unit
+    if half is None:
+        return ""
+    return quantity(half if unit is not None else math.expm1(min(half, MOST)), unit)
 
 
 def _source(reason: Reason) -> str:

@@ -1,3 +1,4 @@
+import re
 import shutil
 
 import pytest
@@ -172,6 +173,16 @@ def test_two_recordings_of_one_name_are_refused(lab):
     (lab / "more" / "a.bag").touch()
     with pytest.raises(InputError, match="same name"):
         settle(Options([f"{lab}/a.bag", f"{lab}/more/a.bag"]))
+
+
+@pytest.mark.parametrize("name", ["a.bag", "a.csv", "log10"])
+def test_a_folder_of_recordings_is_answered_by_what_finds_them(name, tmp_path):
+    for other in (name, "README.md", "tune.yaml", "truth.yaml"):
+        (tmp_path / other).touch()
+    with pytest.raises(InputError, match="is a folder") as refused:
+        find_flights([str(tmp_path)])
+    (pattern,) = re.findall("'(.*)'", str(refused.value))
+    assert tmp_path / name in find_flights([pattern])
 
 
 def test_two_job_files_are_refused(lab):

@@ -21,6 +21,8 @@ from tuner.options import SimulationOptions
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import read_inertial
 from tuner.recordings.notes import NoteCode
+from tuner.report.contents import read_contents
+from tuner.report.outcome import outcome
 from tuner.result import BEST_FIT_FILE
 from tuner.search.job_flights import read_usable, without_pose
 from tuner.uncertainty.verdict import Verdict
@@ -114,6 +116,9 @@ def test_intervals_hold_the_vehicle_that_flew(simulation, flown, tmp_path):
     assert not result["mass"].fitted
     codes = {finding.code for finding in fitted.result.findings}
     assert codes == {Code.SCALES_WITH_MASS, Code.NO_TACHOMETER, Code.YAW_OPEN}
+    contents = read_contents(fitted.folder)
+    said = outcome(contents.run.result, contents.bench).what
+    assert said == "12 coefficients come from 1 flight without a pose; none was simulated."
     again = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
     assert again["inertia_xx"] == result["inertia_xx"].best
 

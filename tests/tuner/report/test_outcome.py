@@ -115,8 +115,11 @@ def test_what_doubts_the_numbers_comes_before_what_does_not():
     info = Finding(Code.YAW_OPEN, "info", "b")
     doubt = Finding(Code.TURNING_UNEXPLAINED, "warning", "c", {"explained": 0.4})
     other = Finding(Code.VEHICLE_NOT_GIVEN, "warning", "d", {"mass": 2.0})
+    numbers = {"rate_gain_yaw": 0.5, "rate_gain_yaw_error": 0.1}
+    cause = Finding(Code.TERM_SHOWS, "warning", "rate_gain", numbers, ("rate_gain_yaw",))
     failure = Finding(Code.NOT_FINITE, "failure", "e")
-    assert [w.link for w in warnings_of((info, gap, doubt, other, failure))] == ["e", "d", "c", "a"]
+    said = warnings_of((info, gap, doubt, other, cause, failure))
+    assert [warning.link for warning in said] == ["e", "d", "rate_gain", "c", "a"]
 
 
 def test_the_flight_to_hold_out_is_the_one_that_tells_least_and_never_the_only_one(

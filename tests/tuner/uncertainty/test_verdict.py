@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from tuner.uncertainty.verdict import (
@@ -12,6 +13,7 @@ from tuner.uncertainty.verdict import (
     judge,
     judge_after_holding,
 )
+from tuner.uncertainty.verdict_texts import half_width_in_words, reason_in_words
 
 KNOWN = Reason(
     code=ReasonCode.INTERVAL,
@@ -98,3 +100,12 @@ def test_a_tied_coefficient_stays_tied_when_its_group_is_held() -> None:
 def test_a_reason_survives_json() -> None:
     _, reason = judged(bound="upper", noise_inflation=3.0)
     assert Reason.model_validate_json(reason.model_dump_json()) == reason
+
+
+def test_a_reason_has_the_longer_side_of_the_interval_as_tables_do():
+    """Of 0.022, ±0.19 in its logarithm."""
+    reason = Reason(code=ReasonCode.MEASURED_ROUGHLY, half_width=0.19)
+    low, high = 0.022 * math.exp(-0.19), 0.022 * math.exp(0.19)
+    assert half_width_in_words((low, high), 0.022, "kg m²") in reason_in_words(reason)
+    in_unit = Reason(code=ReasonCode.MEASURED_ROUGHLY, half_width=0.19, unit="N m")
+    assert "±0.19 N m" in reason_in_words(in_unit)

@@ -8,6 +8,7 @@ from tuner.ground.bench_json import (
     ExperimentRecord,
     agreement_in_words,
     numbers_in_words,
+    of_flights,
     remarks_in_words,
 )
 from tuner.ground.measurement import Curve
@@ -28,7 +29,8 @@ def bench(contents: Contents) -> Section | None:
     rows = [
         (e.name, "; ".join(numbers_in_words(e)), " ".join(remarks_in_words(e))) for e in experiments
     ]
-    columns = ("experiment", "gives", "what its checks noticed")
+    flown = of_flights(contents.bench)
+    columns = ("flight" if flown else "experiment", "gives", "what its checks noticed")
     table = Table(columns, rows, words=columns)
     charts = [
         chart for number, experiment in enumerate(experiments)
@@ -36,7 +38,7 @@ def bench(contents: Contents) -> Section | None:
     ]  # fmt: skip
     return Section(
         "bench",
-        "Ground measurements",
+        "Flights without a pose" if flown else "Ground measurements",
         sentences=(agreement_in_words(contents.bench),),
         tables=(table,),
         charts=charts,
