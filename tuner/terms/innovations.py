@@ -28,7 +28,7 @@ from tuner.terms.candidates import (
     with_groups,
 )
 from tuner.terms.linearisation import Columns, Linear, linear_of, neutral_of, vector_after
-from tuner.terms.model_averaging import SMALLEST, in_doubt
+from tuner.terms.model_averaging import SMALLEST, Evidence, in_doubt
 from tuner.terms.score import EARNING, score, surviving
 from tuner.uncertainty.model_error import Lack
 from tuner.vehicle import COEFFICIENTS, conditions
@@ -45,6 +45,8 @@ REFUSED = (
 """Why least squares may have left out what innovations call for."""
 WORTH_A_FIT = 0.05
 """Chance below which a secant lets a term be tried."""
+SURELY = 4.0
+"""Standard errors by which a coefficient is surely elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,17 @@ class Innovations:
             **self.selected.in_doubt,
             **{self.space.names[i]: float(moves[i]) for i in model},
         }
+
+    def contradict(self, name: str, value: float) -> bool:
+        """Return whether they surely put a coefficient that was left out elsewhere, from zero."""
+        column = self._columns([name])
+        if not len(column) or name in self.fitted.objective.space.names:
+            return False
+        model = self._model(self.fitted.objective.space.names)
+        square = self.linear.information() + self.linear.prior
+        told = Evidence.of(self.linear, square, self.linear.step(model), model, column)
+        apart = told.value - value / self.linear.prior_sd[column]
+        return bool(np.any(apart**2 > SURELY**2 * told.variance))
 
     def selection(self, had: Collection[str], *, first: bool = False) -> Selected | None:
         """Return the terms that innovations call for and their fit, one linear step on.

@@ -30,7 +30,7 @@ from tuner.terms.search_with_terms import (
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine, full_problem_of
 from tuner.uncertainty.identifiability import with_undetermined_held
-from tuner.uncertainty.model_error import alternatives_of, lack_of
+from tuner.uncertainty.model_error import Lack, alternatives_of, lack_of
 
 CONTRADICTS = 4.0
 """Standard errors by which no coefficient may move. Those of least squares are known from some ten
@@ -142,7 +142,7 @@ def with_disturbances(
         findings=(*again.findings, _finding(predictor)),
     )
     otherwise = alternatives_of(again.objective, again.point, job.fitted)
-    lack = lack_of(again, job.fitted)
+    lack = _believed(lack_of(again, job.fitted), seen)
     examination = examine(
         again,
         otherwise=otherwise,
@@ -170,6 +170,17 @@ def with_disturbances(
             on_message("It contradicts the fit of the simulated flights, which is kept.")
         better = agree and _is_sharper(examination.uncertainty, before.uncertainty)
     return (seen.selected, again, examination) if better else None
+
+
+def _believed(lack: Lack | None, seen: Innovations) -> Lack | None:
+    """Return what the model lacks, without a lateness of rotor speeds that samples contradict.
+
+    Accelerations tell it in the few seconds in which rotors change their speed most, and there a
+    gust may pass for it. Every sample of a tachometer tells it.
+    """
+    if lack is None or not seen.contradict("tachometer_lag", lack.late):
+        return lack
+    return replace(lack, late=0.0).or_none
 
 
 def _with_lags(

@@ -296,6 +296,16 @@ def test_terms_are_judged_with_what_the_model_lacks_acting(monkeypatch) -> None:
     assert doubt(lack) > 10.0 * doubt(None) > 0.0
 
 
+def test_what_innovations_surely_put_elsewhere_is_contradicted() -> None:
+    usual, said = USUAL["fuselage_drag"], seen([DRAG], {"fuselage_drag": 2.0})
+    sizes = (-2.0, 0.0, 1.98, 2.0, 2.02, 2.1)
+    found = [said.contradict("fuselage_drag", size * usual) for size in sizes]
+    assert found == [True, True, False, False, False, True]
+    assert not said.contradict("tachometer_lag", 1.0)  # which nobody tried
+    fitted = seen([DRAG.model_copy(update={"kept": True})], {"fuselage_drag": 2.0})
+    assert not fitted.contradict("fuselage_drag", -2.0 * usual)
+
+
 def test_a_steady_wind_is_a_disturbance_like_others() -> None:
     wind = SelectionRow(
         group="wind",

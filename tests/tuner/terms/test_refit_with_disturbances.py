@@ -14,11 +14,13 @@ from tests.tuner.uncertainty.making import ended
 from tuner.config import JobFile
 from tuner.disturbances.disturbances import USUAL
 from tuner.disturbances.maximum_likelihood import STEPS
+from tuner.equation_error.omitted_laws import Law
 from tuner.search.problem import Job
 from tuner.search.progress import COLOURED, Fitted
 from tuner.terms import refit_with_disturbances as disturbances
 from tuner.terms.candidates import Selected
-from tuner.terms.refit_with_disturbances import ROUGHLY, with_disturbances
+from tuner.terms.refit_with_disturbances import ROUGHLY, _believed, with_disturbances
+from tuner.uncertainty.model_error import Lack
 
 NOBODY = cast(Any, None)
 
@@ -179,13 +181,14 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
     row = SimpleNamespace(group="fuselage_drag", kept=True)
     begin = Selected(job, fitted(2.0 * COLOURED), (cast(Any, row),))
-    polished, examined, read, lack = [], [], [], object()
+    polished, examined, read, lack = [], [], [], Lack((), None)
     chosen = iter([replace(begin, rows=()) if others else None, None])
 
     def seen(selected: Selected, *_: Any) -> Any:
         return SimpleNamespace(
             selected=selected,
             selection=lambda *_, **__: next(chosen),
+            contradict=lambda *_: False,
             with_acting=lambda lack, _: SimpleNamespace(in_doubt=lambda: {"acting": lack}),
         )
 
@@ -218,6 +221,22 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     assert len(examined) == 2 - lag
     assert (examined[-1] is begin.fitted) == (titles == 1 and not lag)
     assert read[0] == (job.fitted,)  # whose voltmeters are read again
+
+
+def test_a_lateness_that_samples_contradict_is_not_believed():
+    law = Law("force_z", "airspeed_across", 0.2)
+    seconds, both = {"tachometer_lag": 0.012}, Lack((law,), None, late=0.012)
+
+    def believed(lack: Lack | None, *, contradicted: bool) -> Lack | None:
+        def contradict(name: str, value: float) -> bool:
+            return contradicted and value == seconds[name]
+
+        return _believed(lack, cast(Any, SimpleNamespace(contradict=contradict)))
+
+    assert believed(both, contradicted=False) == both
+    assert believed(both, contradicted=True) == Lack((law,), None)
+    assert believed(Lack((), None, late=0.012), contradicted=True) is None
+    assert believed(None, contradicted=True) is None
 
 
 @pytest.mark.parametrize(
