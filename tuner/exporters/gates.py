@@ -144,5 +144,7 @@ def _on_bounds(run: Run) -> list[str]:
         for side, bound in (("lower", lower), ("upper", upper)):
             near = ON_BOUND * (abs(bound or 0.0) if span is None else span)
             if bound is not None and abs(coefficient.best - bound) <= near:
-                objections.append(f"{name} {coefficient.best:g} is its {side} bound")
+                untold = coefficient.identifiable is False
+                to_do = f", and no flight tells it: --fix {name}" if untold else ""
+                objections.append(f"{name} {coefficient.best:g} is its {side} bound{to_do}")
     return objections

@@ -175,6 +175,16 @@ def test_a_coefficient_that_the_run_held_may_lie_on_its_bound(make_run):
     assert all(gate.passed for gate in check(run, run.vehicle, as_the_run_says))
 
 
+def test_a_coefficient_on_its_bound_that_no_flight_tells_had_better_be_fixed(make_run):
+    on_bound = {"fitted": True, "lower": 0.0, "upper": 0.04, "best": 0.04}
+    for told in (True, False):
+        row = on_bound | {"identifiable": told}
+        run = make_run(coefficients={"actuator_latency": row})
+        (objection,) = check(run, run.vehicle, as_the_run_says)[-1].objections
+        assert objection.startswith("actuator_latency 0.04 is its upper bound")
+        assert ("--fix actuator_latency" in objection) is not told
+
+
 def test_a_fixed_coefficient_may_equal_its_bound(make_run):
     run = make_run(coefficients={"mass": {"fitted": False, "upper": 2.243}})
     assert all(gate.passed for gate in check(run, run.vehicle, as_the_run_says))
