@@ -163,7 +163,8 @@ def _lift_of(recorded: Array, vehicle: VehicleFile, source: Source) -> float:
 def _motor_orders(job: Job) -> Iterator[Finding]:
     """Warn of commands or rotor speeds that turn the vehicle as those of other rotors would."""
     for flight, inlet in zip(job.fitted, job.inlets, strict=True):
-        source: Source = "rotor_speed" if inlet == "rotor_speed" else "command"
+        speeds = inlet == "rotor_speed" or "command" not in flight.series
+        source: Source = "rotor_speed" if speeds else "command"
         if not {source, "body_rate"} <= set(flight.series):
             continue
         span = (0.0, flight.duration)

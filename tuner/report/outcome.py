@@ -221,8 +221,10 @@ def flights_table(flights: Sequence[FlightOutcome]) -> Table:
     ahead = sorted({flight.horizon for flight in flights if flight.horizon is not None})
     ends = dict.fromkeys(f"{seconds:.2g}" for seconds in ahead[:: len(ahead) - 1 or 1])
     within = f" in {' to '.join(ends)} s" if ahead else ""
-    position, attitude = f"position RMSE{within}", f"attitude RMSE{within}"
-    columns = ("flight", position, "noise", attitude, "noise ", "verdict")
+    columns = (
+        *("flight", f"position RMSE{within}", "noise"),
+        *("attitude RMSE", "noise ", "verdict"),
+    )
     return Table(columns, rows, words=("flight", "verdict"))
 
 

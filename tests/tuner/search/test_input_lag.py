@@ -1,6 +1,7 @@
 """The lateness of recorded inputs, to a fraction of a sample, before anything is fitted."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks import fast_flights
 from tuner.config import Options, settle
 from tuner.findings.findings import Code
+from tuner.job.check import _motor_orders
 from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
@@ -129,6 +131,12 @@ def test_the_order_of_measured_speeds_is_seen_in_how_they_turn_the_vehicle(broad
     series = dict(broadband.series) | {"rotor_speed": swapped}
     (finding,) = order_findings("a", series, updated, span, "rotor_speed")
     assert (finding.code, finding.names) == (Code.MOTOR_ORDER, ("1", "3", "2", "4"))
+    series.pop("command", None)
+    flown = replace(broadband, series=series)  # turns that it does not explain are followed
+    settings = SimpleNamespace(vehicle=updated)
+    job = SimpleNamespace(fitted=(flown,), inlets=("attitude",), settings=settings)
+    (said,) = _motor_orders(job)
+    assert (said.code, said.names) == (finding.code, finding.names)
 
 
 def test_what_the_loop_answers_to_hidden_torques_is_no_lateness(tmp_path):
