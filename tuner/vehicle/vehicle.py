@@ -366,7 +366,7 @@ def _with_units(text: str) -> str:
     units |= _OTHER_UNITS
     section = ""
     lines = []
-    for line in text.splitlines():
+    for line in text.removesuffix("\n").split("\n"):
         key = line.partition(":")[0]
         inside = line.startswith("  ")
         if not inside:

@@ -3,7 +3,9 @@ import re
 import pytest
 
 from tuner.core.errors import ConfigError
+from tuner.core.shipped import configs_folder
 from tuner.core.yaml_document import MAX_BYTES, commented, dump_yaml, read_yaml
+from tuner.vehicle import read_vehicle, write_vehicle
 
 
 def refusal(tmp_path, text):
@@ -55,6 +57,13 @@ def test_words_that_look_like_numbers_come_back_as_words(tmp_path):
     path.write_text(commented("two\nlines") + dump_yaml(data))
     assert path.read_text().startswith("# two\n# lines\n")
     assert read_yaml(path).data == data
+
+
+def test_line_breaks_of_unicode_come_back_from_a_vehicle_s_name(tmp_path):
+    vehicle = read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml")
+    named = vehicle.replace(name="quad\x85of\u2028the lab\u2029")
+    write_vehicle(named, tmp_path / "v.yaml", header=named.name)
+    assert read_vehicle(tmp_path / "v.yaml") == named
 
 
 def test_sections_have_a_line_for_each_key_and_deeper_values_one_line():
