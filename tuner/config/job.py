@@ -284,6 +284,12 @@ class JobFile(Section):
             raise refuse("both 'free' and 'fixed' are given", "keep one of them")
         _once("free", self.free or ())
         _once("terms", () if isinstance(self.terms, str) else self.terms)
+        for term in () if isinstance(self.terms, str) else self.terms:
+            for name in term_groups().get(term, (term,)):
+                if name in self.fixed:
+                    raise refuse(
+                        f"'{name}' is both among terms and fixed", "keep it in one of them"
+                    )
         _once("ties", tuple(name for group in self.ties for name in group))
         if self.channels and not any(self.channels.get(name, True) for name in CHANNELS):
             raise refuse("every channel is switched off", "leave one on")

@@ -188,6 +188,10 @@ def space_of(
         tied = [name for name in group if name in free]
         if not tied:
             continue
+        for name in group[1:]:
+            if name in job.coefficients:
+                what = f"'{name}' goes with '{group[0]}', and has bounds or a prior of its own"
+                raise ConfigError("ties", what, f"give those of '{group[0]}'")
         if len(tied) < len(group):
             missing = next(name for name in group if name not in free)
             raise ConfigError(
@@ -272,6 +276,9 @@ def parameter_of(
     if scale != row.scale:  # a start of zero has no share of itself
         sd *= 1.0 / initial if scale == "log" else abs(initial) or quarter
     if given.prior is not None:
+        if not lower <= given.prior.mean <= upper:
+            what = f"its prior's mean {given.prior.mean:g} is not within {lower:g} to {upper:g}"
+            raise ConfigError(name, what, "give bounds that hold it")
         mean = scaled(given.prior.mean)
         sd = given.prior.sd / given.prior.mean if scale == "log" else given.prior.sd
     return Parameter(

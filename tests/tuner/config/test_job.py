@@ -62,6 +62,7 @@ def test_paths_count_from_the_job_file_and_bare_names_are_shipped_files(tmp_path
         ("vehicle: hovergame", "did you mean 'hovergames'?"),
         ("free: [motor_constan]", "unknown coefficient 'motor_constan'; did you mean"),
         ("free: [mass]\nfixed: [mass]", "both 'free' and 'fixed' are given"),
+        ("terms: [linear_drag]\nfixed: [linear_drag_y]", "'linear_drag_y' is both among terms and"),
         ("free: []", "free is []"),
         ("free: [mass, mass]", "free names 'mass' twice"),
         ("coefficients: {mas: {lower: 1}}", "unknown coefficient 'mas'"),

@@ -201,10 +201,19 @@ def test_the_table_of_the_reference_is_the_registrys():
     ("name", "bounds", "expected"),
     [
         ("moment_constant", (-0.1, 0.1), "moment_constant is -0.1; it should be at least 0"),
+        ("motor_constant", (1e-3, 1e-2), "mean 1e-05 is not within 0.001 to 0.01"),
         ("estimate_latency", (0.0, 0.5), "estimate_latency is 0.5; it should be at most 0.1"),
     ],
 )
-def test_bounds_that_no_vehicle_file_can_hold_are_refused(vehicle, name, bounds, expected):
+def test_bounds_that_no_vehicle_file_or_prior_can_hold_are_refused(vehicle, name, bounds, expected):
     given = dict(zip(("lower", "upper"), bounds, strict=True)) | {"scale": "linear"}
+    given["prior"] = {"mean": 1e-5, "sd": 1e-5}
     with pytest.raises(ConfigError, match=expected):
         space_of(vehicle, ControllerFile(), JobFile(coefficients={name: given}))
+
+
+def test_what_goes_with_another_has_no_bounds_of_its_own(vehicle):
+    ties, bounds = (("inertia_xx", "inertia_yy"),), {"lower": 0.01, "upper": 0.05}
+    space_of(vehicle, ControllerFile(), JobFile(ties=ties, coefficients={"inertia_xx": bounds}))
+    with pytest.raises(ConfigError, match="'inertia_yy' goes with 'inertia_xx', and has bounds"):
+        space_of(vehicle, ControllerFile(), JobFile(ties=ties, coefficients={"inertia_yy": bounds}))
