@@ -55,6 +55,9 @@ FormatName = Annotated[
 ChannelName = Annotated[str, AfterValidator(lambda name: _known(name, CHANNELS, "channel"))]
 
 
+Weight = Annotated[Number, Interval(ge=1e-6, le=1e6)]
+
+
 class Prior(Section):
     """What is believed of a coefficient before the flights: mean ± standard deviation, its unit."""
 
@@ -186,7 +189,7 @@ class FlightSettings(Section):
     """
 
     inlet: InletChoice | None = None
-    weight: Positive = 1.0
+    weight: Weight = 1.0
     time_offset: Number | Literal["free"] | None = None
     trajectory: TrajectorySettings | None = None
 
@@ -271,7 +274,7 @@ class JobFile(Section):
     coefficients: dict[CoefficientName, CoefficientSettings] = Field(default_factory=dict)
     ties: tuple[Annotated[tuple[CoefficientName, ...], Len(min_length=2)], ...] = ()
     channels: dict[ChannelName, Flag] = Field(default_factory=dict)
-    weights: dict[ChannelName, Positive] = Field(default_factory=dict)
+    weights: dict[ChannelName, Weight] = Field(default_factory=dict)
     inlet: InletChoice = "auto"
     time_offset: Number | Literal["free"] = "free"
     search: Search = Search()

@@ -133,8 +133,8 @@ def _set_style(node: yaml.Node, depth: int) -> None:
     """Give the file and its sections a line for each key, and what lies deeper one line."""
     if isinstance(node, yaml.MappingNode | yaml.SequenceNode):
         node.flow_style = depth > 1
-    elif set(node.value) & set("\x85\u2028\u2029"):  # line breaks that a plain word would lose
-        node.style = '"'
+    elif isinstance(node, yaml.ScalarNode) and set(node.value) & set("\x85\u2028\u2029"):
+        node.style = '"'  # which escapes line breaks that a plain word would lose
     for child in _children(node):
         _set_style(child, depth + 1)
 

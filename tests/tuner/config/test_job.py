@@ -74,6 +74,7 @@ def test_paths_count_from_the_job_file_and_bare_names_are_shipped_files(tmp_path
         ("ties: [[inertia_xx, inertia_yy], [inertia_yy, mass]]", "ties names 'inertia_yy' twice"),
         ("channels: {positon: true}", "unknown channel 'positon'; did you mean 'position'?"),
         ("weights: {position: -1}", "weights.position is -1"),
+        ("weights: {position: 1.0e+300}", "weights.position is 1e+300; it should be at most"),
         ("inlet: motors", "inlet is 'motors'"),
         ("search: {method: newton}", "search.method is 'newton'"),
         ("search: {starts: 0}", "search.starts is 0"),
