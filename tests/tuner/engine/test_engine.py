@@ -3,7 +3,6 @@ import os
 import time
 
 import pytest
-from distributed import Client
 
 from tests.tuner.engine import tasks
 from tuner.core.errors import EngineError, InputError, RecordingError
@@ -126,6 +125,6 @@ def test_a_result_that_is_lost_on_its_way_is_an_error(two_workers, monkeypatch):
     async def lost(*_, **__):
         raise OSError("the worker that had it is gone")
 
-    monkeypatch.setattr(Client, "_gather", lost)
+    monkeypatch.setattr(type(two_workers._client), "_gather", lost)
     with pytest.raises(EngineError, match="does not answer any more"):
         two_workers.submit(tasks.square, 3).result(timeout=60)
