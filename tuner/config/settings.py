@@ -21,7 +21,7 @@ from tuner.ground.bench_json import joint_prior
 from tuner.options import FILES, IN_JOB_FILE, FlightOptions, Options
 from tuner.vehicle.controller import ControllerFile, read_controller
 from tuner.vehicle.joint_prior import JointPrior
-from tuner.vehicle.vehicle import VehicleFile, check_names, read_vehicle, with_values
+from tuner.vehicle.vehicle import VehicleFile, check_names, check_rotors, read_vehicle, with_values
 
 JOB_FILE = "tune.yaml"
 DEFAULT_NAME = "hovergames"
@@ -101,6 +101,7 @@ def settle(asked: FlightOptions, *, fits: bool = True) -> Settings:
     if named is None and options.bench is not None:
         named = str(Path(options.bench) / "best_fit.yaml")
     vehicle, origin["vehicle"] = _choose("vehicles", read_vehicle, named, job.vehicle, job_path)
+    check_rotors(vehicle)
     controller, origin["controller"] = _choose(
         "controllers", read_controller, options.controller, job.controller, job_path
     )

@@ -43,8 +43,8 @@ from tuner.vehicle import (
     ControllerFile,
     VehicleFile,
     check_filter,
-    check_mixer,
     check_names,
+    check_rotors,
     read_controller,
     read_vehicle,
     with_values,
@@ -225,7 +225,7 @@ def simulate(
     Simulation
         One, or B of them in the order of the grid.
     """
-    check_mixer(vehicle)
+    check_rotors(vehicle)
     flown = vehicle, controller, trajectory, duration, rate, precision, forces
     pieces = ((columns, *flown) for columns in _pieces(grid or {}))
     engine = current()

@@ -51,7 +51,7 @@ from tuner.search.job_flights import Recording, as_logged, read_usable
 from tuner.search.levenberg_marquardt import FAR
 from tuner.search.problem import limits_of
 from tuner.search.progress import plain_criterion
-from tuner.vehicle import ControllerFile, VehicleFile, check_mixer, read_vehicle
+from tuner.vehicle import ControllerFile, VehicleFile, check_rotors, read_vehicle
 from tuner.vehicle.model import Model, model_of, schedule_of
 
 POSE = ("position", "attitude")
@@ -142,7 +142,6 @@ class _Group:
     ) -> None:
         self._recordings, self._controller = tuple(recordings), controller
         self._schedule = schedule_of(controller)
-        self._has_mixer = INLETS[inlet].has_mixer
         self._inlet, self._seconds = inlet, seconds
         self.windowed = not INLETS[inlet].closed_loop
         self._stride = max(1, round(self._schedule.log_rate / FORCES_RATE))
@@ -193,8 +192,7 @@ class _Group:
         flier: Callable[..., Flown] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name to its errors, those of windows behind each other."""
-        if self._has_mixer:
-            check_mixer(vehicle)
+        check_rotors(vehicle)
         flights = [recording.flight for recording in self._recordings]
         model = model_of(with_reference_voltage(vehicle, flights), self._controller)
         segments, states = self._segments, None

@@ -121,8 +121,6 @@ class RecordedInlet(ABC):
     """Coefficients that are free besides the usual ones: what no loop takes out by itself."""
     terms: ClassVar[tuple[str, ...]] = ()
     """Groups of terms that are free from the beginning where the job leaves the choice."""
-    has_mixer: ClassVar[bool] = False
-    """Whether the mixer, which is that of a quad X, is simulated."""
     computed_at: ClassVar[str | None] = None
     """The rate of a `Schedule` at which the flight controller computes the signal."""
     remedy: ClassVar[str] = "use inlet: auto"
@@ -210,7 +208,6 @@ class RecordedReference(RecordedInlet):
     starts_recorded = False
     window = 1.0
     closed_loop = True
-    has_mixer = True
     remedy = "name its trajectory in the job file"
 
     def is_preferred(self, flight: Flight) -> bool:
@@ -250,7 +247,6 @@ class RecordedBodyRate(RecordedInlet):
     ignores = ("trim",)
     starts_recorded = False
     window = 1.0
-    has_mixer = True
     computed_at = "position_control_rate"
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> BodyRateInlet:

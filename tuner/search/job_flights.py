@@ -34,7 +34,6 @@ from tuner.recordings.loader import InertialFlight, load_flights, read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import parameters_of
 from tuner.search.inlet_choice import FED_BY, choose_inlet
-from tuner.vehicle import check_mixer
 from tuner.vehicle.controller import PLACES, with_parameters
 
 
@@ -243,8 +242,6 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     if not INLETS[chosen].closed_loop:
         seconds = window_seconds([chosen], job.search.window)
         require_windows(flight, seconds, INLETS[chosen].fed(flight))
-    if INLETS[chosen].has_mixer:
-        check_mixer(settings.vehicle)
     late = None if offset == "free" else float(offset)
     return Recording(flight, chosen, late, holdout, because=because)
 

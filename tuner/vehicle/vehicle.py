@@ -288,19 +288,19 @@ class VehicleFile(Section):
         return len(self.rotors) == len(QUAD_X)
 
 
-def check_mixer(vehicle: VehicleFile) -> None:
-    """Refuse a vehicle that the simulated mixer, which is the quad X's, cannot fly.
+def check_rotors(vehicle: VehicleFile) -> None:
+    """Refuse a vehicle that can be written and judged, but neither simulated nor fitted.
 
     Raises
     ------
     ConfigError
-        It has more than four rotors.
+        It has more than four rotors: the mixer is the quad X's, and recordings hold four motors.
     """
     if not vehicle.is_quad:
         raise ConfigError(
             vehicle.name,
-            f"has {len(vehicle.rotors)} rotors, and the simulated mixer flies four only",
-            "fit it through the inlet actuator or rotor_speed, which need no mixer",
+            f"has {len(vehicle.rotors)} rotors, and only four are simulated and read",
+            "name a vehicle of four; one of six or eight can be exported and audited",
         )
 
 

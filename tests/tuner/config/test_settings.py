@@ -6,7 +6,8 @@ import pytest
 from tuner.config import Options, find_job_file, settle
 from tuner.core.disk import find_flights
 from tuner.core.errors import ConfigError, InputError
-from tuner.core.shipped import configs_folder
+from tuner.core.shipped import configs_folder, find_config
+from tuner.vehicle import read_vehicle
 
 
 @pytest.fixture
@@ -201,3 +202,10 @@ def test_a_ros_2_recording_is_a_folder(lab):
     (lab / "d").mkdir()
     (lab / "d" / "metadata.yaml").touch()
     assert find_flights([f"{lab}/d"]) == (lab / "d",)
+
+
+def test_a_vehicle_of_six_rotors_is_refused_before_anything_is_read(lab):
+    vehicle = read_vehicle(find_config("vehicles", "hovergames", lab))
+    six = vehicle.model_copy(update={"rotors": (*vehicle.rotors, *vehicle.rotors[:2])})
+    with pytest.raises(ConfigError, match="has 6 rotors, and only four are simulated and read"):
+        settle(Options([str(lab / "a.bag")], vehicle=six))

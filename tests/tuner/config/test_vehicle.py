@@ -6,7 +6,7 @@ from tuner.core.errors import ConfigError
 from tuner.core.shipped import configs_folder
 from tuner.vehicle import (
     COEFFICIENTS,
-    check_mixer,
+    check_rotors,
     read_vehicle,
     values_of,
     with_values,
@@ -219,10 +219,10 @@ def test_six_and_eight_rotors_are_read_and_only_the_mixer_refuses_them(vehicle_t
     path.write_text(vehicle_text.replace("motor:\n", "".join(extra) + "motor:\n", 1))
     hexacopter = read_vehicle(path)
     assert len(hexacopter.rotors) == 6
-    check_mixer(read_vehicle(ORIGINAL))
+    check_rotors(read_vehicle(ORIGINAL))
     with pytest.raises(ConfigError, match="has 6 rotors") as error:
-        check_mixer(hexacopter)
-    assert "inlet actuator or rotor_speed" in str(error.value)
+        check_rotors(hexacopter)
+    assert "exported and audited" in str(error.value)
     path.write_text(vehicle_text.replace("motor:\n", extra[0] + "motor:\n", 1))
     with pytest.raises(ConfigError, match="rotors are 5; list 4, 6 or 8 rotors"):
         read_vehicle(path)
