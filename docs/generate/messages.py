@@ -62,8 +62,8 @@ STAGES: Mapping[str, tuple[str, ...]] = {
         *("attitude_followed", "spins_reversed", "rotor_changed"),
     ),
     "Before the search": (
-        *("vehicle_not", "mass_not", "wrong_vehicle", "cannot_hover", "still_axes", "no_yaw"),
-        *("implausible", "start_on_bound"),
+        *("same_recording", "vehicle_not", "mass_not", "wrong_vehicle", "cannot_hover"),
+        *("still_axes", "no_yaw", "implausible", "start_on_bound"),
         *("not_finite", "nothing_has", "no_effect", "singular", "setpoints", "heading_flown"),
         *("input_late", "turning_regressed", "turning_not"),
     ),

@@ -84,6 +84,11 @@ class Code(Worded):
         "No pose was recorded for {seconds:.2f} s during the mission.",
         "Check the cameras' view and the network.",
     )
+    SAME_RECORDING = (
+        "same_recording",  # names: the other flight
+        "It is the recording of {coefficients}: it counts twice, and held out it checks nothing.",
+        "Leave one of them out.",
+    )
     WRONG_VEHICLE = (
         "wrong_vehicle",  # lift, weight (N), mass (kg)
         (

@@ -54,6 +54,7 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
                 *_controllers(job),
             )
         ),
+        *_recorded_twice(job),
         *_not_given(job),
         *_wrong_vehicle(job),
         *_excitation(job),
@@ -114,6 +115,15 @@ def _sparse_inputs(job: Job) -> Iterator[Finding]:
         if rate is not None and sparse([flight], signal, rate):
             numbers = {"recorded": round(flight.series[signal].rate), "needed": float(rate)}
             yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
+
+
+def _recorded_twice(job: Job) -> Iterator[Finding]:
+    """Warn of flights whose poses are those of another to the last digit."""
+    first: dict[bytes, str] = {}
+    for flight in job.flights:
+        poses = flight.series["position"].values.tobytes()
+        if (other := first.setdefault(poses, flight.name)) != flight.name:
+            yield Finding(Code.SAME_RECORDING, "warning", flight.name, names=(other,))
 
 
 def _not_given(job: Job) -> Iterator[Finding]:

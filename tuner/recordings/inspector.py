@@ -135,7 +135,7 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
         del measured["attitude"]
     return replace(
         _with_signals(content),
-        problem=None if missions else "nothing flies in it: no mission was found",
+        problem=None if missions else "nothing flies in it for 2 s: no mission was found",
         missions=missions,
         inlets=inlets(measured, trajectory=sidecar.trajectory is not None),
         coefficients=() if unusable else informed(content.series, measured, missions),

@@ -167,7 +167,7 @@ def load_flights(
     if not content.missions:
         raise RecordingError(
             path,
-            "nothing flies in it: no mission was found",
+            "nothing flies in it for 2 s: no mission was found",
             "inspect it, or give 'start' and 'end' in a side-car",
         )
     return flights_of(content, options, keep=cache)

@@ -32,6 +32,7 @@ OTHER_INPUTS = frozenset(
     {
         Code.VEHICLE_NOT_GIVEN,
         Code.MASS_NOT_GIVEN,
+        Code.SAME_RECORDING,
         Code.WRONG_VEHICLE,
         Code.CANNOT_HOVER,
         Code.MOTOR_ORDER,

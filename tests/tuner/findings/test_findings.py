@@ -120,6 +120,7 @@ MADE = {
     Code.VEHICLE_NOT_GIVEN: Finding(
         Code.VEHICLE_NOT_GIVEN, "warning", "hovergames", {"mass": 2.079}
     ),
+    Code.SAME_RECORDING: Finding(Code.SAME_RECORDING, "warning", "b", names=("a",)),
     Code.MASS_NOT_GIVEN: Finding(Code.MASS_NOT_GIVEN, "warning", "crazyflie", {"mass": 0.03}),
     Code.STILL_AXES: Finding(Code.STILL_AXES, "warning", "excitation", names=("x", "roll")),
     Code.NO_YAW: Finding(Code.NO_YAW, "warning", "excitation", {"rate": 0.1}),

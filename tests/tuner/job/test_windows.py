@@ -100,6 +100,16 @@ def test_another_vehicle_than_the_one_that_flew_is_named(full_flight, full_bag, 
     assert wrong.numbers["lift"] == pytest.approx(updated.mass * 9.81, rel=0.2)
 
 
+def test_a_flight_given_twice_is_named(full_flight, full_bag, updated):
+    job = job_through("actuator", full_flight, full_bag, updated)
+    assert Code.SAME_RECORDING not in {finding.code for finding in check_recordings(job)}
+    (own,) = job.recordings
+    copy = replace(own, flight=replace(full_flight, name="copy"), holdout=True)
+    twice = replace(job, recordings=(own, copy))
+    (said,) = (one for one in check_recordings(twice) if one.code is Code.SAME_RECORDING)
+    assert (said.subject, said.names) == ("copy", (full_flight.name,))
+
+
 def test_a_mass_that_no_user_gave_is_named(full_flight, full_bag, updated):
     job = job_through("actuator", full_flight, full_bag, updated)
     noticed = (Code.VEHICLE_NOT_GIVEN, Code.MASS_NOT_GIVEN)

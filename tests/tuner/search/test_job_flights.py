@@ -82,8 +82,8 @@ def test_recordings_of_which_no_flight_can_be_made_are_left_out_by_name(tmp_path
     assert [recording.flight.name for recording in recordings] == [CIRCLE]
     assert [finding.subject for finding in left_out] == ["too_short", "empty"]
     assert sentence(left_out[1]).startswith("It is empty; the flight is left out")
-    assert sentence(left_out[0]).startswith("Nothing flies in it: no mission was found")
-    with pytest.raises(RecordingError, match="nothing flies in it"):
+    assert sentence(left_out[0]).startswith("Nothing flies in it for 2 s: no mission was found")
+    with pytest.raises(RecordingError, match="nothing flies in it for 2 s"):
         read_usable(replace(settings, flights=(too_short, empty)))
     with pytest.raises(RecordingError, match="no such file"):
         read_usable(replace(settings, flights=(*settings.flights, tmp_path / "typed_wrong.bag")))
