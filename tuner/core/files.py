@@ -127,7 +127,7 @@ class ResultFile(Part):
         path = folder / cls.FILE
         raw = read_bytes(path, most=MAX_BYTES, remedy=remedy)
         try:
-            content = from_json(raw)
+            content = from_json(raw, allow_inf_nan=False)
         except ValueError as error:
             raise InputError(path, f"is not JSON ({error})", remedy) from None
         version = cls.model_fields["schema_version"].default

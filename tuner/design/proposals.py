@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
-from pydantic import JsonValue
+from pydantic import JsonValue, model_validator
 
 from tuner.core.disk import write_text
 from tuner.core.files import Part, ResultFile, csv_text
 from tuner.core.phrases import listed
+from tuner.core.yaml_section import refuse
 
 NEXT_FLIGHT_TABLE = "next_flight.csv"
 WORTH_FLYING = 0.9
@@ -102,6 +103,13 @@ class Proposals(ResultFile):
     fixed_targets: list[str]
     all_known: bool
     flights: list[Proposal]
+
+    @model_validator(mode="after")
+    def _tell_all_of_each_flight(self) -> Self:
+        for flight in self.flights:
+            if not set(self.targets) <= set(flight.shrinks):
+                raise refuse(f"lacks what {flight.name} would narrow", "was it edited?")
+        return self
 
     def write(self, folder: Path) -> None:
         """Write ``next_flight.json`` and, for other programs, ``next_flight.csv``."""

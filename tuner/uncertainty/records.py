@@ -387,6 +387,9 @@ class Knowledge(ResultFile):
                 for output in outputs
             ):
                 raise refuse(f"lacks a part of what is known of {name}", "was it edited?")
+        for effect in self.effects_over_time:
+            if any(len(change) != len(effect.time) for change in effect.change.values()):
+                raise refuse(f"lacks an effect over the time of {effect.flight}", "was it edited?")
         return self
 
 

@@ -152,6 +152,28 @@ def test_a_file_whose_parts_do_not_agree_is_named(tmp_path: Path) -> None:
         render(tmp_path)
 
 
+@pytest.mark.parametrize("value", [float("nan"), None])
+def test_an_effect_over_time_that_is_no_number_or_lacks_is_named(tmp_path: Path, value) -> None:
+    making.write_run(tmp_path, FREE, ROLLING)
+    knowledge = json.loads((tmp_path / "sensitivity.json").read_text())
+    changes = next(iter(knowledge["effects_over_time"][0]["change"].values()))
+    changes[:1] = [] if value is None else [value]
+    (tmp_path / "sensitivity.json").write_text(json.dumps(knowledge))
+    expected = "lacks an effect over the time" if value is None else "is not JSON"
+    with pytest.raises(InputError, match=rf"sensitivity\.json: {expected}"):
+        render(tmp_path)
+
+
+def test_a_proposal_that_lacks_a_target_is_named(tmp_path: Path) -> None:
+    making.write_run(tmp_path, FREE, ROLLING)
+    flight = {"name": "circle", "trajectory": {}, "shrinks": {}, "volume": 1.0}
+    proposals = {"schema_version": 2, "arena": [8, 6, 3], "seconds": 20, "flights": [flight]}
+    proposals |= {"targets": ["inertia_zz"], "fixed_targets": [], "all_known": False}
+    (tmp_path / "next_flight.json").write_text(json.dumps(proposals))
+    with pytest.raises(InputError, match=r"next_flight\.json: lacks what circle would narrow"):
+        render(tmp_path)
+
+
 def test_terms_that_are_worth_nothing_are_one_line(report: Path) -> None:
     text = words(report)
     assert "Tried, and worth nothing here: ground_effect." in text
