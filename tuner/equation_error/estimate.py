@@ -108,7 +108,7 @@ def estimate(
     free = free & ~out
     found = regress(made, np.where(out, begin, full.point), free=free, near=True)
     again = partial(regress, begin=found.point, free=free, near=True)
-    others = [(1.0, again(made, memory=0.5 * MEMORY))]
+    others = [(1.0, again(made, memory=times * MEMORY)) for times in (0.5, 2.0)]
     if made.noisy:
         others.append((NOISE_KNOWN, again(quiet)))
     if commands:

@@ -26,6 +26,8 @@ from tuner.vehicle.model import Model, with_coefficients
 
 SPEED_STEP = 1e-3
 """Change of a rotor's speed over itself by which accelerations are differentiated."""
+CHANGE_STEP = 100.0
+"""rad/s², likewise of a rotor's acceleration."""
 MOTOR_STEP = 1e-2
 """Step of a motor's logarithm, or of a number over its usual size, likewise."""
 ROTORS = 4
@@ -46,10 +48,11 @@ class Linear:
     columns
         (N, 6, K) derivatives of the model's.
     moved
-        (6, K, K): how the noise of rotor speeds moves columns together; the mean over steps and sum
-        over rotors of products of derivatives by a rotor's speed. Zero without noise.
+        (2, 2, 6, K, K): how the noise of rotor speeds moves columns together; the mean over steps
+        and sum over rotors of products of derivatives by a rotor's speed and by its acceleration.
+        Zero without noise.
     crossed
-        (6, K): likewise of columns and the model's accelerations.
+        (2, 2, 6, K): likewise of columns and the model's accelerations.
     """
 
     steps: Steps
@@ -108,20 +111,41 @@ class ModelAccelerations:
                 for flight, (part, (modelled, _)) in enumerate(zip(beside, ends, strict=True)):
                     change = left[flight] - (part.accelerations - modelled)
                     columns[flight][:, :, number] = change / step
-        moved, crossed = np.zeros((len(left), 6, size, size)), np.zeros((len(left), 6, size))
+        moved = np.zeros((len(left), 2, 2, 6, size, size))
+        crossed = np.zeros((len(left), 2, 2, 6, size))
         for rotor in range(ROTORS if self.noisy else 0):
-            change = SPEED_STEP * np.eye(ROTORS)[rotor]
-            above, below = (
-                _made(self.model, self.parameters, point, [_faster(p, by) for p in flights])
-                for by in (change, -change)
-            )
-            for number, (part, high, low) in enumerate(zip(flights, above, below, strict=True)):
-                span = 2.0 * SPEED_STEP * part.rotor_speed[::EVERY, rotor, None]
-                slope, by = (high[0] - low[0]) / span, (high[1] - low[1]) / span[..., None]
-                by = by.swapaxes(0, 1)
-                moved[number] += by.mT @ by / len(slope)
-                crossed[number] += (by.mT @ slope.T[..., None])[..., 0] / len(slope)
+            slopes = [
+                self._slopes(point, flights, which * np.eye(ROTORS)[rotor])
+                for which in np.eye(2)[:, :, None]
+            ]
+            for number, of_flight in enumerate(zip(*slopes, strict=True)):
+                values, columns_by = (
+                    np.stack(parts).swapaxes(1, 2) for parts in zip(*of_flight, strict=True)
+                )
+                mean = columns_by.mT / values.shape[-1]
+                moved[number] += mean[:, None] @ columns_by
+                crossed[number] += (mean[:, None] @ values[..., None])[..., 0]
         return tuple(map(Linear, flights, left, columns, moved, crossed))
+
+    def _slopes(
+        self, point: Array, flights: Sequence[Steps], by: Array
+    ) -> list[tuple[Array, Array]]:
+        """Return each flight's derivatives of accelerations (n, 6) and of columns (n, 6, K).
+
+        By the rotors' speed, accelerations or both, which move by (2, 4) of their steps.
+        """
+        change = np.array([[SPEED_STEP], [CHANGE_STEP]]) * by
+        above, below = (
+            _made(self.model, self.parameters, point, [_faster(part, c) for part in flights])
+            for c in (change, -change)
+        )
+        spans = [
+            2.0 * (part.rotor_speed[::EVERY] @ change[0] + change[1].sum()) for part in flights
+        ]
+        return [
+            ((high[0] - low[0]) / span[:, None], (high[1] - low[1]) / span[:, None, None])
+            for high, low, span in zip(above, below, spans, strict=True)
+        ]
 
     def _model(self, point: Array) -> Model:
         values = values_at(self.parameters, point)
@@ -150,13 +174,13 @@ def values_at(parameters: Sequence[Parameter], point: Array) -> dict[str, float]
     }
 
 
-def _faster(part: Steps, share: Array) -> Steps:
-    """Return every so manyth step, with rotors (4,) faster by a share."""
+def _faster(part: Steps, change: Array) -> Steps:
+    """Return every so manyth step, with rotors (4,) faster by a share, and so many rad/s²."""
     return replace(
         part,
         motion=jax.tree.map(lambda leaf: leaf[::EVERY], part.motion),
-        rotor_speed=part.rotor_speed[::EVERY] * (1.0 + share),
-        rotor_acceleration=part.rotor_acceleration[::EVERY],
+        rotor_speed=part.rotor_speed[::EVERY] * (1.0 + change[0]),
+        rotor_acceleration=part.rotor_acceleration[::EVERY] + change[1],
     )
 
 

@@ -198,7 +198,7 @@ def unexplained(
         motions.append(motion)
         tables.append(table)
     first = sums[0][1].shape[1] - len(names)
-    information, score, _ = (np.concatenate(parts) for parts in zip(*sums, strict=True))
+    information, score, *_ = (np.concatenate(parts) for parts in zip(*sums, strict=True))
     # lateness is no law: it is judged by itself, and first
     told = _likeliest(information, score, range(first), [first + len(names) - 1])
     while len(told) < MOST:

@@ -248,13 +248,16 @@ def _velocity(series: Mapping[str, Series], edges: Array) -> Array:
 def _noise(rotors: Series) -> float:
     """Return the standard deviation, rad/s, of the white noise of tachometers.
 
-    What is left of third differences is noise and what a rotor really does between samples. The
-    latter is at least twice as much in every second sample, as of a process of first order, so that
-    what both differ by tells the least that noise may be; the mean of both bounds is taken.
+    What is left of third differences is noise, as large in every second sample and in every fourth,
+    and what a rotor really does between samples. The variance of the latter grows with the gap by
+    one factor each time: two as of a process of first order, or more. It is no noise that every
+    second sample does not show.
     """
-    all_of, half = (
-        float(np.nanmedian(white_noise(Series(rotors.time[::n], rotors.values[::n]))))
-        for n in (1, 2)
+    one, two, four = (
+        float(np.nanmedian(white_noise(Series(rotors.time[::n], rotors.values[::n])))) ** 2
+        for n in (1, 2, 4)
     )
-    least = np.sqrt(max(0.0, 2.0 * all_of**2 - half**2))
-    return float(0.5 * (all_of + min(least, all_of)))
+    if two <= one:
+        return float(np.sqrt(two))
+    growth = max(2.0, (four - two) / (two - one))
+    return float(np.sqrt(max(0.0, one - (two - one) / (growth - 1.0))))

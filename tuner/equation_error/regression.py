@@ -25,7 +25,7 @@ from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to 
 
 from tuner.core.numerics import Z95, Array, huber_weights, robust_sd
 from tuner.equation_error.model_accelerations import Linear, ModelAccelerations
-from tuner.equation_error.recorded_accelerations import Mask
+from tuner.equation_error.recorded_accelerations import Mask, Steps
 
 MEMORY = 0.1
 """s of errors from which the next one is predicted."""
@@ -37,6 +37,8 @@ SETTLED = 1e-3
 """Step, likewise, below which a round has arrived."""
 FEWEST_UNITS = 3
 """Flights from which each is left out in turn; fewer are cut into so many parts each."""
+MOST = 0.5
+"""Share of a direction's information that is taken off as noise."""
 ROBUST = 3.0
 """Standard deviations beyond which an error counts linearly."""
 
@@ -135,7 +137,7 @@ def regress(
     point = np.array(begin, float)
     for source, filters in stages[-1:] if near else stages:
         point = minimised(source, point, filters, mean=mean, free=free)
-    sums = _sums_at(made, point, whitened, mean)
+    sums = _sums_at(made, point, whitened, mean, free)
     return Regression(point, sums, _covariance(sums, free))
 
 
@@ -151,7 +153,7 @@ def minimised(
     high = np.array([p.scaled(p.upper) for p in made.parameters])
     point = np.array(begin, float)
     for _ in range(ROUNDS):
-        change = _sums_at(made, point, filters, mean).solved(free, slice(None))
+        change = _sums_at(made, point, filters, mean, free).solved(free, slice(None))
         step = np.clip(change, -LONGEST * unit, LONGEST * unit)
         point = np.clip(point + step, low, high)
         if np.abs(step / unit).max() < SETTLED:
@@ -160,35 +162,61 @@ def minimised(
 
 
 def _sums_at(
-    made: ModelAccelerations, point: Array, filters: Filter, mean: Array
+    made: ModelAccelerations, point: Array, filters: Filter, mean: Array, free: Mask
 ) -> NormalEquations:
-    """Return the normal equations about a point (K,), with priors about a mean (K,)."""
+    """Return the normal equations about a point (K,), with priors about a mean (K,).
+
+    What the noise of rotor speeds makes of them is taken off.
+    """
     prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
     parts = 1 if len(made.flights) >= FEWEST_UNITS else FEWEST_UNITS
     sums = [filtered_sums(one, filters(one), parts) for one in made.at(point)]
-    information, slope, loss = (np.concatenate(units) for units in zip(*sums, strict=True))
+    information, slope, loss = (np.concatenate([s[i] for s in sums]) for i in range(3))
+    if made.noisy:
+        noise, crossed = (np.concatenate([s[i] for s in sums]) for i in (3, 4))
+        taken = _taken(information.sum(axis=0) + np.diag(prior), noise.sum(axis=0), free)
+        information -= taken @ noise @ taken.T
+        slope += crossed @ (taken @ taken).T
     return NormalEquations(information, slope, loss, prior, prior * (mean - point))
 
 
-def filtered_sums(one: Linear, kernels: Sequence[Array], parts: int) -> tuple[Array, Array, Array]:
+def _taken(information: Array, noise: Array, free: Mask) -> Array:
+    """Return what (K, K) limits the part of information (K, K) that noise made, on both its sides.
+
+    Of each direction of the coordinates that move no more than `MOST` of the information is noise:
+    where it is said to be more, as of signals that were smoothed, it is not white, and what is
+    left would have no minimum (Fuller, 2.5.1, limits the correction for that reason).
+    """
+    inside = np.ix_(free, free)
+    unit = np.sqrt(np.diag(information)[free])
+    root = np.linalg.cholesky(information[inside] / np.outer(unit, unit)) * unit[:, None]
+    inverse = np.linalg.inv(root)
+    shares, along = np.linalg.eigh(inverse @ noise[inside] @ inverse.T)
+    limit = np.sqrt(np.minimum(1.0, MOST / np.maximum(shares, MOST)))
+    taken = np.eye(len(free))
+    taken[inside] = root @ (along * limit) @ along.T @ inverse
+    return taken
+
+
+def filtered_sums(
+    one: Linear, kernels: Sequence[Array], parts: int
+) -> tuple[Array, Array, Array, Array, Array]:
     """Return information (U, K, K), slope (U, K) and loss (U,) of a flight in so many parts.
 
-    Of errors that are filtered, each axis by a kernel of its own; the noise of rotor speeds is
-    taken off.
+    Of errors that are filtered, each axis by a kernel of its own. Then what of information and
+    slope (U, K, K) and (U, K) the noise of rotor speeds makes.
     """
     size, steps = one.columns.shape[-1], one.steps
-    information, slope, loss = (
-        np.zeros((parts, size, size)),
-        np.zeros((parts, size)),
-        np.zeros(parts),
-    )
+    information, noise = np.zeros((2, parts, size, size))
+    slope, crossed = np.zeros((2, parts, size))
+    loss = np.zeros(parts)
     for axis, kernel in enumerate(kernels):
         table = np.column_stack([one.left[:, axis], one.columns[:, axis]])
         rows = convolved(table, steps.known, kernel)
         if not len(rows):
             continue
         sigma = spread(rows[:, 0])
-        of_noise = (steps.noise / sigma) ** 2 * _noise_gain(kernel, steps.weights)
+        counts = np.zeros(parts)
         for unit, stretch in enumerate(np.array_split(rows / sigma, parts)):
             errors, columns = stretch[:, 0], stretch[:, 1:]
             robust = huber_weights(errors, ROBUST)
@@ -196,10 +224,12 @@ def filtered_sums(one: Linear, kernels: Sequence[Array], parts: int) -> tuple[Ar
             loss[unit] += 0.5 * float(np.sum(robust * errors**2))
             information[unit] += weighed.T @ columns
             slope[unit] += weighed.T @ errors
-            if steps.noise > 0.0:
-                information[unit] -= robust.sum() * of_noise * one.moved[axis]
-                slope[unit] += robust.sum() * of_noise * one.crossed[axis]
-    return information, slope, loss
+            counts[unit] = robust.sum()
+        if steps.noise > 0.0:
+            gain = (steps.noise / sigma) ** 2 * _noise_gain(kernel, steps)
+            noise += np.multiply.outer(counts, np.tensordot(gain, one.moved[:, :, axis]))
+            crossed += np.multiply.outer(counts, np.tensordot(gain, one.crossed[:, :, axis]))
+    return information, slope, loss, noise, crossed
 
 
 def convolved(table: Array, known: Mask, kernel: Array) -> Array:
@@ -242,12 +272,18 @@ def whitening_filter(errors: Array, known: Mask, order: int) -> Array:
     return np.concatenate([[1.0], -predicted[::-1]])
 
 
-def _noise_gain(kernel: Array, weights: Array) -> float:
-    """Return the variance of a filtered mean of rotor samples over that of one sample."""
-    inside = len(weights) - 1
+def _noise_gain(kernel: Array, steps: Steps) -> Array:
+    """Return the covariance (2, 2) of what is filtered over the variance of a rotor's sample.
+
+    Of the mean of the rotor's samples in a step, and of the acceleration between its ends.
+    """
+    inside = len(steps.weights) - 1
     each = np.zeros(inside * (len(kernel) - 1) + 1)
     each[::inside] = kernel
-    return float(np.sum(np.convolve(each, weights) ** 2))
+    change = np.zeros(inside + 1)
+    change[[0, -1]] = 1.0 / steps.step, -1.0 / steps.step
+    made = np.stack([np.convolve(each, samples) for samples in (steps.weights, change)])
+    return np.asarray(made @ made.T)
 
 
 def _covariance(sums: NormalEquations, free: Mask) -> Array:

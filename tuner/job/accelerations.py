@@ -24,7 +24,13 @@ from tuner.vehicle import COEFFICIENTS, initial_values, with_values
 
 ENOUGH = 0.9
 """Share of roll's and pitch's angular acceleration from which simulations tell inertia as well."""
-OF_INERTIA = (*(f"inertia_{axes}" for axes in ("xx", "yy", "zz")), "moment_constant")
+ROTOR_INERTIA = "rotor_inertia"
+"""No term that a vehicle may lack: every rotor that turns faster turns the vehicle against it."""
+OF_INERTIA = (
+    *(f"inertia_{axes}" for axes in ("xx", "yy", "zz")),
+    ROTOR_INERTIA,
+    "moment_constant",
+)
 """What a search of simulations could not tell from `GAINS`."""
 INFLOW = "max_relative_airspeed"
 """No term that a vehicle may lack, but one whose law many vehicles do not follow."""
@@ -53,6 +59,7 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     effects = start_of([n for n in (*names, *GAINS) if COEFFICIENTS[n].is_effect])
     given = initial_values(settings.vehicle, settings.controller, names)
     space = extended(job.space, [*names, *GAINS], settings.job, {**given, **effects})
+    candidates.pop(ROTOR_INERTIA, None)
     found = estimate(job.objective.model, space, candidates, *steps)
     if found.turning >= ENOUGH:
         return job, ()

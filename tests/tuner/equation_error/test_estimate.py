@@ -80,6 +80,66 @@ def test_errors_hold_tachometers_whose_noise_is_a_quarter_more(flown, begun, mon
         assert 0.01 < moved < 1.5 * part, (name, moved, part)
 
 
+def with_rotors(recordings, changed):
+    """Recordings with what a function makes of each flight's name and rotor speeds."""
+    made = []
+    for recording in recordings:
+        flight = recording.flight
+        rotors = flight.series["rotor_speed"]
+        speeds = Series(rotors.time, changed(flight.name, rotors.values))
+        series = {**flight.series, "rotor_speed": speeds}
+        made.append(replace(recording, flight=replace(flight, series=series)))
+    return made
+
+
+@pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
+def test_rotor_speeds_that_ripple_without_noise_leave_inertia(racer, flown):
+    """What every second sample does not show is no white noise, and nothing is taken off for it."""
+    vehicle, signals = racer
+    _, settings, recordings = flown
+    numbers = {name: number for number, name in enumerate(fast_flights.paths(1.0))}
+
+    def rippled(name, values):
+        true = signals["rotor_speed"][: len(values), numbers[name]]
+        return true + 1.5 * (-1.0) ** np.arange(len(true))[:, None]
+
+    smooth = with_rotors(recordings, rippled)
+    assert steps_of(smooth[0].flight).noise < 0.3
+    found = with_accelerations(job_of(settings, smooth))[0].accelerations
+    for name in (*TILTING, "inertia_zz", "motor_constant"):
+        assert abs(np.log(found.values[name] / vehicle.values[name])) < 0.15, name
+
+
+@pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
+def test_rotors_that_turn_faster_turn_the_vehicle_against_it(racer, flown, monkeypatch):
+    """A rotor's inertia is found, and is not taken for the vehicle's."""
+    vehicle, signals = racer
+    _, settings, recordings = flown
+    numbers, inertia = {n: i for i, n in enumerate(fast_flights.paths(1.0))}, 1e-5
+
+    def reacting(flight, **given):
+        steps = steps_of(flight, **given)
+        speeds = signals["rotor_speed"][:, numbers[flight.name]]
+        clock = np.arange(len(speeds)) / fast_flights.RATE
+        after, before = (
+            np.stack([np.interp(steps.time + by, clock, rotor) for rotor in speeds.T], axis=1)
+            for by in (0.5 * steps.step, -0.5 * steps.step)
+        )
+        momentum = inertia * np.stack([before, after]) @ vehicle.spins
+        turning, rate = momentum.mean(axis=0), steps.motion.body_rate
+        moment = [-rate.y * turning, rate.x * turning, -np.diff(momentum, axis=0)[0] / steps.step]
+        accelerations = steps.accelerations.copy()
+        for axis, name in enumerate((*TILTING, "inertia_zz")):
+            accelerations[:, 3 + axis] += moment[axis] / vehicle.values[name]
+        return replace(steps, accelerations=accelerations)
+
+    monkeypatch.setattr("tuner.equation_error.recorded_accelerations.steps_of", reacting)
+    found = with_accelerations(job_of(settings, recordings))[0].accelerations
+    error = np.log(found.values["inertia_zz"] / vehicle.values["inertia_zz"])
+    assert abs(error) < min(0.15, 3.0 * found.errors["inertia_zz"])
+    assert found.values["rotor_inertia"] == pytest.approx(inertia, rel=0.15)
+
+
 @pytest.fixture(scope="module", params=[400.0, 100.0], ids=["400 Hz", "100 Hz"])
 def commanded(request, racer, tmp_path_factory):
     """A job by commands alone, and what it begins with."""
@@ -155,8 +215,9 @@ def test_the_search_begins_there_and_leaves_inertia_alone(flown, begun):
     _, job, (finding,) = begun
     assert job.given.vehicle == settings.vehicle
     assert job.settings.vehicle.inertia.xx == job.accelerations.values["inertia_xx"]
+    assert "rotor_inertia" in job.accelerations.values
     assert set(GAINS) <= set(job.space.names)
-    assert not set(job.space.names) & {*TILTING, "inertia_zz", "moment_constant"}
+    assert not set(job.space.names) & {*TILTING, "inertia_zz", "rotor_inertia", "moment_constant"}
     assert job.settings.job.search.window == finding.numbers["seconds"]
     assert 0.0 < finding.numbers["explained_x"] < 0.9
 
