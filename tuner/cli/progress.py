@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from tuner.config import Settings
+    from tuner.findings.findings import Finding
     from tuner.job.listener import Listener
     from tuner.search.iteration import Iteration, PointEstimate
 
@@ -55,7 +56,8 @@ DOING = {
 @contextmanager
 def listening(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
     """Yield a listener that shows a run on the terminal, or nothing; each message if verbose."""
-    from tuner.cli.results import estimates_table, folds_table
+    from tuner.cli.results import WIDTH, estimates_table, folds_table
+    from tuner.findings.findings import brief
     from tuner.job.listener import SILENT, Listener
 
     if quiet:
@@ -78,11 +80,15 @@ def listening(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
     def on_iteration(iteration: Iteration, _left: float) -> None:
         search.show(iteration)
 
-    shown = Listener(on_iteration=on_iteration, on_stop=say)
+    def show_doubt(finding: Finding) -> None:
+        say(f"! {brief(finding, WIDTH - 2)}")
+
+    shown = Listener(on_iteration=on_iteration, on_doubt=show_doubt, on_stop=say)
     if verbose:
         shown = replace(
             shown,
             on_settings=show_settings,
+            on_doubt=lambda _: None,  # which all messages hold
             on_estimates=show_estimates,
             on_message=say,
             on_folds=lambda folds: search.table(folds_table(folds)),

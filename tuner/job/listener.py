@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tuner.config import Settings
+    from tuner.findings.findings import Finding
     from tuner.search.iteration import Iteration, PointEstimate
     from tuner.uncertainty.records import Refit
 
@@ -27,6 +28,8 @@ class Listener:
         Gets where the search of the base model ended, long before intervals and validation.
     on_message
         Gets a sentence on what is done next, or on what a user should know.
+    on_doubt
+        Gets a finding before the search: what was given is not what flew.
     on_stop
         Gets a sentence on how to go on, where the run was interrupted.
     on_folds
@@ -37,6 +40,7 @@ class Listener:
     on_iteration: Callable[[Iteration, float], None] = lambda *_: None
     on_estimates: Callable[[Sequence[PointEstimate]], None] = lambda _: None
     on_message: Callable[[str], None] = lambda _: None
+    on_doubt: Callable[[Finding], None] = lambda _: None
     on_stop: Callable[[str], None] = lambda _: None
     on_folds: Callable[[Sequence[Refit]], None] = lambda _: None
 

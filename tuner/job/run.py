@@ -46,6 +46,7 @@ from tuner.job.results import (
 )
 from tuner.report import render, write_search, write_traces
 from tuner.report.contents import forget
+from tuner.report.outcome import OTHER_INPUTS
 from tuner.report.result_texts import export_sentence
 from tuner.result import BEST_FIT_FILE, Run, RunResult
 from tuner.search.estimation import OnProgress
@@ -107,10 +108,10 @@ def run(
     job, findings = prepared(settings)
     findings = (*logged, *findings)
     explanation = Explanation(listener.on_message)
-    _check(findings, explanation, force=options.force)
+    _check(findings, explanation, listener, force=options.force)
     with span("check"):
         at_start = tuple(check_information(job))
-    _check(at_start, explanation, force=options.force)
+    _check(at_start, explanation, listener, force=options.force)
     folder = result_folder(out)
     found, validation, (selected, fitted, examination) = _fitted(
         job,
@@ -343,9 +344,17 @@ def _with_refits(
     return result
 
 
-def _check(findings: Sequence[Finding], explanation: Explanation, *, force: bool) -> None:
-    """Tell findings; refuse to go on after a failure unless forced."""
+def _check(
+    findings: Sequence[Finding], explanation: Explanation, listener: Listener, *, force: bool
+) -> None:
+    """Tell findings; refuse to go on after a failure unless forced.
+
+    Where what was given is not what flew, the search may take long to fail.
+    """
     explanation.tell(findings)
+    for finding in findings:
+        if finding.level == "warning" and finding.code in OTHER_INPUTS:
+            listener.on_doubt(finding)
     failure = next((finding for finding in findings if finding.level == "failure"), None)
     if failure is not None and not force:
         what, to_do = clause(sentence(failure)), clause(remedy(failure))

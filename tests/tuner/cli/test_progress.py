@@ -9,6 +9,7 @@ from rich.console import Console
 
 from tuner.cli.progress import DOING, _MovingLine, listening
 from tuner.core.spans import span, watching
+from tuner.findings.findings import Code, Finding
 from tuner.search.iteration import Iteration, PointEstimate
 
 MESSAGE = "Examining [how well] each coefficient is known, of which there are many." * 4
@@ -77,6 +78,16 @@ def test_an_interrupted_search_still_gets_its_line_and_says_how_to_go_on(capsys)
     stage, go_on = lines_of(capsys)
     assert "2 s: iteration 3," in stage
     assert go_on == "Continue with --resume."
+
+
+def test_another_vehicle_than_the_one_that_flew_is_named_before_the_search(capsys):
+    with listening(quiet=False) as listener:
+        listener.on_doubt(Finding(Code.MASS_NOT_GIVEN, "warning", "quad", {"mass": 2.0}))
+    (line,) = lines_of(capsys)
+    assert (
+        line
+        == "! quad: Its 2 kg are the shipped file's. Give what it weighs at take-off with --mass."
+    )
 
 
 def test_quiet_shows_nothing(capsys):

@@ -12,6 +12,8 @@ from tuner.core.shipped import configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.findings.findings import Code
 from tuner.job.check import check_information, check_recordings
+from tuner.job.listener import Listener
+from tuner.job.run import run
 from tuner.search.estimation import search
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
@@ -120,6 +122,18 @@ def test_a_mass_that_no_user_gave_is_named(full_flight, full_bag, updated):
         of_file = replace(job, settings=replace(job.settings, origin=origins))
         (said,) = (found for found in check_recordings(of_file) if found.code in noticed)
         assert (said.code, said.numbers["mass"]) == (code, job.settings.vehicle.mass)
+
+
+def test_a_vehicle_that_was_not_given_is_said_before_the_search(full_bag, tmp_path):
+    class ToldError(Exception):
+        """Ends the run where it is told."""
+
+    def told(finding):
+        raise ToldError(finding.code.value)
+
+    with pytest.raises(ToldError, match="vehicle_not_given"):
+        run(Options([str(full_bag)]), out=tmp_path / "run", listener=Listener(on_doubt=told))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.slow
