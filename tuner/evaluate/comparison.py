@@ -39,13 +39,15 @@ from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import (
     CLOCKS,
     OFFSETS,
+    Piece,
     Segments,
+    pieces_of,
     segments_of,
     window_segments,
 )
 from tuner.objective.simulation import MOTION, SPEEDS, TURNED, Flown, fly
 from tuner.objective.space import Space
-from tuner.objective.windows import Window, windows_of
+from tuner.objective.windows import Window
 from tuner.options import RecordingOptions
 from tuner.search.job_flights import Recording, as_logged, read_usable
 from tuner.search.levenberg_marquardt import FAR
@@ -147,11 +149,11 @@ class _Group:
         self._stride = max(1, round(self._schedule.log_rate / FORCES_RATE))
         rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
         if self.windowed:
+            self._segments, pieces = self._laid(free_starts=False)
             self._windows = [
-                windows_of(flight, seconds, fed=INLETS[inlet].fed(flight), smoothed_widely=False)
-                for flight in flights
+                tuple(piece.window for piece in pieces if piece.number == number)
+                for number in range(len(flights))
             ]
-            self._segments = self._laid(free_starts=False)
             self._samples, self._limits = math.ceil((seconds + BEYOND) * rate), AIRBORNE
         else:
             self._windows = [(Window(flight, 0.0),) for flight in flights]
@@ -170,19 +172,28 @@ class _Group:
             for name in names
         }
 
-    def _laid(self, *, free_starts: bool) -> Segments:
+    def _laid(self, *, free_starts: bool) -> tuple[Segments, list[Piece]]:
         """Return the windows, which start as recorded or near there."""
         flights = [recording.flight for recording in self._recordings]
-        return window_segments(
+        inlets = [self._inlet] * len(flights)
+        pieces = pieces_of(
             flights,
-            inlets=[self._inlet] * len(flights),
+            inlets=inlets,
+            seconds=self._seconds,
+            free_starts=free_starts,
+            input_late={r.flight.name: r.input_late for r in self._recordings},
+        )
+        segments = window_segments(
+            flights,
+            inlets=inlets,
             seconds=self._seconds,
             schedule=self._schedule,
             lag=LAG,
             noise=noise_of(flights),
             free_starts=free_starts,
-            input_late={r.flight.name: r.input_late for r in self._recordings},
+            pieces=pieces,
         )
+        return segments, pieces
 
     def fly(
         self,
@@ -197,7 +208,7 @@ class _Group:
         model = model_of(with_reference_voltage(vehicle, flights), self._controller)
         segments, states = self._segments, None
         if fitted_starts:
-            segments = self._laid(free_starts=True)
+            segments, _ = self._laid(free_starts=True)
             states = self._likeliest_starts(model, segments)
         elif self.windowed:
             segments = self._spinning(vehicle)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -23,7 +24,7 @@ from tuner.evaluate.torque_observer import TorqueObserver
 from tuner.findings.sentences import PREDICTED
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.inlets import INLETS
-from tuner.objective.segments import Segments, window_segments
+from tuner.objective.segments import Segments, pieces_of, window_segments
 from tuner.objective.simulation import MOTION, fly
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import States, states_at
@@ -122,32 +123,73 @@ def predict(
     RecordingError
         The flight never holds so many s of pose and input.
     """
-    motor, schedule = vehicle.motor, schedule_of(controller)
-    segments = window_segments(
-        [flight],
-        inlets=[inlet],
-        seconds=seconds,
-        schedule=schedule,
-        lag=0.5 * (motor.time_constant_up + motor.time_constant_down),
-        noise={},
-        stride=1.0 / flight.rate if stride is None else stride,
-        free_starts=False,
-        input_late={flight.name: input_late},
-    )
-    whole = np.flatnonzero(segments.begins + seconds <= flight.duration + 1e-9)
-    segments, begins = _taken(segments, whole), segments.begins[whole]
-    if observer is not None:
-        unseen = observer.disturbance((flight, inlet, input_late), begins)
-        segments = replace(segments, disturbance=unseen)
-    model = model_of(with_reference_voltage(vehicle, [flight]), controller)
-    steps = round(seconds * flight.rate)
-    ahead = np.arange(1, steps + 1) / flight.rate
-    reached = _simulated(model, segments, schedule, ahead)
-    recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
-    errors = errors_of(reached, recorded, (steps, len(begins)))
-    followed = INLETS[inlet].silences
-    predicted = {name: distances for name, distances in errors.items() if name not in followed}
-    return Predictions(begins, ahead, predicted)
+    course = Course(flight, inlet, seconds=seconds, stride=stride, input_late=input_late)
+    return course.predicted(vehicle, controller, observer)
+
+
+class Course:
+    """A flight cut into what is predicted of it: the same for each of several vehicles.
+
+    Parameters, units and errors are those of `predict`.
+    """
+
+    def __init__(
+        self,
+        flight: Flight,
+        inlet: InletName,
+        *,
+        seconds: float = 0.5,
+        stride: float | None = None,
+        input_late: float = 0.0,
+    ) -> None:
+        self.flight, self.inlet, self.seconds = flight, inlet, seconds
+        self.input_late = input_late
+        self._pieces = pieces_of(
+            [flight],
+            inlets=[inlet],
+            seconds=seconds,
+            stride=1.0 / flight.rate if stride is None else stride,
+            free_starts=False,
+            input_late={flight.name: input_late},
+        )
+        begins = np.array([piece.window.begin for piece in self._pieces])
+        self._whole = np.flatnonzero(begins + seconds <= flight.duration + 1e-9)
+        self.begins = begins[self._whole]
+        self.ahead = np.arange(1, round(seconds * flight.rate) + 1) / flight.rate
+
+    @cached_property
+    def recorded(self) -> States:
+        """The states that predictions are compared with, step by step."""
+        return states_at(self.flight.series, (self.begins + self.ahead[:, None]).ravel())
+
+    def predicted(
+        self,
+        vehicle: VehicleFile,
+        controller: ControllerFile,
+        observer: TorqueObserver | None = None,
+    ) -> Predictions:
+        """Return what a vehicle is predicted to do."""
+        motor, schedule = vehicle.motor, schedule_of(controller)
+        segments = window_segments(
+            [self.flight],
+            inlets=[self.inlet],
+            seconds=self.seconds,
+            schedule=schedule,
+            lag=0.5 * (motor.time_constant_up + motor.time_constant_down),
+            noise={},
+            free_starts=False,
+            pieces=self._pieces,
+        )
+        segments = _taken(segments, self._whole)
+        if observer is not None:
+            known = self.flight, self.inlet, self.input_late
+            segments = replace(segments, disturbance=observer.disturbance(known, self.begins))
+        model = model_of(with_reference_voltage(vehicle, [self.flight]), controller)
+        reached = _simulated(model, segments, schedule, self.ahead)
+        errors = errors_of(reached, self.recorded, (len(self.ahead), len(self.begins)))
+        followed = INLETS[self.inlet].silences
+        predicted = {name: distances for name, distances in errors.items() if name not in followed}
+        return Predictions(self.begins, self.ahead, predicted)
 
 
 def errors_of(
@@ -205,13 +247,19 @@ def _taken(segments: Segments, chosen: NDArray[np.intp]) -> Segments:
     return taken
 
 
-def hold(flight: Flight, begins: Array, ahead: Array) -> Predictions:
-    """Predict that the state stays as it was recorded: the naive predictor."""
+def hold(
+    flight: Flight, begins: Array, ahead: Array, recorded: States | None = None
+) -> Predictions:
+    """Predict that the state stays as it was recorded: the naive predictor.
+
+    ``recorded``: `Course.recorded`, where it is known.
+    """
     start = states_at(flight.series, begins)
     shape = (len(ahead), len(begins))
     reached = {
         name: np.broadcast_to(getattr(start, name), (*shape, getattr(start, name).shape[-1]))
         for name in PREDICTED
     }
-    recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
+    if recorded is None:
+        recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
     return Predictions(begins, ahead, errors_of(reached, recorded, shape))

@@ -13,7 +13,7 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.prediction import Predictions, hold, predict
+from tuner.evaluate.prediction import Course, Predictions, hold
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, Pose
 from tuner.evaluate.torque_observer import FED, TorqueObserver
@@ -150,76 +150,77 @@ class Validation:
     turning_explained: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _Predicted:
+    """Predictions of one flight; ``observed`` where an observer can tell something of it."""
+
+    initial: Predictions
+    best: Predictions
+    held: Predictions
+    observed: Predictions | None
+
+
 def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
     """Fly every flight with the initial and with the fitted vehicle."""
     comparison, initial = comparison_of(job, fitted), job.given.vehicle
-    predictions = _predictions(job, fitted, vehicle)
-    flights = {flight.name: flight for flight in job.flights}
-    held = {name: _unchanged(flights[name], of) for name, of in predictions.items()}
+    predicted = _predicted(job, fitted, vehicle)
     return Validation(
         initial=comparison.fly(initial),
         best=comparison.fly(vehicle),
         fitted_starts=comparison.fly(vehicle, fitted_starts=True),
-        predicted_initial=_errors(_predictions(job, fitted, initial)),
-        predicted_best=_errors(predictions),
-        predicted_with_observer=_errors(_observed(job, fitted, vehicle)),
-        predicted_holding=_errors(held),
+        predicted_initial={name: _errors(of.initial) for name, of in predicted.items()},
+        predicted_best={name: _errors(of.best) for name, of in predicted.items()},
+        predicted_with_observer={
+            name: _errors(of.observed) for name, of in predicted.items() if of.observed is not None
+        },
+        predicted_holding={name: _errors(of.held) for name, of in predicted.items()},
         worse_than_holding={
-            name: {seconds: of.worse_than(held[name], seconds) for seconds in AHEAD}
-            for name, of in predictions.items()
+            name: {seconds: of.best.worse_than(of.held, seconds) for seconds in AHEAD}
+            for name, of in predicted.items()
         },
         turning_explained={
-            name: 1.0 - _turning_missed(of) / _turning_missed(held[name])
-            for name, of in predictions.items()
-            if "body_rate" in of.errors
+            name: 1.0 - _turning_missed(of.best) / _turning_missed(of.held)
+            for name, of in predicted.items()
+            if "body_rate" in of.best.errors
         },
     )
 
 
-def _observed(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, Predictions]:
-    """Return flight -> its predictions that know what turned it, where that can be told."""
-    known = [(r.flight, r.inlet, r.input_late) for r in job.recordings if not r.holdout]
-    observer = TorqueObserver.of(vehicle, controller_flown(job, fitted), known)
-    return {} if observer is None else _predictions(job, fitted, vehicle, observer)
-
-
-def _predictions(
-    job: Job, fitted: Fitted, vehicle: VehicleFile, observer: TorqueObserver | None = None
-) -> dict[str, Predictions]:
-    """Return flight -> its predictions, of those that are not flown in a closed loop.
-
-    With an observer, of those alone of which it can tell something.
-    """
+def _predicted(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, _Predicted]:
+    """Return flight -> its predictions, of those that are not flown in a closed loop."""
     controller = controller_flown(job, fitted)
-    return {
-        recording.flight.name: predict(
-            vehicle,
-            controller,
+    known = [(r.flight, r.inlet, r.input_late) for r in job.recordings if not r.holdout]
+    observer = TorqueObserver.of(vehicle, controller, known)
+    found = {}
+    for recording in job.recordings:
+        if INLETS[recording.inlet].closed_loop:
+            continue
+        course = Course(
             recording.flight,
             recording.inlet,
             seconds=max(AHEAD),
             stride=STRIDE,
             input_late=recording.input_late,
-            observer=observer,
         )
-        for recording in job.recordings
-        if not INLETS[recording.inlet].closed_loop and (observer is None or recording.inlet in FED)
-    }
+        best = course.predicted(vehicle, controller)
+        observes = observer is not None and recording.inlet in FED
+        found[recording.flight.name] = _Predicted(
+            initial=course.predicted(job.given.vehicle, controller),
+            best=best,
+            held=_unchanged(course, best),
+            observed=course.predicted(vehicle, controller, observer) if observes else None,
+        )
+    return found
 
 
-def _unchanged(flight: Flight, predictions: Predictions) -> Predictions:
+def _unchanged(course: Course, predictions: Predictions) -> Predictions:
     """Return what is off if a flight's state stays, of what predictions of it predict."""
-    naive = hold(flight, predictions.begins, predictions.ahead)
+    naive = hold(course.flight, course.begins, course.ahead, course.recorded)
     return replace(naive, errors={name: naive.errors[name] for name in predictions.errors})
 
 
-def _errors(
-    predictions: Mapping[str, Predictions],
-) -> dict[str, tuple[PredictedErrors, ...]]:
-    return {
-        name: tuple(PredictedErrors(seconds=seconds, **of.mean(seconds)) for seconds in AHEAD)
-        for name, of in predictions.items()
-    }
+def _errors(of: Predictions) -> tuple[PredictedErrors, ...]:
+    return tuple(PredictedErrors(seconds=seconds, **of.mean(seconds)) for seconds in AHEAD)
 
 
 def _turning_missed(predictions: Predictions) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -173,6 +174,45 @@ def segments_of(
     )
 
 
+class Piece(NamedTuple):
+    """A window of one of some flights.
+
+    Attributes
+    ----------
+    number
+        Of its flight.
+    window
+        As it was recorded.
+    flight
+        What is fed in of it on the clock of what it is compared with.
+    """
+
+    number: int
+    window: Window
+    flight: Flight
+
+
+def pieces_of(
+    flights: Sequence[Flight],
+    *,
+    inlets: Sequence[InletName],
+    seconds: float,
+    stride: float | None = None,
+    free_starts: bool = True,
+    input_late: Mapping[str, float] = MappingProxyType({}),
+) -> list[Piece]:
+    """Cut flights into the windows that `window_segments` lays out, with parameters as there."""
+    pieces = []
+    for number, (flight, name) in enumerate(zip(flights, inlets, strict=True)):
+        fed, late = INLETS[name].fed(flight), input_late.get(flight.name, 0.0)
+        for window in windows_of(
+            flight, seconds, fed=fed, stride=stride, smoothed_widely=free_starts
+        ):
+            own = INLETS[name].fed(window.flight)
+            pieces.append(Piece(number, window, on_time(window.flight, own, late)))
+    return pieces
+
+
 def window_segments(
     flights: Sequence[Flight],
     *,
@@ -185,6 +225,7 @@ def window_segments(
     stride: float | None = None,
     free_starts: bool = True,
     input_late: Mapping[str, float] = MappingProxyType({}),
+    pieces: Sequence[Piece] | None = None,
 ) -> Segments:
     """Lay the windows of all flights side by side.
 
@@ -208,28 +249,21 @@ def window_segments(
         (`tuner.recordings.states`).
     input_late
         Flight name -> s by which what is fed in is stamped later than what it is compared with.
+    pieces
+        The windows, where `pieces_of` has cut them already.
     """
-    cut = [
-        (number, window)
-        for number, (flight, name) in enumerate(zip(flights, inlets, strict=True))
-        for window in windows_of(
-            flight,
-            seconds,
-            fed=INLETS[name].fed(flight),
+    if pieces is None:
+        pieces = pieces_of(
+            flights,
+            inlets=inlets,
+            seconds=seconds,
             stride=stride,
-            smoothed_widely=free_starts,
+            free_starts=free_starts,
+            input_late=input_late,
         )
-    ]
-    pieces = [
-        on_time(
-            window.flight,
-            INLETS[inlets[number]].fed(window.flight),
-            input_late.get(window.flight.name, 0.0),
-        )
-        for number, window in cut
-    ]
-    start = start_of([piece.initial for piece in pieces], resting=False)
-    names = [inlets[number] for number, _ in cut]
+    cut = [piece.flight for piece in pieces]
+    start = start_of([flight.initial for flight in cut], resting=False)
+    names = [inlets[piece.number] for piece in pieces]
     freedom, freed = None, np.arange(0)
     if free_starts:
         of_all = np.stack([freedom_of(INLETS[name].ignores) for name in names], axis=-1)
@@ -245,14 +279,16 @@ def window_segments(
         for flight, name in zip(flights, inlets, strict=True)
     }
     return Segments(
-        inlet=inlet_of(names, pieces, schedule),
+        inlet=inlet_of(names, cut, schedule),
         start=start,
-        measured={name: _measured(pieces, name, sd, weights) for name, sd in compared.items()},
-        flight=np.asarray([number for number, _ in cut]),
-        turning=np.stack([recent_command(piece, lag) for piece in pieces], axis=-1),
-        begin=np.asarray([window.begin for _, window in cut]),
+        measured={name: _measured(cut, name, sd, weights) for name, sd in compared.items()},
+        flight=np.asarray([piece.number for piece in pieces]),
+        turning=np.stack([recent_command(flight, lag) for flight in cut], axis=-1),
+        begin=np.asarray([piece.window.begin for piece in pieces]),
         log_voltage=log_voltage_of(
-            [flights[number] for number, _ in cut], [window for _, window in cut], schedule
+            [flights[piece.number] for piece in pieces],
+            [piece.window for piece in pieces],
+            schedule,
         ),
         freedom=freedom,
         freed=tuple(freed.tolist()),
