@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
+from annotated_types import Interval, Len
 from pydantic import JsonValue, model_validator
 
 from tuner.core.disk import write_text
@@ -49,6 +50,9 @@ class LogProposal(Part):
     shrinks: dict[str, float]
 
 
+Share = Annotated[float, Interval(ge=0, le=1e6)]
+
+
 class Proposal(Part):
     """A flight that could be flown, and by how much it would narrow the intervals.
 
@@ -65,10 +69,10 @@ class Proposal(Part):
         ellipsoid.
     """
 
-    name: str
+    name: Annotated[str, Len(1)]
     trajectory: dict[str, JsonValue]
-    shrinks: dict[str, float]
-    volume: float
+    shrinks: dict[str, Share]
+    volume: Share
 
     @property
     def mean(self) -> float:

@@ -102,11 +102,10 @@ def run(
     """
     settings, logged = as_logged(settle(options))
     listener.on_settings(settings)
-    folder = folder_for(out, resume=resume)
-    if options.bench and folder.resolve() == Path(options.bench).resolve():
-        raise InputError("--out", "is the folder of --bench", "name another folder")
+    _check_place(options, folder_for(out, resume=resume))
     job, findings = prepared(settings)
     findings = (*logged, *findings)
+    _check_refits(options, job)
     explanation = Explanation(listener.on_message)
     _check(findings, explanation, listener, force=options.force)
     with span("check"):
@@ -342,6 +341,20 @@ def _with_refits(
     result = with_errors_of_refits(result, jackknife, bootstrapped)
     result.write(folder)
     return result
+
+
+def _check_place(options: Options, folder: Path) -> None:
+    """Refuse a result folder of which the run reads what it would write there."""
+    if options.bench and folder.resolve() == Path(options.bench).resolve():
+        raise InputError("--out", "is the folder of --bench", "name another folder")
+
+
+def _check_refits(options: Options, job: Job) -> None:
+    """Refuse refits to other flights where there is one only."""
+    if len(job.fitted) < 2 and options.cross_validate:
+        raise InputError("--cross-validate", "leaves no flight to fit", "give two or more")
+    if len(job.fitted) < 2 and options.bootstrap is not None:
+        raise InputError("--bootstrap", "draws from a single flight", "give two or more")
 
 
 def _check(

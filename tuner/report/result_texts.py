@@ -27,9 +27,9 @@ def refits_in_words(result: RunResult) -> tuple[str, ...]:
     2 (n - 1), if they are normal.
     """
     fitted = result.coefficients
-    if all(c.jackknife_error is c.bootstrap_error is None for c in fitted.values()):
-        return ()
     flights = sum(flight.split == "fit" for flight in result.flights)
+    if flights < 2 or all(c.jackknife_error is c.bootstrap_error is None for c in fitted.values()):
+        return ()
     known_to = 100 / sqrt(2 * (flights - 1))
     precision = (
         f"With {flights} flights, an error that comes of their differences is itself known to "

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.disk import write_text
-from tuner.core.errors import ConfigError, RecordingError
+from tuner.core.errors import ConfigError
 from tuner.core.files import csv_text
 from tuner.engine import Report, current
 from tuner.evaluate.records import RMSE_UNITS
@@ -118,7 +118,7 @@ BOOTSTRAP_FILE = "bootstrap.csv"
 def bootstrap(
     job: Job, fitted: Fitted, count: int, folder: Path, on_iteration: Callable[[Iteration], None]
 ) -> dict[str, float]:
-    """Refit to flights drawn with replacement, write the table, and return the standard errors.
+    """Refit to two or more flights, drawn with replacement; write and return what they give.
 
     The engine in force computes the refits; the draws follow from the job's seed.
 
@@ -131,15 +131,8 @@ def bootstrap(
     -------
     dict
         Coefficient -> standard deviation over the refits.
-
-    Raises
-    ------
-    RecordingError
-        There are fewer than two flights to fit.
     """
     names = [flight.name for flight in job.fitted]
-    if len(names) < 2:
-        raise RecordingError("--bootstrap", "draws from a single flight", "give two or more")
     random = np.random.default_rng(job.settings.job.search.seed)
     drawn = random.integers(len(names), size=(count, len(names)))
     counts = [np.bincount(row, minlength=len(names)) for row in drawn]
@@ -163,16 +156,10 @@ def cross_validate(
 ) -> list[Refit]:
     """Leave each fitted flight out in turn, polish the fit to the others, and write the table.
 
-    The engine in force computes the folds. Those side by side report each stage when it has ended.
-
-    Raises
-    ------
-    RecordingError
-        There are fewer than two flights to fit.
+    There are two at least. The engine in force computes the folds. Those side by side report each
+    stage when it has ended.
     """
     names = [flight.name for flight in job.fitted]
-    if len(names) < 2:
-        raise RecordingError("--cross-validate", "leaves no flight to fit", "give two or more")
     others = 1.0 - np.eye(len(names))
     draws = [Draw(f"without {n}", row, n) for n, row in zip(names, others, strict=True)]
     folds = refits(job, fitted, draws, on_iteration)

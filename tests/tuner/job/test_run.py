@@ -294,6 +294,13 @@ def test_resume_without_a_checkpoint_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("asked", [{"cross_validate": True}, {"bootstrap": 5}])
+def test_refits_to_a_single_flight_are_refused_before_the_search(tmp_path, asked):
+    with pytest.raises(InputError, match="give two or more"):
+        run(Options([str(FLIGHTS / "yaw_spin_3rps.bag")], **asked), out=tmp_path / "r")
+    assert not (tmp_path / "r").exists()
+
+
 def test_a_missing_flight_writes_nothing(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         run(Options(["nowhere/*.bag"]), out=tmp_path / "run")
