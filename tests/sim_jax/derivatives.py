@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -70,6 +71,15 @@ class Differences:
         assert np.all(apart <= size), f"{np.max(apart / size)} times the tolerance"
 
 
+@lru_cache(maxsize=16)
+def _differences(
+    function: Callable[..., Any], structure: Any, shapes: tuple[tuple[int, ...], ...]
+) -> Differences:
+    return Differences(function, *jax.tree.unflatten(structure, [jnp.zeros(s) for s in shapes]))
+
+
 def assert_derivatives(function: Callable[..., Any], *point: Any, **how: Any) -> None:
     """Hold a function's derivatives at one point against finite differences."""
-    Differences(function, *point).hold(*point, **how)
+    leaves, structure = jax.tree.flatten(point)
+    shapes = tuple(jnp.shape(leaf) for leaf in leaves)
+    _differences(function, structure, shapes).hold(*point, **how)

@@ -34,7 +34,7 @@ def without_losses(craft: Vehicle) -> Vehicle:
     return eqx.tree_at(  # type: ignore[no-any-return]
         lambda v: (v.aerodynamics.rotor_drag_coefficient, v.aerodynamics.max_relative_airspeed),
         craft,
-        (0.0, 1e12),
+        (jnp.asarray(0.0), jnp.asarray(1e12)),
     )
 
 

@@ -21,6 +21,7 @@ from sim_jax.state import Limits, hover
 from sim_jax.vehicle import Setup
 from tests.golden_check.coefficients import golden_vehicle
 from tests.golden_check.controllers import golden_controller
+from tests.sim_jax.support import compiled_rollout
 
 CONTROLLER = golden_controller(Filters(jnp.asarray(40.0), jnp.asarray(20.0)), MixerSettings())
 DELAYED = Schedule(longest_estimate_latency=0.03, longest_actuator_latency=0.01)
@@ -112,7 +113,7 @@ def test_commands_from_the_inlet_are_logged_when_they_act() -> None:
     wanted = jnp.linspace(0.4, 0.6, SAMPLES * 4)
     start = hover(VEHICLE, Vec3(*jnp.asarray([0.0, 0.0, 10.0])))
     inlet = ActuatorInlet((wanted, wanted, wanted, wanted))
-    flown = rollout(VEHICLE, CONTROLLER, Schedule(), inlet, start, samples=SAMPLES)
+    flown = compiled_rollout(VEHICLE, CONTROLLER, Schedule(), inlet, start, samples=SAMPLES)
     np.testing.assert_allclose(flown.log.command[2], wanted[::4], rtol=1e-12)
 
 

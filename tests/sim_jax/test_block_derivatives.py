@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -67,16 +68,17 @@ def test_feedback_at_its_limit() -> None:
     assert_derivatives(feedback, vec(-1.0, 0.5, 1.0))
 
 
+def level_thrust(acceleration: Vec3) -> Array:
+    return geometric.thrust_setpoint(CONTROL.attitude, acceleration, LEVEL)
+
+
 @pytest.mark.parametrize("along", [-0.1 / 0.06, 0.9 / 0.06])
 def test_thrust_setpoint_at_its_limits(along: float) -> None:
-    def thrust(acceleration: Vec3) -> Array:
-        return geometric.thrust_setpoint(CONTROL.attitude, acceleration, LEVEL)
-
     # where the clip itself rounds, stay on the limit by adding to it
-    limit = (0.0 if along < 0 else 1.0) - float(thrust(vec(0.0, 0.0, along)))
+    limit = (0.0 if along < 0 else 1.0) - float(level_thrust(vec(0.0, 0.0, along)))
     assert abs(limit) < 1e-15
-    assert_derivatives(thrust, vec(0.0, 0.0, along), kink=True)
-    assert_derivatives(thrust, vec(0.0, 0.0, 3 * along))
+    assert_derivatives(level_thrust, vec(0.0, 0.0, along), kink=True)
+    assert_derivatives(level_thrust, vec(0.0, 0.0, 3 * along))
 
 
 def test_attitude_of_no_acceleration_and_of_one_along_the_heading() -> None:
@@ -183,13 +185,15 @@ def test_mixer(airmode: int, thrust_factor: float) -> None:
         mixing.hold(torque, jnp.asarray(thrust))
 
 
+@cache
+def mixing_still(airmode: int) -> Differences:
+    return Differences(lambda thrust: mixed(STILL, thrust, airmode=airmode), HALF)
+
+
 @pytest.mark.parametrize("airmode", [0, 1, 2])
 @pytest.mark.parametrize("thrust", [0.0, 1.0])
 def test_mixer_at_no_and_full_thrust(airmode: int, thrust: float) -> None:
-    def mix(thrust: Array) -> PerRotor:
-        return mixed(STILL, thrust, airmode=airmode)
-
-    assert_derivatives(mix, jnp.asarray(thrust), kink=True)
+    mixing_still(airmode).hold(jnp.asarray(thrust), kink=True)
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
@@ -264,11 +268,12 @@ def test_rotor_in_flight_and_standing() -> None:
         )
 
 
+def force(air: Vec3) -> Wrench:
+    return blown(jnp.asarray(616.0), air, *COEFFICIENTS)
+
+
 @pytest.mark.parametrize("axial", [0.0, 25.0, -25.0])
 def test_rotor_at_hover_and_where_thrust_has_gone(axial: float) -> None:
-    def force(air: Vec3) -> Wrench:
-        return blown(jnp.asarray(616.0), air, *COEFFICIENTS)
-
     assert_derivatives(force, vec(0.0, 0.0, axial), kink=True)
     if axial:
         assert_derivatives(force, vec(1.0, 0.0, 1.2 * axial))
