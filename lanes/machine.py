@@ -21,6 +21,9 @@ logger = logging.getLogger(__name__)
 MOST = 256 * 2**20
 """bytes of object code that are kept; the longest unused goes first."""
 _BYTES_OF_DIGEST = 32
+UNOPTIMISED = "LANES_UNOPTIMISED"
+"""An environment variable: where it is set, LLVM optimises nothing, which builds in half the time
+what runs more slowly and fuses no product with a sum."""
 
 _lock = Lock()
 _folder: list[Path] = []
@@ -34,14 +37,19 @@ def keep_code_in(folder: Path | None) -> None:
     _folder[:] = [] if folder is None else [folder]
 
 
+def _level() -> int:
+    """Return how much LLVM optimises, as its -O says."""
+    return 0 if os.environ.get(UNOPTIMISED) else 2
+
+
 @cache
-def _target_machine() -> Any:
+def _target_machine(level: int) -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     features = llvm.get_host_cpu_features()
     flat = features.flatten() + (",-prefer-256-bit" if features.get("avx512f") else "")
     return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=flat, opt=2, reloc="pic"
+        cpu=llvm.get_host_cpu_name(), features=flat, opt=level, reloc="pic"
     )
 
 
@@ -55,16 +63,18 @@ def register_bytes() -> int:
 
 
 def _machine_name() -> str:
-    machine = _target_machine()
+    level = _level()
+    triple = _target_machine(level).triple
     features = sorted(name for name, has in llvm.get_host_cpu_features().items() if has)
     versions = (llvmlite.__version__, *llvm.llvm_version_info)
-    return repr((versions, machine.triple, llvm.get_host_cpu_name(), features))
+    return repr((versions, triple, llvm.get_host_cpu_name(), features, level))
 
 
 def _compiled(text: str) -> bytes:
-    machine = _target_machine()
+    level = _level()
+    machine = _target_machine(level)
     module = llvm.parse_assembly(text)
-    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    options = llvm.create_pipeline_tuning_options(speed_level=level)
     # lanes are vectors already; loops are long and gain nothing from being unrolled
     options.loop_unrolling = options.loop_vectorization = options.slp_vectorization = False
     builder = llvm.create_pass_builder(machine, options)
@@ -138,8 +148,7 @@ def _bound(folder: Path) -> None:
 
 @cache
 def _linker() -> Any:
-    _target_machine()
-    return llvm.create_lljit_compiler(_target_machine())
+    return llvm.create_lljit_compiler(_target_machine(_level()))
 
 
 class Code:

@@ -18,7 +18,8 @@ import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
-from lanes.machine import keep_code_in
+from lanes.machine import UNOPTIMISED, keep_code_in
+from lanes.program import _program_of
 from tests import memory
 from tests.demo import demo
 from tests.memory import MOST_IN_A_MODULE, MOST_MEMORY
@@ -51,6 +52,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         folders[path in slow, path.parent].append(path)
     behind = {path: len(paths) - i for paths in folders.values() for i, path in enumerate(paths)}
     items.sort(key=lambda item: (item.path not in slow, -behind[item.path]))
+
+
+@pytest.fixture
+def optimised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Build kernels as the program does, those of this process that are not optimised anew."""
+    monkeypatch.setenv(UNOPTIMISED, "")
+    _program_of.cache_clear()
 
 
 class _NoFallback(logging.Handler):

@@ -42,6 +42,7 @@ def test_a_step_costs_as_many_operations_as_it_did(name):
     assert counted["transcendentals"] == pytest.approx(functions, rel=0.02)
 
 
+@pytest.mark.usefixtures("optimised")
 def test_the_kernel_that_is_timed_flies_what_xla_does():
     factor = np.asarray(factors(5))
     run = Kernel(moves=True)(factor, samples=30)

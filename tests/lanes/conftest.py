@@ -11,7 +11,7 @@ from tests.conftest import KERNELS, KERNELS_ALONE
 
 
 @pytest.fixture(autouse=True)
-def fallback_allowed() -> Iterator[None]:
+def fallback_allowed(optimised: None) -> Iterator[None]:  # noqa: ARG001
     watched = logging.getLogger("lanes.program")
     watched.removeHandler(KERNELS_ALONE)
     yield

@@ -27,6 +27,8 @@ from tuner.disturbances.ticks import Sampled
 from tuner.objective.segments import Segments
 from tuner.vehicle.model import coefficients_in, model_of, schedule_of
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 TICKS = 6
 ROOT = Path(__file__).parents[3]
 SD = {"position": 1e-3, "attitude": 2e-3, "body_rate": 0.02, "rotor_speed": 100.0}

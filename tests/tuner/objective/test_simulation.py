@@ -23,6 +23,8 @@ from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.vehicle.model import Model, coefficients_in, with_coefficients
 
+pytestmark = pytest.mark.usefixtures("optimised")
+
 MOVING = ("inertia_xx", "time_constant_up", "rotor_drag_coefficient", "estimate_latency")
 SAMPLES = 120
 
