@@ -273,29 +273,40 @@ def scale_of(lengths: Stamped, attitude: Stamped, *, speeds: bool = False) -> Sc
     lengths, attitude = _near(lengths, attitude)
     if not len(lengths.time) or not len(attitude.time):
         return Scale()
+    centres = _centres(lengths, attitude)
+    push = _push(lengths, centres, speeds=speeds)
     readings = (attitude.values, *(r.read(attitude.values) for r in ATTITUDE_READINGS))
     return _best_known(
-        _scale(*pull_and_tilt(lengths, Stamped(attitude.time, values), speeds=speeds))
-        for values in readings
+        _scale(*_against_tilt(push, Stamped(attitude.time, values), centres)) for values in readings
     )
 
 
-def pull_and_tilt(
-    lengths: Stamped, attitude: Stamped, *, speeds: bool = False
-) -> tuple[Array, Array]:
+def pull_and_tilt(position: Stamped, attitude: Stamped) -> tuple[Array, Array]:
     """Return a_xy - a_z t and t, see above, at times a bin apart: (n, 2) each.
 
     Both are the same weighted mean over `REACH` bins to either side; times at which either is not
     known, or the vehicle lies on its side, are left out.
     """
-    centres = _centres(lengths, attitude)
+    centres = _centres(position, attitude)
+    return _against_tilt(_push(position, centres), attitude, centres)
+
+
+def _push(lengths: Stamped, centres: Array, *, speeds: bool = False) -> Array:
+    """Return accelerations, (n, 3), `REACH` bins from either end of some bins."""
     if len(centres) <= 2 * REACH:
-        return np.empty((0, 2)), np.empty((0, 2))
+        return np.empty((0, 3))
     at = _binned(lengths, centres)
     if speeds:
         at = np.where(np.isfinite(at), np.nancumsum(at, axis=0) * BIN, np.nan)
     # a second difference is the mean of the second derivative by a triangle of weights
-    push = (at[2 * REACH :] - 2 * at[REACH:-REACH] + at[: -2 * REACH]) / (REACH * BIN) ** 2
+    second = at[2 * REACH :] - 2 * at[REACH:-REACH] + at[: -2 * REACH]
+    return np.asarray(second / (REACH * BIN) ** 2)
+
+
+def _against_tilt(push: Array, attitude: Stamped, centres: Array) -> tuple[Array, Array]:
+    """Return what `pull_and_tilt` does, of accelerations."""
+    if not len(push):
+        return np.empty((0, 2)), np.empty((0, 2))
     norm = np.linalg.norm(attitude.values, axis=1, keepdims=True)
     turned = attitude.values / np.where(norm > 0.5, norm, np.nan)
     up = upward(turned)
