@@ -197,12 +197,14 @@ def fitted_in(
     if not free:
         return start, True
     conditions = {n for flight in run.result.flights for n in flight.conditions if n not in lost}
+    ties = tuple(t for t in simulator.ties or settings.job.ties if set(t) <= set(free))
+    tied = {name for group in ties for name in group[1:]}
     job = JobFile(
         free=tuple(free),
-        ties=tuple(t for t in simulator.ties or settings.job.ties if set(t) <= set(free)),
+        ties=ties,
         terms=tuple(sorted(conditions)) or "none",
         disturbances="none",
-        coefficients=_bounds(run, start, free),
+        coefficients=_bounds(run, start, [name for name in free if name not in tied]),
         channels=settings.job.channels,
         weights=settings.job.weights,
         flights=settings.job.flights,

@@ -1,5 +1,7 @@
 """The second answer: what Gazebo lacks is made up for, or named, and nothing else moves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,26 @@ def test_coefficients_stand_in_for_a_term_that_is_lost_and_the_set_up_stays(run)
     assert found.result.rmse_effective.position < 0.2 * found.result.rmse_unfitted.position
     (lost,) = found.result.lost
     assert lost.rmse_without == found.result.rmse_unfitted
+
+
+def test_moments_of_inertia_that_a_job_ties_are_refitted_tied(run):
+    run = of_vehicle(as_fitted(run), effects={"linear_drag_x": 0.1, "linear_drag_y": 0.1})
+    inertia, rows = ("inertia_xx", "inertia_yy"), run.result.coefficients
+    free = {
+        n: rows[n].model_copy(update={"fitted": True, "lower": 0.001, "upper": 0.1})
+        for n in inertia
+    }
+    result = run.result.model_copy(update={"coefficients": rows | free})
+
+    def tied(run):
+        settings, recordings = recordings_of(run)
+        return replace(settings, job=settings.job.replace(ties=(inertia,))), recordings
+
+    found = effective_in(run.model_copy(update={"result": result}), GAZEBO_CLASSIC, tied)
+    before, after = values_of(run.vehicle), values_of(found.vehicle)
+    moved = after["inertia_xx"] / before["inertia_xx"]
+    assert moved != 1.0
+    assert after["inertia_yy"] / before["inertia_yy"] == pytest.approx(moved, rel=1e-9)
 
 
 def test_nothing_free_is_nothing_refitted(run):
