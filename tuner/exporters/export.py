@@ -298,7 +298,8 @@ def exported_vehicle(run: Run, today: date) -> tuple[VehicleFile, tuple[str, ...
 def provenance(run: Run, today: date, accepted: str = "") -> str:
     """Return one line that says where the numbers come from."""
     fitted = [flight.name for flight in run.result.flights if flight.split == "fit"]
-    line = f"fitted to {', '.join(fitted)}; run {run.folder.resolve().name}; {today.isoformat()}"
+    how = f"fitted to {', '.join(fitted)}" if fitted else "measured, no flight was simulated"
+    line = f"{how}; run {run.folder.resolve().name}; {today.isoformat()}"
     return _one_line(line, accepted)
 
 

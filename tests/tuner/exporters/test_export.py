@@ -11,7 +11,7 @@ from tuner.core import shipped
 from tuner.core.errors import ExportError, InputError
 from tuner.exporters import export as exporting
 from tuner.exporters.effective import Effective
-from tuner.exporters.export import export, exports_of_job
+from tuner.exporters.export import export, exports_of_job, provenance
 from tuner.exporters.gates import check
 from tuner.exporters.target import Draft, write
 from tuner.options import ExportOptions
@@ -306,6 +306,13 @@ def test_a_job_can_want_physical_coefficients_in_the_simulator(make_run):
     assert "<rotorDragCoefficient>0.000145<" in done.path.read_text()
     assert "effective" not in done.path.read_text()
     assert any(note.startswith("fuselage_drag 0.03 N s²/m² is not exported") for note in done.notes)
+
+
+def test_a_run_without_simulated_flights_says_so_where_its_numbers_stand(make_run):
+    run = make_run()
+    measured = run.model_copy(update={"result": run.result.model_copy(update={"flights": ()})})
+    assert provenance(run, TODAY).startswith("fitted to circle; run ")
+    assert provenance(measured, TODAY).startswith("measured, no flight was simulated; run ")
 
 
 def test_where_nothing_is_held_out_fitted_flights_check_the_run(make_run):
