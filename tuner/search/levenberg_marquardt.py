@@ -77,6 +77,8 @@ class Step(NamedTuple):
     predicted_reduction
         (S,) share of the loss at the best point by which its minimum would be lower, were the
         residuals linear: ½ gᵀH⁻¹g over the loss. Free of units and of damping.
+    promised
+        (S,) the same of the point to be tried next, which damping holds nearer.
     quadratic
         About the best point; None before the first step.
     best
@@ -92,6 +94,7 @@ class Step(NamedTuple):
     damping: Array
     still: NDArray[np.bool_]
     predicted_reduction: Array
+    promised: Array
     quadratic: NormalEquations | None = None
     best: SegmentSums | None = None
     sums: SegmentSums | None = None
@@ -125,6 +128,7 @@ def begin(points: Point, damping: Array | None = None, sums: SegmentSums | None 
         damping=np.ones(starts) if damping is None else np.asarray(damping, float),
         still=np.zeros(starts, bool),
         predicted_reduction=np.full(starts, np.inf),
+        promised=np.full(starts, np.inf),
         sums=sums,
     )
 
@@ -202,8 +206,10 @@ def _stepped(
     point = tried if accepted else before.point
     gradient, hessian = here.gradient[moves], here.hessian[np.ix_(moves, moves)]
     following = _packed(point)
-    following[moves] -= _solved(hessian, gradient, damping)
+    back = _solved(hessian, gradient, damping)
+    following[moves] -= back
     gain = 0.5 * gradient @ _solved(hessian, gradient, 0.0)
+    promised = gradient @ back - 0.5 * back @ hessian @ back
     return Step(
         point=point,
         tried=_unpacked(following, point),
@@ -211,6 +217,7 @@ def _stepped(
         damping=np.asarray(damping),
         still=np.asarray(still),
         predicted_reduction=np.asarray(float(gain) / max(here.loss, 1e-300)),
+        promised=np.asarray(float(promised) / max(here.loss, 1e-300)),
         quadratic=here,
         best=sums if accepted else before.best,
         sums=sums,
@@ -300,7 +307,8 @@ def _has_converged(
     `Step.still` ends a start whose nine leading digits no longer change. No recording has so many,
     so that a stage's tolerance ends it sooner: as soon as the loss gains less than that, by the
     last accepted step or by the last three tries; or before that step is tried, where the normal
-    equations predict no gain that matters.
+    equations predict no gain that matters. Tries that were rejected may have been too long: the
+    last stage makes them shorter until they promise no more than that.
     """
     assert step.sums is not None, "what has stepped has sums"
     stage, predicted = problem.stage, step.predicted_reduction
@@ -317,7 +325,8 @@ def _has_converged(
     if len(losses) > 1:
         ended |= step.accepted & (losses[-2] - losses[-1] <= least * np.abs(losses[-1]))
     if len(losses) > 3:
-        ended |= losses[-4] - losses[-1] <= least * np.abs(losses[-1])
+        long = problem.last & ~step.accepted & (step.promised > least)
+        ended |= ~long & (losses[-4] - losses[-1] <= least * np.abs(losses[-1]))
     return bool(np.all(ended))
 
 

@@ -97,6 +97,9 @@ def test_the_first_step_is_the_damped_one(advanced):
     np.testing.assert_allclose(first.tried.coefficients[0], expected, rtol=1e-9)
     gain = 0.5 * gradient @ np.linalg.solve(hessian, gradient)
     assert first.predicted_reduction[0] == pytest.approx(gain / valley(START).loss)
+    change = expected - START
+    promised = -gradient @ change - 0.5 * change @ hessian @ change
+    assert first.promised[0] == pytest.approx(promised / valley(START).loss)
 
 
 def test_what_is_held_stays(advanced):
@@ -110,6 +113,23 @@ def test_what_is_no_number_is_never_better(advanced):
     assert not last.accepted[1]
 
 
+def ends(last, gain, accepted, worst, *, promised=1.0, tries=1):
+    """Return whether a stage ends after so many tries at a loss of 1."""
+    stage = SimpleNamespace(tolerance=1e-4, rough=False, enough=0.0)
+    segments = SimpleNamespace(windowed=False)
+    problem = SimpleNamespace(stage=stage, last=last, objective=SimpleNamespace(segments=segments))
+    step = SimpleNamespace(
+        predicted_reduction=np.array([gain]),
+        promised=np.array([promised]),
+        accepted=np.array([accepted]),
+        loss=np.array([1.0]),
+        still=np.array([False]),
+        sums=SimpleNamespace(compared=np.array([1000.0])),
+    )
+    losses = [step.loss] * tries
+    return levenberg_marquardt._has_converged(problem, step, np.array([worst]), losses)
+
+
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("gain", [0.009, 0.011])
 @pytest.mark.parametrize("accepted", [False, True])
@@ -117,15 +137,13 @@ def test_what_is_no_number_is_never_better(advanced):
 def test_a_stage_ends_before_a_small_step_where_the_fit_is_near_and_the_last_was_better(
     last, gain, accepted, worst
 ):
-    stage = SimpleNamespace(tolerance=1e-4, rough=False, enough=0.0)
-    segments = SimpleNamespace(windowed=False)
-    problem = SimpleNamespace(stage=stage, last=last, objective=SimpleNamespace(segments=segments))
-    step = SimpleNamespace(
-        predicted_reduction=np.array([gain]),
-        accepted=np.array([accepted]),
-        loss=np.array([1.0]),
-        still=np.array([False]),
-        sums=SimpleNamespace(compared=np.array([1000.0])),
-    )
-    ended = levenberg_marquardt._has_converged(problem, step, np.array([worst]), [step.loss])
+    ended = ends(last, gain, accepted, worst)
     assert ended is (not last and gain < 0.01 and accepted and worst < NEAR)
+
+
+@pytest.mark.parametrize("last", [False, True])
+@pytest.mark.parametrize("promised", [0.9e-4, 1.1e-4, np.nan])
+@pytest.mark.parametrize("tries", [3, 4])
+def test_rejected_tries_end_the_last_stage_once_the_next_promises_nothing(last, promised, tries):
+    ended = ends(last, 0.1, False, 2.0 * NEAR, promised=promised, tries=tries)
+    assert ended is (tries == 4 and not (last and promised > 1e-4))
