@@ -77,6 +77,7 @@ def write_nanobench(folder: Path) -> None:
         command = 65535.0 * s["command"][:, [0, 3, 1, 2]]  # as its motors are numbered
         table = {
             "t": flown.time[:, None],
+            "pwr_pm_vbat": np.full((flown.time.size, 1), 3.4),
             "px,py,pz": s["position"],
             "qx,qy,qz,qw": s["attitude"][:, [1, 2, 3, 0]],
             "vx,vy,vz": s["velocity"],

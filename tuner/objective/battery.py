@@ -254,9 +254,9 @@ def require_voltage(flights: Sequence[Flight]) -> None:
         if not flight.has(VOLTAGE):
             raise RecordingError(
                 flight.path,
-                "holds no battery voltage, on which battery_exponent counts",
-                "fix battery_exponent at zero and add the term battery_decline, or leave the "
-                "flight out",
+                "holds no battery voltage, which battery_exponent needs",
+                "write battery_decline for battery in terms, or fix battery_exponent at zero, or "
+                "leave the flight out",
             )
 
 
