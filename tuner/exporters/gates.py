@@ -19,7 +19,7 @@ Refly = Callable[[Run, VehicleFile], Mapping[str, AxesRmse]]
 ON_BOUND = 1e-4
 #: Part by which what checks the run may be met worse than with the initial coefficients.
 WORSE = 0.01
-#: What a re-flown RMSE may differ from the run's: relative, or in m and degrees.
+#: What two RMSEs may differ by and be the same: relative, or in m and degrees.
 SAME_RELATIVE, SAME_ABSOLUTE = 0.01, 1e-4
 #: By how much its own simulator may miss a flight by more than this project's simulation of it:
 #: a factor, and in m and degrees.
@@ -129,7 +129,7 @@ def _worse(run: Run) -> list[str]:
     for flight in [one for one in flights if one.split == "holdout"] or flights:
         for what, unit in (("position", "m"), ("attitude", "degrees")):
             before, after = flight.rmse_initial.length(what), flight.rmse_best.length(what)
-            if after > before * (1 + WORSE):
+            if after > before * (1 + WORSE) + SAME_ABSOLUTE:
                 objections.append(f"{flight.name} {what} {after:.4g} {unit}, before {before:.4g}")
     return objections
 

@@ -319,6 +319,8 @@ def test_where_nothing_is_held_out_fitted_flights_check_the_run(make_run):
     flights = {"circle": {"rmse_best": rmse(0.2)}, "held": {"split": "fit"}}
     with pytest.raises(ExportError, match=r"circle position 0\.3 m, before 0\.15"):
         exported(make_run(flights=flights), "yaml")
+    flights["circle"] = {"rmse_initial": rmse(1e-9), "rmse_best": rmse(1e-6)}
+    exported(make_run(flights=flights), "yaml")
 
 
 def test_gates_ask_of_the_effective_coefficients_what_they_ask_of_others(make_run):

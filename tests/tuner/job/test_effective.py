@@ -12,7 +12,7 @@ from tuner.exporters.effective import effective_in, recordings_of
 from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.job.run import run
 from tuner.result import read_run
-from tuner.vehicle import ControllerFile, values_of, write_vehicle
+from tuner.vehicle import ControllerFile, values_of, with_values, write_vehicle
 
 LACKED = {
     "fuselage_drag": 0.05,
@@ -31,7 +31,8 @@ disturbances: none
 def test_coefficients_for_gazebo_end_at_the_bottom_of_their_valley(updated, tmp_path, monkeypatch):
     """A search that leaves ten thousand times less to gain finds the same ones."""
     vehicle = updated.replace(effects=LACKED)
-    write_vehicle(vehicle, tmp_path / "vehicle.yaml")
+    start = with_values(vehicle, {"motor_constant": 1.4e-5, "rotor_drag_coefficient": 3e-4})
+    write_vehicle(start, tmp_path / "vehicle.yaml")
     shape = TrajectorySettings(name="circle", radius=1.0, omega=1.0, speed_scale=3.0)
     bag, job = tmp_path / "circle.bag", tmp_path / "job.yaml"
     write_flights(simulate(vehicle, ControllerFile(), shape, duration=8.0), bag)

@@ -60,7 +60,7 @@ def test_an_interval_in_its_unit() -> None:
 def test_what_the_prior_determines() -> None:
     reason = Reason(code=ReasonCode.WIDE_INTERVAL, half_width=1.57, prior_given=False)
     assert reason_in_words(reason) == (
-        "the flights alone determine it only to ±157 %; the interval leans on the default prior"
+        "the flights alone determine it only to ±381 %; the interval leans on the default prior"
     )
     reason = Reason(code=ReasonCode.PRIOR_DOMINATES, prior_share=0.7, prior_given=True)
     assert reason_in_words(reason) == "70% of the information about it is that of the given prior"
