@@ -185,7 +185,7 @@ def unexplained(
     made = ModelAccelerations(model, (), (*recorded, *moved)).noiseless.at(np.zeros(0))
     mean = float(np.mean([part.rotor_speed.mean() for part in simulated]))
     names = [*((axis, name) for axis, features in FEATURES.items() for name in features), LATE]
-    motions, tables, sums = list[_Motion](), list[Array](), []
+    motions, tables, sums = list[_Motion](), list[Array](), list[tuple[Array, Array]]()
     for number, (one, real, of_commands) in enumerate(zip(along, made, driven, strict=False)):
         ends = made[len(recorded) + SHIFTS * number :][:SHIFTS]
         shift = np.stack([(one.left - end.left) / MOVED for end in ends], 2)
@@ -194,11 +194,12 @@ def unexplained(
         table = np.concatenate([_features(motion), _late(shift) * (not of_commands)], axis=2)
         columns = np.concatenate([one.columns, nuisances, shift * of_commands, table], axis=2)
         units = len(columns) // max(1, round(STRETCH / real.steps.step))
-        sums.append(filtered_sums(replace(real, columns=columns), whitening(real, MEMORY), units))
+        filters = whitening(real, MEMORY)
+        sums.append(filtered_sums(replace(real, columns=columns), filters, units)[:2])
         motions.append(motion)
         tables.append(table)
     first = sums[0][1].shape[1] - len(names)
-    information, score, *_ = (np.concatenate(parts) for parts in zip(*sums, strict=True))
+    information, score = (np.concatenate(parts) for parts in zip(*sums, strict=True))
     # lateness is no law: it is judged by itself, and first
     told = _likeliest(information, score, range(first), [first + len(names) - 1])
     while len(told) < MOST:

@@ -207,9 +207,8 @@ def filtered_sums(
     slope (U, K, K) and (U, K) the noise of rotor speeds makes.
     """
     size, steps = one.columns.shape[-1], one.steps
-    information, noise = np.zeros((2, parts, size, size))
-    slope, crossed = np.zeros((2, parts, size))
-    loss = np.zeros(parts)
+    information, slope, loss = (np.zeros((parts, *k)) for k in ((size, size), (size,), ()))
+    noise, crossed = (np.broadcast_to(0.0, made.shape) for made in (information, slope))
     for axis, kernel in enumerate(kernels):
         table = np.column_stack([one.left[:, axis], one.columns[:, axis]])
         rows = convolved(table, steps.known, kernel)
@@ -227,8 +226,10 @@ def filtered_sums(
             counts[unit] = robust.sum()
         if steps.noise > 0.0:
             gain = (steps.noise / sigma) ** 2 * _noise_gain(kernel, steps)
-            noise += np.multiply.outer(counts, np.tensordot(gain, one.moved[:, :, axis]))
-            crossed += np.multiply.outer(counts, np.tensordot(gain, one.crossed[:, :, axis]))
+            noise = noise + np.multiply.outer(counts, np.tensordot(gain, one.moved[:, :, axis]))
+            crossed = crossed + np.multiply.outer(
+                counts, np.tensordot(gain, one.crossed[:, :, axis])
+            )
     return information, slope, loss, noise, crossed
 
 
