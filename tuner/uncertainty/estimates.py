@@ -28,11 +28,11 @@ LOGGED = "logged"
 READINGS = "readings"
 """The battery's voltmeter read again, `DRAWS` times."""
 LACK = "lack"
+"""With what pushes the flights along and is none of the model."""
 LIMIT = "limit"
 LIMIT_STEP, LIMIT_SD = 0.01, 0.25
 """Share by which the rotors' limit is lowered to see what it moves, and to which it is known where
 nothing recorded tells rotor speeds: a vehicle file has a nominal one."""
-"""With what pushes the flights along and is none of the model."""
 DRAWS = 6
 """How many times: an error that is told by so many is told to a third."""
 AT_BOUND = 2e-3
