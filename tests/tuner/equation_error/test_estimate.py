@@ -17,6 +17,7 @@ from tuner.equation_error.recorded_accelerations import (
     steps_of,
     without_gaps_of,
 )
+from tuner.equation_error.regression import MEMORY, regress
 from tuner.job.accelerations import with_accelerations
 from tuner.recordings.flight import Series
 from tuner.search.inlet_choice import predicts_turning, regressors
@@ -78,6 +79,42 @@ def test_errors_hold_tachometers_whose_noise_is_a_quarter_more(flown, begun, mon
         moved = abs(np.log(other.values[name] / found.values[name]))
         part = np.sqrt(found.errors[name] ** 2 - certain.errors[name] ** 2)
         assert 0.01 < moved < 1.5 * part, (name, moved, part)
+
+
+@pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
+@pytest.mark.parametrize("times", [0.5, 2.0])
+def test_errors_hold_what_another_memory_moves(flown, begun, monkeypatch, times):
+    _, settings, recordings = flown
+
+    def moved(made, begin, *, memory=MEMORY, **given):
+        found = regress(made, begin, memory=memory, **given)
+        return replace(found, point=found.point + (0.5 if memory == times * MEMORY else 0.0))
+
+    monkeypatch.setattr("tuner.equation_error.estimate.regress", moved)
+    found = with_accelerations(job_of(settings, recordings))[0].accelerations
+    for name in TILTING:
+        assert found.errors[name] > 0.4 > begun[1].accelerations.errors[name] + 0.1
+
+
+@pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
+def test_noise_that_is_said_to_be_more_than_there_is_leaves_a_minimum(flown, monkeypatch):
+    """No more than half of what a direction holds is taken off for it."""
+    _, settings, recordings = flown
+    found = []
+
+    def noisier(flight, **given):
+        steps = steps_of(flight, **given)
+        return replace(steps, noise=2.0 * steps.noise)
+
+    def followed(*given, **named):
+        found.append(regress(*given, **named))
+        return found[-1]
+
+    monkeypatch.setattr("tuner.equation_error.recorded_accelerations.steps_of", noisier)
+    monkeypatch.setattr("tuner.equation_error.estimate.regress", followed)
+    with_accelerations(job_of(settings, recordings))
+    assert len(found) == 5
+    assert all(np.all(np.diag(one.covariance) >= 0.0) for one in found)
 
 
 def with_rotors(recordings, changed):

@@ -172,7 +172,8 @@ def test_a_fit_with_a_lag_whose_filter_loses_a_flight_is_not_taken(monkeypatch):
 def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, others, titles, lag):
     """A fit of another model cannot contradict this one, nor can one without a lag.
 
-    What the model lacks acts as terms that were left out are judged.
+    What the model lacks, without a lateness that samples contradict, acts as terms that were left
+    out are judged.
     """
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
     predictor = SimpleNamespace(memory=0, is_lost=False, keeps_track=True, strengths=USUAL)
@@ -181,14 +182,15 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
     row = SimpleNamespace(group="fuselage_drag", kept=True)
     begin = Selected(job, fitted(2.0 * COLOURED), (cast(Any, row),))
-    polished, examined, read, lack = [], [], [], Lack((), None)
+    lack = Lack((Law("force_z", "airspeed_across", 0.2),), None)
+    polished, examined, read = [], [], []
     chosen = iter([replace(begin, rows=()) if others else None, None])
 
     def seen(selected: Selected, *_: Any) -> Any:
         return SimpleNamespace(
             selected=selected,
             selection=lambda *_, **__: next(chosen),
-            contradict=lambda *_: False,
+            contradict=lambda *_: True,
             with_acting=lambda lack, _: SimpleNamespace(in_doubt=lambda: {"acting": lack}),
         )
 
@@ -211,7 +213,7 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     monkeypatch.setattr(disturbances, "free_offsets", lambda _: np.zeros((0, 0), bool))
     monkeypatch.setattr(disturbances, "polished", polish)
     monkeypatch.setattr(disturbances, "alternatives_of", lambda *given: read.append(given[2:]))
-    monkeypatch.setattr(disturbances, "lack_of", lambda *_: lack)
+    monkeypatch.setattr(disturbances, "lack_of", lambda *_: replace(lack, late=0.012))
     monkeypatch.setattr(disturbances, "examine", examine)
     monkeypatch.setattr(disturbances, "_with_lags", with_lags)
     monkeypatch.setattr(disturbances, "_agree", lambda *_: not lag)
