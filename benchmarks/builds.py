@@ -13,7 +13,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.contest import STRIDE, Contest, simple
+from benchmarks.contest import STRIDE, Contest, rivals, simple
 from tuner.config import Options, settle
 from tuner.config.job import InletName, JobFile
 from tuner.core.errors import InputError
@@ -89,8 +89,10 @@ def _predicted(path: Path, mass: float) -> dict[str, list[Predictions]]:
     best = vehicle_fitted(selected.job, fitted)
     controller = controller_flown(selected.job, fitted)
     predictions = {
-        label: [predict(vehicle, controller, second, INLET, stride=STRIDE)]
-        for label, vehicle in {"unfitted": settings.vehicle, "fitted": best}.items()
+        label: [predict(vehicle, controller, second, INLET, stride=STRIDE, observer=observer)]
+        for label, vehicle, observer in rivals(
+            settings.vehicle, best, controller, [(first, INLET, 0.0)]
+        )
     }
     signal = INLETS[INLET].needs[0]
     return simple([first], [second], signal, predictions["fitted"]) | predictions

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 from benchmarks.regression import Regression
 from tuner.evaluate.prediction import Predictions, hold
+from tuner.evaluate.torque_observer import Fed, TorqueObserver
 from tuner.recordings.flight import Flight
+from tuner.vehicle import ControllerFile, VehicleFile
 
 STEPS = (10, 50)
 """Samples of 10 ms after which predictions are compared."""
@@ -30,6 +32,21 @@ class Contest:
     seconds: float
     predictions: Mapping[str, Sequence[Predictions]]
     remark: str = ""
+
+
+def rivals(
+    unfitted: VehicleFile, fitted: VehicleFile, controller: ControllerFile, flights: Sequence[Fed]
+) -> tuple[tuple[str, VehicleFile, TorqueObserver | None], ...]:
+    """Return the predictors of a vehicle that was fitted to flights: from the state, and beside it.
+
+    Each with its name, its vehicle and what tells it the torque that no input shows.
+    """
+    observer = TorqueObserver.of(fitted, controller, flights)
+    return (
+        ("unfitted", unfitted, None),
+        ("fitted", fitted, None),
+        ("fitted, observed", fitted, observer),
+    )
 
 
 def simple(

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import builds, without_pose
-from benchmarks.contest import STEPS, STRIDE, Contest, simple
+from benchmarks.contest import STEPS, STRIDE, Contest, rivals, simple
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from tuner.config import Options, settle
@@ -60,7 +60,8 @@ def measure() -> Section:
         "side): Euclidean distances, and for the attitude the angle between both. Nothing is "
         "fitted to these flights. *hold* lets the state be; *linear regression* fits "
         "accelerations to state and inputs of the fitted flights; *unfitted* is the vehicle file "
-        "that the fit starts from. "
+        "that the fit starts from; *observed* knows besides what turned the vehicle unseen in the "
+        "last sample before. "
     )
     return Section("Prediction of real flights", text + " ".join(notes), head, rows)
 
@@ -108,6 +109,7 @@ def contest_of(folder: Path) -> Contest:
     settings = settle(options)
     late = {flight.name: flight.input_late for flight in result.flights}
     controller = controller_of(result)
+    known = [(r.flight, r.inlet, late[r.flight.name]) for r in recordings if not r.holdout]
     signal = INLETS[held_out[0].inlet].needs[0]
     predictions: dict[str, list[Predictions]] = {
         label: [
@@ -118,10 +120,11 @@ def contest_of(folder: Path) -> Contest:
                 recording.inlet,
                 stride=STRIDE,
                 input_late=late[recording.flight.name],
+                observer=observer,
             )
             for recording in held_out
         ]
-        for label, vehicle in {"unfitted": settings.vehicle, "fitted": best}.items()
+        for label, vehicle, observer in rivals(settings.vehicle, best, controller, known)
     }
     return Contest(
         tuple(recording.flight.name for recording in held_out),

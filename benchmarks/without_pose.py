@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.contest import STRIDE, Contest, simple
+from benchmarks.contest import STRIDE, Contest, rivals, simple
 from tuner.config import Options, settle
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
@@ -60,10 +60,12 @@ def contest_of(folder: Path) -> Contest:
     controller = ControllerFile()
     predictions = {
         label: [
-            _of_rate(predict(vehicle, controller, flight, INLET, stride=STRIDE))
+            _of_rate(predict(vehicle, controller, flight, INLET, stride=STRIDE, observer=observer))
             for flight in held_out
         ]
-        for label, vehicle in {"unfitted": settings.vehicle, "fitted": best}.items()
+        for label, vehicle, observer in rivals(
+            settings.vehicle, best, controller, [(fitted, INLET, 0.0)]
+        )
     }
     others = simple([fitted], held_out, "command", predictions["fitted"])
     return Contest(

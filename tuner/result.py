@@ -135,6 +135,9 @@ class FlightResult(Part):
     predicted_initial, predicted_best, predicted_holding
         Open-loop predictions with the initial and the best coefficients, and that the state stays
         as it is, by how far they look ahead; empty for a flight simulated whole.
+    predicted_with_observer
+        As ``predicted_best``, with the torque besides that the last samples before a prediction
+        tell and its inputs do not; empty where neither rotor speeds nor commands are fed in.
     """
 
     name: str
@@ -152,6 +155,7 @@ class FlightResult(Part):
     rmse_fitted_starts: AxesRmse | None = None
     predicted_initial: tuple[PredictedErrors, ...] = ()
     predicted_best: tuple[PredictedErrors, ...] = ()
+    predicted_with_observer: tuple[PredictedErrors, ...] = ()
     predicted_holding: tuple[PredictedErrors, ...] = ()
 
 

@@ -2,12 +2,13 @@
 
 A prediction begins at the recorded state (`tuner.recordings.states`) and is simulated open loop
 for a stated time. Nothing is fitted to the flight that is predicted: no start, no trim, no offset.
+From the state alone, or with the torque that an observer has told just before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import jax
@@ -19,6 +20,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.state import AIRBORNE
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
+from tuner.evaluate.torque_observer import TorqueObserver
 from tuner.findings.sentences import PREDICTED
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.inlets import INLETS
@@ -97,6 +99,7 @@ def predict(
     seconds: float = 0.5,
     stride: float | None = None,
     input_late: float = 0.0,
+    observer: TorqueObserver | None = None,
 ) -> Predictions:
     """Predict a flight open loop from many of its recorded states.
 
@@ -112,6 +115,8 @@ def predict(
         s from one prediction to the next; by default one sample.
     input_late
         s by which what is fed in is stamped later than the recorded state.
+    observer
+        Tells the torque that no input shows when a prediction begins.
 
     Raises
     ------
@@ -119,7 +124,7 @@ def predict(
         The flight never holds so many s of pose and input.
     """
     course = Course(flight, inlet, seconds=seconds, stride=stride, input_late=input_late)
-    return course.predicted(vehicle, controller)
+    return course.predicted(vehicle, controller, observer)
 
 
 class Course:
@@ -138,6 +143,7 @@ class Course:
         input_late: float = 0.0,
     ) -> None:
         self.flight, self.inlet, self.seconds = flight, inlet, seconds
+        self.input_late = input_late
         self._pieces = pieces_of(
             [flight],
             inlets=[inlet],
@@ -156,7 +162,12 @@ class Course:
         """The states that predictions are compared with, step by step."""
         return states_at(self.flight.series, (self.begins + self.ahead[:, None]).ravel())
 
-    def predicted(self, vehicle: VehicleFile, controller: ControllerFile) -> Predictions:
+    def predicted(
+        self,
+        vehicle: VehicleFile,
+        controller: ControllerFile,
+        observer: TorqueObserver | None = None,
+    ) -> Predictions:
         """Return what a vehicle is predicted to do."""
         motor, schedule = vehicle.motor, schedule_of(controller)
         segments = window_segments(
@@ -170,6 +181,9 @@ class Course:
             pieces=self._pieces,
         )
         segments = _taken(segments, self._whole)
+        if observer is not None:
+            known = self.flight, self.inlet, self.input_late
+            segments = replace(segments, disturbance=observer.disturbance(known, self.begins))
         model = model_of(with_reference_voltage(vehicle, [self.flight]), controller)
         reached = _simulated(model, segments, schedule, self.ahead)
         errors = errors_of(reached, self.recorded, (len(self.ahead), len(self.begins)))

@@ -16,6 +16,7 @@ from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.prediction import Course, Predictions, hold
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, Pose
+from tuner.evaluate.torque_observer import FED, TorqueObserver
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS
@@ -127,6 +128,8 @@ class Validation:
         As ``best``, but windows start where the vehicle meets them best; flights in windows only.
     predicted_initial, predicted_best
         Open-loop predictions; flights in windows only.
+    predicted_with_observer
+        Likewise by the fitted vehicle, with the torque that fed rotors do not show before them.
     predicted_holding
         That the state stays as it was recorded, at the times of these predictions.
     worse_than_holding
@@ -141,6 +144,7 @@ class Validation:
     fitted_starts: Mapping[str, FlightErrors] = field(default_factory=dict)
     predicted_initial: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     predicted_best: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
+    predicted_with_observer: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     predicted_holding: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     worse_than_holding: Mapping[str, Mapping[float, tuple[str, ...]]] = field(default_factory=dict)
     turning_explained: Mapping[str, float] = field(default_factory=dict)
@@ -148,11 +152,12 @@ class Validation:
 
 @dataclass(frozen=True)
 class _Predicted:
-    """Predictions of one flight."""
+    """Predictions of one flight; ``observed`` where an observer can tell something of it."""
 
     initial: Predictions
     best: Predictions
     held: Predictions
+    observed: Predictions | None
 
 
 def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
@@ -165,6 +170,9 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
         fitted_starts=comparison.fly(vehicle, fitted_starts=True),
         predicted_initial={name: _errors(of.initial) for name, of in predicted.items()},
         predicted_best={name: _errors(of.best) for name, of in predicted.items()},
+        predicted_with_observer={
+            name: _errors(of.observed) for name, of in predicted.items() if of.observed is not None
+        },
         predicted_holding={name: _errors(of.held) for name, of in predicted.items()},
         worse_than_holding={
             name: {seconds: of.best.worse_than(of.held, seconds) for seconds in AHEAD}
@@ -181,6 +189,8 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
 def _predicted(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, _Predicted]:
     """Return flight -> its predictions, of those that are not flown in a closed loop."""
     controller = controller_flown(job, fitted)
+    known = [(r.flight, r.inlet, r.input_late) for r in job.recordings if not r.holdout]
+    observer = TorqueObserver.of(vehicle, controller, known)
     found = {}
     for recording in job.recordings:
         if INLETS[recording.inlet].closed_loop:
@@ -193,10 +203,12 @@ def _predicted(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, _Pre
             input_late=recording.input_late,
         )
         best = course.predicted(vehicle, controller)
+        observes = observer is not None and recording.inlet in FED
         found[recording.flight.name] = _Predicted(
             initial=course.predicted(job.given.vehicle, controller),
             best=best,
             held=_unchanged(course, best),
+            observed=course.predicted(vehicle, controller, observer) if observes else None,
         )
     return found
 

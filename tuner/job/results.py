@@ -284,6 +284,7 @@ def _flight(job: Job, fitted: Fitted, recording: Recording, validation: Validati
         rmse_fitted_starts=None if met is None else met.rmse,
         predicted_initial=validation.predicted_initial.get(name, ()),
         predicted_best=validation.predicted_best.get(name, ()),
+        predicted_with_observer=validation.predicted_with_observer.get(name, ()),
         predicted_holding=validation.predicted_holding.get(name, ()),
     )
 

@@ -223,6 +223,7 @@ def _result(
             rmse_best=best[name].rmse,
             predicted_initial=(_ahead(3.0),),
             predicted_best=(_ahead(1.25),),
+            predicted_with_observer=(_ahead(1.0),),
             predicted_holding=(_ahead(0.75),),
         )
         for number, name in enumerate(FLIGHTS)

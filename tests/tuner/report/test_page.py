@@ -62,7 +62,7 @@ def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
     ):
         assert heading in text
     assert "swing, lap 2" in text
-    assert "3 → 1.2 (0.75)" in text
+    assert "3 → 1.2, 1 (0.75)" in text
     assert "What to log next time" in text
     assert "Log the command at 200 Hz" in text
     assert "Added to Gazebo's motor model: fuselage_drag." in text

@@ -89,8 +89,8 @@ def _tables(contents: Contents, result: RunResult) -> list[Table]:
     if ahead := [row for flight in result.flights for row in _predictions(flight)]:
         quantities = [f"{name.replace('_', ' ')} [{unit}]" for name, unit in PREDICTED.items()]
         fold = (
-            "Open-loop predictions from recorded states: mean error before → after (of a state "
-            "that stays as it is)"
+            "Open-loop predictions from recorded states: mean error before → after, knowing the "
+            "torque that was unseen just before (of a state that stays as it is)"
         )
         tables.append(
             Table(("flight", "after [s]", *quantities), ahead, words=("flight",), fold=fold)
@@ -175,6 +175,7 @@ def _predictions(flight: FlightResult) -> list[tuple[Cell | str, ...]]:
     rows = zip(
         flight.predicted_initial,
         flight.predicted_best,
+        flight.predicted_with_observer or nothing,
         flight.predicted_holding or nothing,
         strict=True,
     )
@@ -182,16 +183,23 @@ def _predictions(flight: FlightResult) -> list[tuple[Cell | str, ...]]:
         (
             _title(flight),
             f"{best.seconds:g}",
-            *(_ahead(*(getattr(of, n, None) for of in (before, best, naive))) for n in PREDICTED),
+            *(
+                _ahead(*(getattr(of, n, None) for of in (before, best, observed, naive)))
+                for n in PREDICTED
+            ),
         )
-        for before, best, naive in rows
+        for before, best, observed, naive in rows
     ]
 
 
-def _ahead(before: float | None, best: float | None, held: float | None) -> Cell | str:
+def _ahead(
+    before: float | None, best: float | None, observed: float | None, held: float | None
+) -> Cell | str:
     if best is None:
         return "–"
     text = f"{short(before) or 'crash'} → {short(best)}"
+    if observed is not None:
+        text += f", {short(observed)}"
     if held is None:
         return text
     return Cell(f"{text} ({short(held)})", look="worse" if best > held else "")
