@@ -124,11 +124,6 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.HOLDING_BETTER: "Holding what was recorded of this flight's state, all of it or what the "
     "line names, predicts it better than the fitted coefficients do, by more than chance. Predict "
     "less far ahead, or with more recorded.",
-    Code.INERTIA_BALANCED: "Errors in rotor speeds would pass for inertia: it is the one at which "
-    "recorded motion and rotor speeds balance. Nothing to do.",
-    Code.INERTIA_NOT_BALANCED: "Errors in rotor speeds pass for inertia: what predicts the "
-    "flights is kept. Take these inertias for effective ones, and measure them on the ground "
-    "(tune bench).",
     Code.DISTURBANCES_FOLLOWED: "The residuals hold more than noise, as gusts leave it, and a "
     "Kalman filter estimates the disturbances. Nothing to do.",
     Code.FLIGHT_UNMATCHED: "The simulation does not match this flight, and its weight in the fit "

@@ -37,7 +37,6 @@ DOING = {
     "selection of terms": "Trying terms beyond the motor model",
     "disturbances": "Estimating what disturbed the flights",
     "examination": "Examining how well each coefficient is known",
-    "balance": "Balancing the recorded motion and the rotor speeds",
     "validation": "Simulating each flight",
     "cross-validation": "Fitting without each flight in turn",
     "bootstrap": "Fitting to flights drawn with replacement",

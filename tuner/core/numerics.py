@@ -29,9 +29,9 @@ SEEN = 1e-6
 """Share of a coefficient in unknown directions from which it is unknown."""
 
 
-def robust_sd(values: ArrayLike, axis: int | tuple[int, ...] | None = None) -> Array:
+def robust_sd(values: ArrayLike) -> Array:
     """Return a robust standard deviation about zero: that of the median absolute value."""
-    return np.asarray(ROBUST * np.median(np.abs(values), axis=axis))
+    return np.asarray(ROBUST * np.median(np.abs(values)))
 
 
 def huber_weights(error: Array, limit: float) -> Array:

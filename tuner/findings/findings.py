@@ -306,16 +306,6 @@ class Code(Worded):
         sentences.holding_better,
         "Predict less far ahead, or with more recorded.",
     )
-    INERTIA_BALANCED = (
-        "inertia_balanced",  # error, NAME_fitted, NAME_balanced; names: NAMEs
-        sentences.inertia_balanced,
-        "",
-    )
-    INERTIA_NOT_BALANCED = (
-        "inertia_not_balanced",  # likewise
-        sentences.inertia_balanced,
-        "Take these inertias for effective ones, and measure them on the ground (tune bench).",
-    )
     DISTURBANCES_FOLLOWED = (
         "disturbances_followed",  # gust, thrust (shares), both _seconds
         sentences.disturbances_followed,

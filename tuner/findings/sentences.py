@@ -140,30 +140,6 @@ def holding_better(finding: Finding) -> str:
     )
 
 
-def inertia_balanced(finding: Finding) -> str:
-    """Return at which inertia motion and rotor speeds balance, and what became of it."""
-    values = listed(
-        [
-            f"{name} {finding.numbers[f'{name}_balanced']:.3g} instead of "
-            f"{finding.numbers[f'{name}_fitted']:.3g} kg m²"
-            for name in finding.names
-        ]
-    )
-    error = finding.numbers["error"]
-    if finding.code == "inertia_balanced":
-        return (
-            "Errors in the measured rotor speeds would pass for inertia, so that it is the one at "
-            f"which recorded motion and rotor speeds balance: {values}. All else is fitted to what "
-            "flies, with drag that stands in for what the errors drive. Flights that are left out "
-            f"are predicted with {error:.2f} times the error."
-        )
-    return (
-        "Errors in rotor speeds pass for inertia: recorded motion and rotor speeds balance at "
-        f"{values}. What predicts these flights is kept, for flights that "
-        f"are left out would be predicted with {error:.2f} times the error."
-    )
-
-
 def disturbances_followed(finding: Finding) -> str:
     """Return how strong the estimated disturbances are, and their correlation times."""
     numbers = finding.numbers

@@ -59,7 +59,6 @@ from tuner.search.problem import Job, job_of
 from tuner.search.progress import Fitted, Progress
 from tuner.search.rotor_change import used_up_to_changes
 from tuner.terms.candidates import Selected
-from tuner.terms.inverse_regression import with_inputs_balanced
 from tuner.terms.refit_with_disturbances import Examined, examined
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.uncertainty.estimates import finer_than_steps, flights_refute, terms_shown
@@ -122,12 +121,11 @@ def run(
         resume=resume,
     )
     job = selected.job
-    fitted, examination, inertia = _balanced(selected, fitted, examination, explanation, listener)
     explanation.tell(fitted.findings)
     vehicle = vehicle_fitted(job, fitted)
     if job is not found.job or fitted is not found.fitted:
         validation = _flown(job, fitted, vehicle, listener)
-    explanation.notice(_of_flights(job, validation, inertia))
+    explanation.notice(_of_flights(job, validation))
     explanation.notice(voltage_taken(settings.vehicle, vehicle))
     sources = _known(fitted, examination, explanation)
 
@@ -246,41 +244,14 @@ def _flown(job: Job, fitted: Fitted, vehicle: VehicleFile, listener: Listener) -
         return validate(job, fitted, vehicle)
 
 
-def _of_flights(
-    job: Job, validation: Validation, inertia: Sequence[Finding]
-) -> tuple[Finding, ...]:
-    """Return what the simulated flights say of a fit.
-
-    ``inertia`` is what the balance of moments has said; if nothing, the turning is looked at.
-    """
+def _of_flights(job: Job, validation: Validation) -> tuple[Finding, ...]:
+    """Return what the simulated flights say of a fit."""
     return (
         *flights_worse(validation.initial, validation.best),
         *flights_not_flown(job, validation.best),
         *holding_better(job, validation),
-        *(inertia or turning_unexplained(job, validation.turning_explained)),
+        *turning_unexplained(job, validation.turning_explained),
     )
-
-
-def _balanced(
-    selected: Selected,
-    fitted: Fitted,
-    examination: Examination | None,
-    explanation: Explanation,
-    listener: Listener,
-) -> tuple[Fitted, Examination | None, tuple[Finding, ...]]:
-    """Return the fit whose moments balance, its examination, and what was found of inertia."""
-    as_it_is: tuple[Fitted, Examination | None, tuple[Finding, ...]] = fitted, examination, ()
-    if examination is None:
-        return as_it_is
-    balance = partial(
-        with_inputs_balanced,
-        selected.job,
-        fitted,
-        examination,
-        listener.on_message,
-        in_doubt=selected.in_doubt,
-    )
-    return explanation.part("balance", balance, as_it_is)
 
 
 def _known(

@@ -58,7 +58,6 @@ DOUBTS = OTHER_INPUTS | frozenset(
         Code.TURNING_UNEXPLAINED,
         Code.TURNING_REGRESSED,
         Code.TURNING_NOT_PREDICTED,
-        Code.INERTIA_NOT_BALANCED,
         Code.SPARSE_INPUT,
         Code.SINGULAR_DIRECTION,
         Code.FLIGHTS_FAR_OFF,

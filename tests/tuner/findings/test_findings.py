@@ -57,20 +57,6 @@ MADE = {
         "flights",
         {"gust": 0.0027, "gust_seconds": 1.0, "thrust": 0.004, "thrust_seconds": 0.02},
     ),
-    Code.INERTIA_BALANCED: Finding(
-        Code.INERTIA_BALANCED,
-        "info",
-        "moments of inertia",
-        {"inertia_xx_fitted": 3e-5, "inertia_xx_balanced": 2e-5, "error": 1.1},
-        ("inertia_xx",),
-    ),
-    Code.INERTIA_NOT_BALANCED: Finding(
-        Code.INERTIA_NOT_BALANCED,
-        "warning",
-        "moments of inertia",
-        {"inertia_xx_fitted": 3e-5, "inertia_xx_balanced": 1e-5, "error": 2.3},
-        ("inertia_xx",),
-    ),
     Code.INLET_CHOSEN: Finding(
         Code.INLET_CHOSEN,
         "info",
