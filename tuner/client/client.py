@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import quote
 
 from tuner.config import Settings, settle
-from tuner.core.disk import folder_for, inside, make_folder, result_folder, whole_file
+from tuner.core.disk import folder_for, inside, result_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.core.shipped import Kind, configs_folder, find_config
 from tuner.core.yaml_document import read_yaml
@@ -239,7 +239,6 @@ class Client:
         folder = result_folder(None if out is None else Path(out))
         for name in found["files"]:
             target = inside(folder, name)
-            make_folder(target.parent)
             with whole_file(target) as unfinished:
                 self._download(f"{_at(job)}/files/{quote(name)}", unfinished)
         return read_run(folder)

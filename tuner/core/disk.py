@@ -75,7 +75,8 @@ def write_text(path: Path, text: str) -> None:
 def whole_file(path: Path) -> Iterator[Path]:
     """Give the path of an unfinished file beside ``path`` that takes its place in the end.
 
-    If anything fails before, what stood at ``path`` stays as it was and nothing is left beside it.
+    Its folder is made where there is none. If anything fails before, what stood at ``path`` stays
+    as it was and nothing is left beside it.
 
     Raises
     ------
@@ -83,6 +84,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         The system refuses to write there.
     """
     with _refusals(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
         os.close(handle)
         unfinished = Path(name)
@@ -120,20 +122,17 @@ def check_folder(path: Path) -> None:
         _check_writable(path)
 
 
-def check_file(path: Path, *, folder_is_made: bool = False) -> None:
-    """Refuse a file that could not be written, without touching it.
+def check_file(path: Path) -> None:
+    """Refuse a file that `whole_file` could not write, without touching it.
 
     Raises
     ------
     OutputError
-        It is a folder, its folder does not exist and is not ``folder_is_made`` before writing, or
-        the system refuses.
+        It is a folder, or the system refuses.
     """
     with _refusals(path):
         if _stands(path) and path.is_dir():
             raise OSError(errno.EISDIR, "")
-        if not folder_is_made and not _stands(path.parent):
-            raise OSError(errno.ENOENT, "")
         _check_writable(path.parent)
 
 

@@ -333,24 +333,27 @@ def _beyond_limit(flight: Flight, control: PositionControl, time: Array, positio
 
 
 def holding_better(job: Job, validation: Validation) -> tuple[Finding, ...]:
-    """Return what of a flight is predicted worse than by leaving it as it is, chance apart."""
+    """Return what of a flight is predicted worse than by leaving it as it is, chance apart.
+
+    So far ahead as anything is.
+    """
     findings = []
     for recording in job.recordings:
         name = recording.flight.name
-        pairs = zip(
-            validation.predicted_best.get(name, ()),
-            validation.predicted_holding.get(name, ()),
-            strict=True,
+        ahead = validation.worse_than_holding.get(name, {})
+        lost = {seconds: names for seconds, names in ahead.items() if names}
+        if not lost:
+            continue
+        seconds = max(lost)
+        best, held = (
+            next(one for one in predicted[name] if one.seconds == seconds)
+            for predicted in (validation.predicted_best, validation.predicted_holding)
         )
-        for best, held in pairs:
-            lost = validation.worse_than_holding[name][best.seconds]
-            if not lost:
-                continue
-            numbers = {"seconds": best.seconds}
-            for quantity in lost:
-                numbers |= {
-                    quantity: getattr(best, quantity),
-                    f"{quantity}_held": getattr(held, quantity),
-                }
-            findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, lost))
+        numbers = {"soonest": min(lost), "seconds": seconds}
+        for quantity in lost[seconds]:
+            numbers |= {
+                quantity: getattr(best, quantity),
+                f"{quantity}_held": getattr(held, quantity),
+            }
+        findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, lost[seconds]))
     return tuple(findings)

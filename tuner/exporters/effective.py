@@ -22,7 +22,6 @@ from pydantic import ValidationError
 
 from tuner.config import JobFile, Settings
 from tuner.config.job import CoefficientSettings
-from tuner.core.disk import make_folder
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.files import ResultFile
 from tuner.core.phrases import listed
@@ -445,7 +444,6 @@ def kept_effective(run: Run, simulator: Simulator) -> Effective | None:
                 else Effective(read_vehicle(vehicle_file), kept.effective)
             )
     found = effective_in(run, simulator, recordings_of)
-    make_folder(vehicle_file.parent)
     if found is not None:
         write_vehicle(found.vehicle, vehicle_file, header=f"Effective in {simulator.title}.")
     Kept(of=key, effective=None if found is None else found.result).write(run.folder)

@@ -91,7 +91,7 @@ def export(
     target, into, out = target_of(asked.format), asked.into, asked.out
     own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
     if out is None or out.suffix:  # before anything is computed
-        check_file(out or into or inside(run.folder, own), folder_is_made=True)
+        check_file(out or into or inside(run.folder, own))
     target = target.for_simulator(asked.simulator, into)
     physical, (run, effective) = run, in_simulator(run, target)
     vehicle, decided = exported_vehicle(run, today)
@@ -223,7 +223,7 @@ def _places(draft: Draft, path: Path, into: Path | None) -> tuple[Path, dict[Pat
     file in a folder of the name of its own.
     """
     if into is None or path == into or not draft.others:
-        check_file(path, folder_is_made=True)
+        check_file(path)
         return path, {}
     if path.suffix:
         raise ExportError(
@@ -234,7 +234,7 @@ def _places(draft: Draft, path: Path, into: Path | None) -> tuple[Path, dict[Pat
     files = (into, *draft.others)
     places = {f: inside(path, f"{f.absolute().parent.name}/{f.name}") for f in files}
     for place in places.values():
-        check_file(place, folder_is_made=True)
+        check_file(place)
     return places.pop(into), places
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from tuner.core import shipped
-from tuner.core.disk import make_folder, whole_file
+from tuner.core.disk import whole_file
 from tuner.core.errors import ConfigError, ExportError, did_you_mean
 from tuner.core.files import read_bytes
 from tuner.exporters import targets
@@ -114,7 +114,6 @@ def write(draft: Draft, path: Path, others: Mapping[Path, Path] | None = None) -
     with ExitStack() as stack:
 
         def written(place: Path, text: str) -> Path:
-            make_folder(place.parent)
             unfinished = stack.enter_context(whole_file(place))
             unfinished.write_text(text, encoding="utf-8", newline="")
             return unfinished

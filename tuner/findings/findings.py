@@ -302,7 +302,7 @@ class Code(Worded):
         "Feed the attitude in (inlet: attitude), or log what the loop is told to do.",
     )
     HOLDING_BETTER = (
-        "holding_better",  # seconds, QUANTITY, QUANTITY_held; names: QUANTITYs
+        "holding_better",  # soonest, seconds, QUANTITY, QUANTITY_held; names: QUANTITYs
         sentences.holding_better,
         "Predict less far ahead, or with more recorded.",
     )

@@ -134,9 +134,10 @@ def holding_better(finding: Finding) -> str:
     some = listed([name.replace("_", " ") for name in names])
     what = "state" if set(names) == set(PREDICTED) else some
     it = "it" if len(names) in (1, len(PREDICTED)) else "them"
+    ahead = " to ".join(dict.fromkeys(f"{numbers[end]:g}" for end in ("soonest", "seconds")))
     return (
-        f"Holding its {what} predicts {it} better {numbers['seconds']:g} s ahead: the fitted "
-        f"coefficients miss {lost} in the mean."
+        f"Holding its {what} predicts {it} better {ahead} s ahead: the fitted coefficients then "
+        f"miss {lost} in the mean."
     )
 
 

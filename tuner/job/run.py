@@ -61,7 +61,12 @@ from tuner.search.rotor_change import used_up_to_changes
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import Examined, examined
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
-from tuner.uncertainty.estimates import finer_than_steps, flights_refute, terms_shown
+from tuner.uncertainty.estimates import (
+    NOT_WHAT_FLEW,
+    finer_than_steps,
+    flights_refute,
+    terms_shown,
+)
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import ground_conflicts, sources_of
 from tuner.uncertainty.model_error import lack_found
@@ -151,28 +156,21 @@ def run(
 
     physical = Run(folder=folder, result=written(), vehicle=vehicle)
     _write_flown(folder, validation, fitted)
-    flew = replace(job.settings, controller=controller_flown(job, fitted)), job.recordings
-    effective = explanation.part(
-        "effective coefficients",
-        lambda: effective_in(
-            physical,
-            GAZEBO_CLASSIC,
-            lambda _: flew,
-            on_message=listener.on_message,
-            on_progress=partial(_reporting(listener), job),
-        ),
-        None,
-    )
+    find = partial(_effective, physical, job, fitted, listener)
+    stops = selected.refuted  # no other answer, and no flight to plan
+    effective = None if stops else explanation.part("effective coefficients", find, None)
     next_log: tuple[LogProposal, ...] = ()
-    if examination is not None:
-        log = partial(what_to_log, job, fitted, examination.known, vehicle)
-        next_log = explanation.part("what to log", log, next_log)
+    if examination is not None and not stops:
+        next_log = explanation.part(
+            "what to log", partial(what_to_log, job, fitted, examination.known, vehicle), next_log
+        )
     result = written(effective, next_log)
     if options.cross_validate or options.bootstrap is not None:
         result = _with_refits((job, fitted), result, folder, options, listener)
     if examination is not None:
         of_fit = folder, job, examination, fitted
         explanation.part("knowledge", partial(write_knowledge, *of_fit), None)
+    if examination is not None and not stops:
         listener.on_message("Simulating which flight would be the most informative next.")
         explanation.part("next flight", partial(write_next_flight, *of_fit), None)
     explanation.part("exports", partial(_export, folder, settings, listener), None)
@@ -221,6 +219,7 @@ def _fitted(
             on_progress=on_progress,
             on_message=listener.on_message,
             on_estimates=listener.on_estimates,
+            on_doubt=listener.on_doubt,
             findings=findings,
         )
     except (KeyboardInterrupt, OutputError, EngineError):
@@ -229,6 +228,8 @@ def _fitted(
             f"Continue the search with --out {folder} --resume."
         )
         raise
+    if found.refuted:
+        listener.on_doubt(NOT_WHAT_FLEW)
     vehicle = vehicle_fitted(found.job, found.fitted)
     validation = _flown(found.job, found.fitted, vehicle, listener)
     rows = found.rows_given(found.fitted.held)
@@ -270,6 +271,18 @@ def _known(
     )
     explanation.notice(ground_conflicts(sources))
     return sources
+
+
+def _effective(physical: Run, job: Job, fitted: Fitted, listener: Listener) -> Effective | None:
+    """Return the effective coefficients in Gazebo, None where it has every term."""
+    flew = replace(job.settings, controller=controller_flown(job, fitted)), job.recordings
+    return effective_in(
+        physical,
+        GAZEBO_CLASSIC,
+        lambda _: flew,
+        on_message=listener.on_message,
+        on_progress=partial(_reporting(listener), job),
+    )
 
 
 def _write_flown(folder: Path, validation: Validation, fitted: Fitted) -> None:

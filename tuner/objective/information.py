@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim_jax.inlet import ReferenceInlet
 from tuner.core.numerics import Array, Inverse, huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
-from tuner.objective.normal_equations import Objective
+from tuner.objective.normal_equations import Objective, portions
 from tuner.objective.residuals import is_steady
 from tuner.objective.space import Space
 from tuner.vehicle import COEFFICIENTS
@@ -213,6 +213,12 @@ class FisherInformation:
         if self.ground is not None:
             beside = beside + self.ground
         return beside if self.lost is None else beside - self.lost
+
+
+def are_refuting(objective: Objective, point: Point, criterion: Criterion) -> bool:
+    """Return whether the flights contradict a fit, as of `FisherInformation.refuted`."""
+    parts = [information_at(*batch) for _, batch in portions(objective, point, criterion)]
+    return FisherInformation.joined(parts).refuted
 
 
 def _summed(parts: Sequence[Array | None]) -> Array | None:

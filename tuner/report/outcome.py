@@ -28,11 +28,9 @@ UNCHANGED = 0.8
 """Share of what it was above which an error is called unchanged."""
 Errors = tuple[float | None, float | None, float | None]
 """Before and after a fit, and of the noise."""
-OTHER_INPUTS = frozenset(
+NOT_FLOWN = frozenset(
     {
         Code.VEHICLE_NOT_GIVEN,
-        Code.MASS_NOT_GIVEN,
-        Code.SAME_RECORDING,
         Code.WRONG_VEHICLE,
         Code.CANNOT_HOVER,
         Code.MOTOR_ORDER,
@@ -41,6 +39,8 @@ OTHER_INPUTS = frozenset(
         Code.SETPOINTS_SCALED,
     }
 )
+"""Warnings of vehicles and controllers that did not fly, on which a simulation may fail."""
+OTHER_INPUTS = NOT_FLOWN | {Code.MASS_NOT_GIVEN, Code.SAME_RECORDING}
 """Warnings that what was given is not what flew: all numbers follow from that."""
 CAUSES = OTHER_INPUTS | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS}
 """Warnings that say why others arise."""
@@ -150,11 +150,13 @@ def outcome(result: RunResult, bench: BenchRecord | None = None) -> Outcome:
 
 
 def by_weight(findings: Sequence[Finding]) -> list[Finding]:
-    """Return failures and warnings: failures first, causes, then what doubts the numbers."""
+    """Return failures and warnings: why a fit fails first, causes, then what doubts the numbers."""
     found = [finding for finding in findings if finding.level != "info"]
+    refuted = any(finding.code is Code.FLIGHTS_REFUTE for finding in found)
 
     def weight(finding: Finding) -> tuple[bool, ...]:
-        return finding.level != "failure", *(finding.code not in w for w in (CAUSES, DOUBTS))
+        kinds = (finding.code not in codes for codes in (CAUSES, DOUBTS))
+        return not (refuted and finding.code in NOT_FLOWN), finding.level != "failure", *kinds
 
     return sorted(found, key=weight)
 

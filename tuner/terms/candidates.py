@@ -222,6 +222,8 @@ class Selected:
         and not kept; empty where none was tried.
     base
         Job and fit without any of them; None where none was tried.
+    refuted
+        Whether its flights contradict the fit: neither terms nor disturbances explain those.
     """
 
     job: Job
@@ -229,6 +231,7 @@ class Selected:
     rows: tuple[SelectionRow, ...] = ()
     in_doubt: Mapping[str, float] = field(default_factory=dict)
     base: tuple[Job, Fitted] | None = None
+    refuted: bool = False
 
     @property
     def kept(self) -> tuple[str, ...]:

@@ -60,7 +60,9 @@ def examined(
     others.
     """
     follow = partial(with_disturbances, on_progress=on_progress, on_message=on_message)
-    followed = explanation.part("disturbances", partial(follow, selected), None)
+    followed = None
+    if not selected.refuted:
+        followed = explanation.part("disturbances", partial(follow, selected), None)
     if followed is not None and (
         refuted := set(refuted_by_commands(*followed[:2])).difference(selected.kept)
     ):

@@ -14,6 +14,7 @@ from tuner.core.spans import span
 from tuner.evaluate.validation import point_estimates
 from tuner.findings.findings import Finding
 from tuner.objective.battery import require_voltage
+from tuner.objective.information import are_refuting
 from tuner.objective.initial_conditions import rests
 from tuner.objective.inlets import INLETS
 from tuner.objective.space import extended
@@ -24,7 +25,7 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected, candidate_groups, groups_around, groups_named, start_of
 from tuner.terms.selection import Selection
-from tuner.uncertainty.model_error import GAINS, gain_told, lack_of
+from tuner.uncertainty.model_error import GAINS, gain_told, gains_far_off, lack_of
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.selection_table import Groups, SelectionCode
 
@@ -104,13 +105,15 @@ def search_with_terms(
     on_progress: OnProgress,
     on_message: Callable[[str], None],
     on_estimates: Callable[[Sequence[PointEstimate]], None] = lambda _: None,
+    on_doubt: Callable[[Finding], None] = lambda _: None,
     findings: tuple[Finding, ...] = (),
 ) -> Selected:
     """Look for the best coefficients of a job, and for the terms that its flights call for.
 
     Where most flights are far off, terms are tried before the base model is polished, and before
-    CMA-ES looks for another beginning. Arguments and errors are those of `search`; between the two,
-    ``on_estimates`` gets where it ended, unless it has stopped because the model is far off.
+    CMA-ES looks for another beginning; where flights contradict the fit, none is. Arguments and
+    errors are those of `search`; between the two, ``on_estimates`` gets where it ended, or, if it
+    has stopped because the model is far off, ``on_doubt`` what recorded commands say of gains.
     """
 
     def searched(*, resume: bool, provisional: bool) -> Selected:
@@ -125,13 +128,25 @@ def search_with_terms(
             )
         if fitted.polished:
             on_estimates(point_estimates(job, fitted))
+        if _is_refuted(fitted):
+            return Selected(job, fitted, refuted=True)
+        if not fitted.polished:
+            for finding in gains_far_off(fitted, job.fitted):
+                on_doubt(finding)
         with span("selection of terms"):
-            return with_terms_selected(job, fitted, on_progress, on_message)
+            selected = with_terms_selected(job, fitted, on_progress, on_message)
+        return replace(selected, refuted=_is_refuted(selected.fitted))
 
     selected = searched(resume=resume, provisional=bool(candidates_of(job)))
     if selected.fitted.polished:
         return selected
     return searched(resume=True, provisional=False)
+
+
+def _is_refuted(fitted: Fitted) -> bool:
+    if fitted.residuals_at_noise_level:
+        return False
+    return are_refuting(fitted.objective, fitted.point, fitted.criterion)
 
 
 def with_terms_selected(

@@ -310,12 +310,15 @@ def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
     return (Finding(Code.FINER_THAN_STEPS, "warning", ", ".join(names), numbers),)
 
 
+NOT_WHAT_FLEW = Finding(Code.FLIGHTS_REFUTE, "failure", "the fitted vehicle")
+
+
 def flights_refute(uncertainty: Uncertainty) -> tuple[Finding, ...]:
     """Say that the fitted vehicle is not the one that flew, where its flights show that."""
     reasons = (estimate.reason.code for estimate in uncertainty.estimates.values())
     if ReasonCode.REFUTED not in reasons:
         return ()
-    return (Finding(Code.FLIGHTS_REFUTE, "failure", "the fitted vehicle"),)
+    return (NOT_WHAT_FLEW,)
 
 
 TERMS_SHOWN = (

@@ -65,6 +65,8 @@ SMALLEST = 0.03
 """Share of what varies along an axis below which a law is none to speak of."""
 
 
+FAR_OFF = 1.3
+"""Factor on a gain from which it is another controller's, and not its file's with the battery's."""
 GAINS = {"rate_gain_roll_pitch": ("roll", "pitch"), "rate_gain_yaw": ("yaw",)}
 """Coefficient -> axes of the rate controller whose gains it scales."""
 
@@ -319,8 +321,27 @@ def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ..
         if moved and abs(law.share) > SMALLEST
     ]
     heard = [one for one in lack.answers if one.part != "late" or abs(one.value) > WITHIN_PERIOD]
-    parts = {part: [one for one in heard if one.part == part] for part in PARTS}
-    controller = [
+    if abs(lack.late) > LATE:
+        numbers = {"seconds": lack.late}
+        laws.insert(0, Finding(Code.ROTOR_SPEEDS_LATE, "warning", "rotor speeds", numbers))
+    return (*_said_of_controller(heard), *laws)
+
+
+def gains_far_off(fitted: Fitted, flights: Sequence[Flight]) -> tuple[Finding, ...]:
+    """Return which gains of the controller file cannot be those that flew, by recorded commands.
+
+    They tell that beside any fit; arguments are those of `lack_of`.
+    """
+    lack = lack_of(fitted, flights)
+    answers = () if lack is None else lack.answers
+    return _said_of_controller(
+        [one for one in answers if one.part != "late" and not 1.0 / FAR_OFF < one.value < FAR_OFF]
+    )
+
+
+def _said_of_controller(answers: Sequence[Answer]) -> tuple[Finding, ...]:
+    parts = {part: [one for one in answers if one.part == part] for part in PARTS}
+    return tuple(
         Finding(
             Code.CONTROLLER_ANSWERS,
             "warning",
@@ -334,11 +355,7 @@ def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ..
         )
         for part, those in parts.items()
         if those
-    ]
-    if abs(lack.late) > LATE:
-        numbers = {"seconds": lack.late}
-        laws.insert(0, Finding(Code.ROTOR_SPEEDS_LATE, "warning", "rotor speeds", numbers))
-    return (*controller, *laws)
+    )
 
 
 def _answering(gains: RateGains, answer: Answer) -> RateGains:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sim_jax.constants import GRAVITY
-from tuner.core.disk import check_file, make_folder, write_text
+from tuner.core.disk import check_file, write_text
 from tuner.core.runtime import PROGRAM, installed
 from tuner.core.shipped import configs_folder
 from tuner.core.yaml_document import commented, dump_yaml
@@ -183,9 +183,9 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
     OutputError
         A file cannot be written.
     """
-    check_file(out, folder_is_made=True)
+    check_file(out)
     job = out.with_name(f"{out.stem}.job.yaml")
-    check_file(job, folder_is_made=True)
+    check_file(job)
     template = read_vehicle(configs_folder() / "vehicles" / "hovergames_updated.yaml")
     if like is None:
         estimates = coefficients_of(airframe)
@@ -194,7 +194,6 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
         known = read_vehicle(configs_folder() / "vehicles" / f"{name}.yaml")
         estimates = anchored(airframe, like, values_of(known))
     vehicle = _vehicle(template, airframe, estimates, out.stem)
-    make_folder(out.parent)
     write_vehicle(vehicle, out, header=HEADER.format(priors=job.name))
     text = dump_yaml(_job(out, airframe, estimates))
     write_text(job, commented(f"Priors of {out.name}.") + text)

@@ -18,8 +18,8 @@ COMPARE = ("compare", "--flights", "{bag}", "--vehicle", "hovergames")
 SIMULATE = ("simulate", "--trajectory", "hover", "--duration", "4")
 EXPORT = ("export", "{lab}/run", "--format")
 
-INSIDE, NO_FOLDER = "it lies inside a file", "its folder does not exist"
-A_FILE, A_FOLDER, TOO_LONG = "it is a file", "it is a folder", "path is too long"
+INSIDE, TOO_LONG = "it lies inside a file", "path is too long"
+A_FILE, A_FOLDER = "it is a file", "it is a folder"
 
 OUT = [
     *((command, "{bag}/x", INSIDE) for command in (TUNE, SENSITIVITY)),
@@ -30,7 +30,6 @@ OUT = [
     ((*TUNE, "--resume"), "{lab}/new", "nothing to resume"),
     ((*TUNE, "--resume"), "{bag}", A_FILE),
     *((command, "{bag}/x.csv", INSIDE) for command in (COMPARE, SIMULATE)),
-    *((command, "{lab}/new/x.csv", NO_FOLDER) for command in (COMPARE, SIMULATE)),
     *((command, "{lab}/folder.csv", A_FOLDER) for command in (COMPARE, SIMULATE)),
     *((command, f"{LONG}.csv", TOO_LONG) for command in (COMPARE, SIMULATE)),
     *((command, "{lab}/locked/x.csv", "may not write") for command in (COMPARE, SIMULATE)),
@@ -103,6 +102,13 @@ def refused(arguments, expected, lab, capsys):
 @pytest.mark.parametrize(("command", "place", "expected"), OUT)
 def test_a_place_that_cannot_be_written_to(command, place, expected, lab, capsys):
     refused((*command, "--out", place), expected, lab, capsys)
+
+
+@pytest.mark.parametrize("command", [COMPARE, SIMULATE])
+def test_a_folder_that_does_not_exist_is_made(command, lab):
+    words = [word.format(bag=lab / "spin.bag") for word in command]
+    assert main([*words, "--out", str(lab / "new" / "runs" / "x.csv")]) == 0
+    assert (lab / "new" / "runs" / "x.csv").is_file()
 
 
 @pytest.mark.parametrize(("command", "expected"), IN)

@@ -151,7 +151,7 @@ MADE = {
         Code.HOLDING_BETTER,
         "warning",
         "a",
-        {"seconds": 0.1, "body_rate": 1.2, "body_rate_held": 0.9},
+        {"soonest": 0.1, "seconds": 0.1, "body_rate": 1.2, "body_rate_held": 0.9},
         ("body_rate",),
     ),
     Code.INPUT_LATE: Finding(Code.INPUT_LATE, "info", "a", {"seconds": 0.012}),
@@ -276,13 +276,13 @@ def test_a_lag_is_of_what_comes_late(lag: float, says: str) -> None:
 @pytest.mark.parametrize(
     ("names", "says"),
     [
-        (("attitude",), "Holding its attitude predicts it better 0.5 s ahead"),
+        (("attitude",), "Holding its attitude predicts it better 0.1 to 0.5 s ahead"),
         (("velocity", "body_rate"), "Holding its velocity and body rate predicts them better"),
         (tuple(PREDICTED), "Holding its state predicts it better"),
     ],
 )
 def test_what_is_predicted_worse_than_held_is_named(names: tuple[str, ...], says: str) -> None:
-    numbers = {"seconds": 0.5} | dict.fromkeys(names, 0.08)
+    numbers = {"soonest": 0.1, "seconds": 0.5} | dict.fromkeys(names, 0.08)
     numbers |= {f"{name}_held": 0.0663 for name in names}
     found = sentence(Finding(Code.HOLDING_BETTER, "warning", "a", numbers, names))
     assert found.startswith(says)

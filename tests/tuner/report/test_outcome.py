@@ -120,6 +120,9 @@ def test_what_doubts_the_numbers_comes_before_what_does_not():
     failure = Finding(Code.NOT_FINITE, "failure", "e")
     said = warnings_of((info, gap, doubt, other, cause, failure))
     assert [warning.link for warning in said] == ["e", "d", "rate_gain", "c", "a"]
+    refuted = Finding(Code.FLIGHTS_REFUTE, "failure", "e")
+    said = warnings_of((gap, doubt, other, cause, refuted))
+    assert [warning.link for warning in said] == ["d", "e", "rate_gain", "c", "a"]
 
 
 def test_the_flight_to_hold_out_is_the_one_that_tells_least_and_never_the_only_one(

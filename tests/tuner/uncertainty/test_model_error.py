@@ -32,7 +32,7 @@ from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import with_terms
 from tuner.uncertainty.examination import examine
-from tuner.uncertainty.model_error import Lack, alternatives_of, lack_found, lack_of
+from tuner.uncertainty.model_error import Lack, alternatives_of, gains_far_off, lack_found, lack_of
 from tuner.vehicle import with_values
 from tuner.vehicle.model import model_of, schedule_of
 
@@ -299,16 +299,32 @@ def test_commands_that_were_recorded_between_two_ticks_are_those_that_hold():
     assert lack_of(making.fitted_of(objective, making.truth(objective)), flights) is None
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.06])
-def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
-    """Flights of a P that is not the file's, whose set-points and commands were recorded."""
+def flown_with_p(factor):
+    """Return a fit at the truth of flights whose P is so many times the file's, and the flights."""
     truth, fitted_to = problem({}), problem({})
     rate = truth.model.controller.rate
     p = replace(rate.p, x=factor * rate.p.x, y=factor * rate.p.y)
     model = eqx.tree_at(lambda m: m.controller.rate.p, truth.model, p)
     measured, flights = flown(replace(truth, model=model), 0, loop=True)
     objective = replace(fitted_to, segments=replace(fitted_to.segments, measured=measured))
-    fitted = fitted_at(objective, making.truth(objective), flights)
+    return fitted_at(objective, making.truth(objective), flights), flights
+
+
+@pytest.mark.parametrize("factor", [1.06, 1.5])
+def test_a_gain_that_is_far_off_is_told_beside_the_fit(factor):
+    said = gains_far_off(*flown_with_p(factor))
+    if factor < 1.3:
+        assert not said
+        return
+    (found,) = (one for one in said if one.names[0] == "P")
+    assert found.names[1:] == ("roll", "pitch")
+    assert found.numbers["roll"] == pytest.approx(factor, abs=0.05)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.06])
+def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
+    """Flights of a P that is not the file's, whose set-points and commands were recorded."""
+    fitted, flights = flown_with_p(factor)
     lack = lack_of(fitted, flights)
     if factor == 1.0:
         assert lack is None

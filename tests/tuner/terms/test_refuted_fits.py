@@ -1,0 +1,62 @@
+"""Searches that end where the vehicle does not fly what was recorded: nothing is made of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from tests.tuner.terms.making import unfitted_with
+from tuner.search.explanation import Explanation
+from tuner.search.progress import COLOURED, Fitted
+from tuner.terms import refit_with_disturbances, search_with_terms
+from tuner.terms.candidates import Selected
+
+
+def ended_with(thrust: float, monkeypatch: pytest.MonkeyPatch) -> tuple[Selected, list[str]]:
+    """Return what a search comes to that ends with so much of the thrust, and what it tried."""
+    job, start = unfitted_with(0.0, seed=0)
+    space, tried = job.space, list[str]()
+    values = space.numbers(start.point.coefficients)
+    values["motor_constant"] *= thrust
+    point = start.objective.start(space.vector_of(values))
+    scales = {name: {"position": 2.0 * COLOURED} for name in start.scales}
+    end = replace(start, point=point, scales=scales)
+
+    def selecting(job: Any, fitted: Fitted, *_: Any) -> Selected:
+        tried.append("terms")
+        return Selected(job, fitted)
+
+    monkeypatch.setattr(search_with_terms, "search", lambda *_, **__: end)
+    monkeypatch.setattr(search_with_terms, "point_estimates", lambda *_: ())
+    monkeypatch.setattr(search_with_terms, "with_terms_selected", selecting)
+    found = search_with_terms.search_with_terms(
+        job,
+        cast(Path, None),
+        resume=False,
+        on_progress=lambda *_: None,
+        on_message=lambda _: None,
+    )
+    return found, tried
+
+
+@pytest.mark.parametrize(("thrust", "flies"), [(1.0, True), (0.3, False)])
+def test_neither_terms_nor_disturbances_explain_a_vehicle_that_falls(thrust, flies, monkeypatch):
+    found, tried = ended_with(thrust, monkeypatch)
+    assert found.refuted is not flies
+    assert tried == (["terms"] if flies else [])
+
+    def following(*_: Any, **__: Any) -> None:
+        tried.append("disturbances")
+
+    held = SimpleNamespace()
+    monkeypatch.setattr(refit_with_disturbances, "with_disturbances", following)
+    monkeypatch.setattr(
+        refit_with_disturbances, "with_undetermined_held", lambda *_, **__: (found.fitted, held)
+    )
+    silent = (lambda *_: None), (lambda _: None), Explanation(lambda _: None)
+    assert refit_with_disturbances.examined(found, *silent) == (found, found.fitted, held)
+    assert tried == (["terms", "disturbances"] if flies else [])
