@@ -96,10 +96,10 @@ def _origins(result: RunResult) -> list[str]:
 
 
 def _warnings(result: RunResult) -> list[Text]:
-    from tuner.findings.findings import brief
+    from tuner.findings.findings import brief, with_alike_together
     from tuner.report.outcome import by_weight
 
-    found = by_weight(result.findings)
+    found = with_alike_together(by_weight(result.findings))
     lines = [Text(f"! {brief(one, WIDTH - 2)}", "yellow") for one in found[:MOST_WARNINGS]]
     if len(found) > MOST_WARNINGS:
         more = f"! {len(found) - MOST_WARNINGS} more warnings are in the report."

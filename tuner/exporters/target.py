@@ -243,7 +243,11 @@ def not_carried(vehicle: VehicleFile, target: Target) -> tuple[str, ...]:
     for name, value in values_of(vehicle).items():
         row = COEFFICIENTS[name]
         entry = target.simulator.entry(row)
-        if isinstance(entry, NotCarried) and value not in (row.neutral, entry.built_in):
+        if not isinstance(entry, NotCarried):
+            continue
+        same = (at for at in (row.neutral, entry.built_in) if at is not None)
+        # a bound is reached to the last digits
+        if not any(math.isclose(value, at, abs_tol=1e-9 * row.step) for at in same):
             sentences.append(f"{name} {quantity(value, row)} is not exported: {entry.reason}")
     return tuple(sentences)
 

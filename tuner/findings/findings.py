@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from tuner.core.phrases import Worded, as_sentence, listed, percent, shorten
@@ -26,6 +26,7 @@ GIVE_VEHICLE = (
     "propellers."
 )
 
+NUMBER = re.compile(r"[-+]?[0-9.]*[0-9](?:e[-+]?[0-9]+)?")
 LEAST_SAID = 55
 """Letters of what was noticed that stay in a short line."""
 CLAUSE = re.compile(r"[;.] | \(|, (?=and|as|at|or|if)|: (?!false|true)(?=[a-z0-9]+ )")
@@ -537,6 +538,21 @@ def remedy(finding: Finding) -> str:
 def one_line(finding: Finding) -> str:
     """Return a finding as one line of a terminal."""
     return f"{finding.level}: {finding.subject}: {sentence(finding)} {remedy(finding)}".rstrip()
+
+
+def with_alike_together(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings with those that say the same of several subjects, but for numbers, as one.
+
+    Its numbers are those of the first.
+    """
+    alike: dict[tuple[object, ...], list[Finding]] = {}
+    for finding in findings:
+        said = NUMBER.sub("", CLAUSE.split(sentence(finding))[0])
+        alike.setdefault((finding.code, finding.level, said), []).append(finding)
+    return [
+        replace(same[0], subject=", ".join(dict.fromkeys(one.subject for one in same)))
+        for same in alike.values()
+    ]
 
 
 def brief(finding: Finding, width: int) -> str:

@@ -76,17 +76,19 @@ def salvaged(finding: Finding) -> str:
 def inlet_chosen(finding: Finding) -> str:
     """Return why a flight enters further down the loop than it was recorded for."""
     inlet, signal, *order = finding.names
-    what = signal.replace("_", " ")
-    followed = {
-        "attitude": "its recorded attitude is followed and only its translation simulated",
-        "rotor_speed": "it is simulated from its rotor speeds",
-    }[inlet]
+    numbers = finding.numbers
     read = " in the order in which it is read" if order else ""
-    return (
-        f"The {what}, logged at {finding.numbers['recorded']:.0f} Hz, does not explain how the "
-        f"vehicle turned{read} (correlation {finding.numbers['correlation']:.2f} with its angular "
-        f"acceleration), so that {followed}."
+    unexplained = (
+        f"the {signal.replace('_', ' ')}, logged at {numbers['recorded']:.0f} Hz, does not explain "
+        f"how the vehicle turned{read} (correlation {numbers['correlation']:.2f} with its angular "
+        "acceleration), so that"
     )
+    if inlet == "attitude":
+        return (
+            f"Nothing of its turning is fitted: {unexplained} its recorded attitude is followed "
+            "and only its translation simulated."
+        )
+    return as_sentence(f"{unexplained} it is simulated from its rotor speeds")
 
 
 def inlet_remedy(finding: Finding) -> str:

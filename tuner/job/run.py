@@ -33,7 +33,7 @@ from tuner.evaluate.validation import (
 from tuner.exporters.effective import Effective, effective_in
 from tuner.exporters.export import exports_of_job
 from tuner.exporters.simulators import GAZEBO_CLASSIC
-from tuner.findings.findings import Finding, remedy, sentence
+from tuner.findings.findings import Finding, remedy, sentence, with_alike_together
 from tuner.job.accelerations import with_accelerations
 from tuner.job.check import check_information, check_recordings
 from tuner.job.listener import SILENT, Listener
@@ -349,9 +349,9 @@ def _check(
     Where what was given is not what flew, the search may take long to fail.
     """
     explanation.tell(findings)
-    for finding in findings:
-        if finding.level == "warning" and finding.code in OTHER_INPUTS:
-            listener.on_doubt(finding)
+    other = (one for one in findings if one.level == "warning" and one.code in OTHER_INPUTS)
+    for finding in with_alike_together(other):
+        listener.on_doubt(finding)
     failure = next((finding for finding in findings if finding.level == "failure"), None)
     if failure is not None and not force:
         what, to_do = clause(sentence(failure)), clause(remedy(failure))

@@ -42,7 +42,7 @@ NOT_FLOWN = frozenset(
 """Warnings of vehicles and controllers that did not fly, on which a simulation may fail."""
 OTHER_INPUTS = NOT_FLOWN | {Code.MASS_NOT_GIVEN, Code.SAME_RECORDING}
 """Warnings that what was given is not what flew: all numbers follow from that."""
-CAUSES = OTHER_INPUTS | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS}
+CAUSES = OTHER_INPUTS | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS, Code.INLET_CHOSEN}
 """Warnings that say why others arise."""
 DOUBTS = OTHER_INPUTS | frozenset(
     {

@@ -13,7 +13,7 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
 from tuner.equation_error.recorded_accelerations import Steps, rows_of, steps_of
 from tuner.equation_error.regression import convolved, summing
-from tuner.findings.findings import Code, Finding
+from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.inlets import INLETS
 from tuner.objective.rotor_signals import Explained, Source, explained, levers, motor_order
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
@@ -149,7 +149,8 @@ def _finding(flight: Flight, inlet: InletName, doubt: Explained, vehicle: Vehicl
     span = (0.0, flight.duration)
     order = motor_order(flight.series, vehicle, doubt.source, span)
     why = () if order is None or order.is_right else ("order",)
-    return Finding(Code.INLET_CHOSEN, "info", flight.name, numbers, (inlet, doubt.source, *why))
+    level: Level = "warning" if inlet == "attitude" else "info"
+    return Finding(Code.INLET_CHOSEN, level, flight.name, numbers, (inlet, doubt.source, *why))
 
 
 def inlet_for(flight: Flight, requested: str) -> InletName:

@@ -237,13 +237,14 @@ def test_what_has_no_tag_is_said(vehicle):
     vehicle = vehicle.replace(
         motor=vehicle.motor.replace(quadratic=-50.0),
         aerodynamics=vehicle.aerodynamics.replace(max_relative_airspeed=20.0),
-        setup=vehicle.setup.replace(estimate_latency=0.012),
+        setup=vehicle.setup.replace(estimate_latency=0.012, actuator_latency=3.3e-16),
     )
     draft = sdf_draft(CLASSIC, vehicle, "by a test")
     notes = " / ".join(not_carried(vehicle, TARGET))
     assert "quadratic -50 rad/s is not exported: the control channels map" in notes
     assert "25 m/s built in" in notes
     assert "estimate_latency 0.012 s is not exported: it belongs to the set-up" in notes
+    assert "actuator_latency" not in notes
     assert draft.vehicle.motor.quadratic == 0
     assert draft.vehicle.aerodynamics.max_relative_airspeed == 25
 

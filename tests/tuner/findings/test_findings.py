@@ -2,7 +2,15 @@
 
 import pytest
 
-from tuner.findings.findings import Code, Finding, one_line, remedy, sentence
+from tuner.findings.findings import (
+    Code,
+    Finding,
+    brief,
+    one_line,
+    remedy,
+    sentence,
+    with_alike_together,
+)
 from tuner.findings.sentences import PREDICTED
 
 #: What each code's maker gives beside it.
@@ -287,3 +295,14 @@ def test_what_is_predicted_worse_than_held_is_named(names: tuple[str, ...], says
     found = sentence(Finding(Code.HOLDING_BETTER, "warning", "a", numbers, names))
     assert found.startswith(says)
     assert found.count("instead of 0.0663") == len(names)
+
+
+def test_what_holds_of_several_flights_but_for_numbers_is_said_once():
+    def scaled(flight, axis, gain):
+        numbers = {"gain": gain, "correlation": 0.9}
+        return Finding(Code.SETPOINTS_SCALED, "warning", flight, numbers, (axis, ""))
+
+    roll, pitch = scaled("a", "roll", 0.23), scaled("a", "pitch", 0.23)
+    said = with_alike_together([roll, pitch, scaled("b", "roll", 0.25), scaled("b", "roll", 2.0)])
+    assert [(one.subject, one.names[0]) for one in said] == [("a, b", "roll"), ("a", "pitch")]
+    assert brief(said[0], 98).startswith("a and 1 more: Roll rate set-points are 0.2 times")

@@ -78,6 +78,8 @@ def test_auto_follows_the_attitude_where_commands_explain_no_turn(sparse, update
     assert inlet == "attitude"
     assert because.code is Code.INLET_CHOSEN
     line = one_line(because)
+    assert "Nothing of its turning is fitted: the command" in line
+    assert because.level == "warning"
     assert "command, logged at 45 Hz, does not explain how the vehicle turned" in line
     assert "its recorded attitude is followed" in line
     assert line.endswith("Log the command as often as its loop runs.")
