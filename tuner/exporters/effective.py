@@ -230,7 +230,7 @@ def fitted_in(
             stages,
             progress,
             free=Free(moves, none),
-            undecided=(),
+            undecided={},
             on_progress=on_progress,
         )
 

@@ -7,7 +7,7 @@ minimum. Noise is inflated at first, since the model is still wrong by more than
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -53,13 +53,15 @@ MATERIAL = 0.01
 RIDGE = 1e-12
 """Added to a Hessian of unit diagonal."""
 SWITCH_GAIN = 1.2
-"""The controller file's own choice is given up only for one that lowers the loss by this factor."""
+"""The controller file's own choice is given up only for one that lowers the loss of the flights
+that tell by this factor."""
 FROM_START = ("sees_markers",)
 """Choices that the markers' coefficients take up while a hover is all that is seen: the other way
 is tried from where the search began. From markers that meet a hover as it did not fly, it flies
 worse than the wrong way, and no step leads out."""
 
 OnProgress = Callable[[Progress], None]
+Undecided = Mapping[str, NDArray[np.bool_]]
 
 
 def grow(
@@ -68,7 +70,7 @@ def grow(
     progress: Progress,
     *,
     free: Free,
-    undecided: Sequence[str],
+    undecided: Undecided,
     on_progress: OnProgress,
     seed: int = 0,
     worth_polishing: Callable[[Progress], bool] = lambda _: True,
@@ -87,7 +89,7 @@ def grow(
     free
         What may move.
     undecided
-        The choices of a `Loop` that are tried both ways.
+        The choices of a `Loop` that are tried both ways, and the flights that tell.
     on_progress
         Called after every iteration with where the search then stands.
     seed
@@ -124,19 +126,25 @@ class _Search:
 
     def run(self, stage: Stage, progress: Progress, *, last: bool) -> Progress:
         """Run one stage to its end for every start at once."""
+        return _finished(*self.stepped(stage, progress, last=last))
+
+    def stepped(
+        self, stage: Stage, progress: Progress, *, last: bool
+    ) -> tuple[StageProblem, Progress]:
+        """Return a stage's problem, and where its last step led."""
         problem = _problem(self, stage, progress, last=last)
         for iterate in islice(OPTIMISERS[stage.optimiser](problem), stage.steps):
             progress = _advanced(problem, progress, iterate)
             self.on_progress(progress)
             if iterate.converged:
                 break
-        return _finished(problem, progress)
+        return problem, progress
 
     def decided(
         self,
         stage: Stage,
         progress: Progress,
-        choices: Sequence[str],
+        choices: Undecided,
         start: Progress,
         before: Sequence[Stage],
         *,
@@ -146,10 +154,9 @@ class _Search:
 
         Choices of `FROM_START` go through the stages before it too, from the start.
         """
-        best = self.run(stage, progress, last=last)
-        for choice in choices:
+        best = self.stepped(stage, progress, last=last)
+        for choice, tell in choices.items():
             begin, earlier = (start, before) if choice in FROM_START else (progress, ())
-            evaluations = best.evaluations
 
             def on_progress(rival: Progress, begin: Progress = begin) -> None:
                 # a checkpoint begins with all of them again
@@ -164,14 +171,24 @@ class _Search:
                 self.on_progress(shown)
 
             other = replace(self, on_progress=on_progress)
-            rival = replace(begin, loop=best.loop.switched(choice))
+            switched = replace(begin, loop=best[1].loop.switched(choice))
             for one in earlier:
-                rival = other.run(one, rival, last=False)
-            rival = other.run(stage, rival, last=last)
-            evaluations += rival.evaluations - begin.evaluations
-            better = best if best.losses.min() <= SWITCH_GAIN * rival.losses.min() else rival
-            best = replace(better, evaluations=evaluations)
-        return best
+                switched = other.run(one, switched, last=False)
+            rival = other.stepped(stage, switched, last=last)
+            evaluations = best[1].evaluations + rival[1].evaluations - begin.evaluations
+            own, others = (_loss_of(tell, *end) for end in (best, rival))
+            problem, end = best if own <= SWITCH_GAIN * others else rival
+            best = problem, replace(end, evaluations=evaluations)
+        return _finished(*best)
+
+
+def _loss_of(flights: NDArray[np.bool_], problem: StageProblem, progress: Progress) -> float:
+    """Return the loss of some flights (N,) after a step, priors left out."""
+    iterate = progress.iterate
+    assert iterate is not None, "a stage takes at least one step"
+    assert iterate.sums is not None, "normal equations have been solved"
+    losses = np.asarray(iterate.sums.loss)[int(np.argmin(iterate.losses))]
+    return float(losses[flights[np.asarray(problem.objective.segments.flight)]].sum())
 
 
 def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -> StageProblem:

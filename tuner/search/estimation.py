@@ -26,7 +26,7 @@ from tuner.objective.criterion import Point
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
-from tuner.search.continuation import grow
+from tuner.search.continuation import Undecided, grow
 from tuner.search.findings import findings_at, unmatched
 from tuner.search.iteration import Iteration, Outcome
 from tuner.search.levenberg_marquardt import LEAST_DAMPING
@@ -313,7 +313,7 @@ def _through_windows(job: Job, starts: Array, free: Free) -> Array:
         stages_of(job, job.windows)[:-1],
         beginning(job.windows, starts),
         free=free,
-        undecided=(),
+        undecided={},
         on_progress=lambda _: None,
     )
     return np.asarray(progress.points.coefficients)
@@ -402,7 +402,7 @@ def polished(
         progress,
         [_rough(stage, left) for stage in stages_of(job, fitted.objective)[stages]],
         free=free,
-        undecided=(),
+        undecided={},
         title=title,
         on_progress=on_progress,
     )
@@ -456,7 +456,7 @@ def _grown(
     stages: Sequence[Stage],
     *,
     free: Free,
-    undecided: Sequence[str],
+    undecided: Undecided,
     title: str,
     on_progress: Callable[[Progress], None],
 ) -> Fitted:

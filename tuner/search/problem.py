@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_jax.state import AIRBORNE, Limits
 from tuner.config import CHANNELS, JobFile, Settings
@@ -94,22 +95,24 @@ class Job:
         """Where each fitted flight enters the simulated loop."""
         return tuple(recording.inlet for recording in self.recordings if not recording.holdout)
 
-    def undecided(self, objective: Objective) -> tuple[str, ...]:
+    def undecided(self, objective: Objective) -> dict[str, NDArray[np.bool_]]:
         """Return the choices of a `Loop` that matter to a problem of this job.
 
-        Where no rotor was clipped nothing saturates, and where the markers sit at the centre of
-        mass and along the body's axes it is the same who sees them.
+        And which of its N flights tell. Where no rotor was clipped nothing saturates, and where the
+        markers sit at the centre of mass and along the body's axes it is the same who sees them.
         """
-        commands = [flight.signals["command"] for flight in self.fitted if flight.has("command")]
+        marked = any(
+            name.startswith("marker_")
+            for name in (*objective.model.vehicle.effects, *objective.space.names)
+        )
         matters = {
-            "saturation_feedback": any((rows < CLIPPED).any() for rows in commands),
-            "sees_markers": any(INLETS[inlet].closed_loop for inlet in self.inlets)
-            and any(
-                name.startswith("marker_")
-                for name in (*objective.model.vehicle.effects, *objective.space.names)
-            ),
+            "saturation_feedback": [
+                flight.has("command") and bool((flight.signals["command"] < CLIPPED).any())
+                for flight in self.fitted
+            ],
+            "sees_markers": [marked and INLETS[inlet].closed_loop for inlet in self.inlets],
         }
-        return tuple(choice for choice, flown in matters.items() if flown)
+        return {choice: np.array(tell) for choice, tell in matters.items() if any(tell)}
 
 
 def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:

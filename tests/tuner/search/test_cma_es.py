@@ -34,7 +34,7 @@ def evolved(fit, *, seed, free=None):
         (stage,),
         beginning(fit, start[None]),
         free=free,
-        undecided=(),
+        undecided={},
         on_progress=reports.append,
         seed=seed,
     )

@@ -29,7 +29,7 @@ def searched(fit, vectors, *, offsets=False):
     reports = []
     free = Free(np.ones(len(fit.space), bool), np.full((len(OFFSETS), 2), offsets))
     progress = beginning(fit, np.asarray(vectors))
-    progress = grow(fit, stages, progress, free=free, undecided=(), on_progress=reports.append)
+    progress = grow(fit, stages, progress, free=free, undecided={}, on_progress=reports.append)
     return progress, reports
 
 
@@ -79,7 +79,7 @@ def test_the_search_ends_within_a_tenth_of_a_standard_error_of_the_minimum(fit):
     stage, reports = schedule_of(fit.samples, 1.0, robust=True, steps=30)[-1], []
     free = Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool))
     start = beginning(fit, np.asarray(fit.space.initial)[None] + 0.02)
-    progress = grow(fit, (stage,), start, free=free, undecided=(), on_progress=reports.append)
+    progress = grow(fit, (stage,), start, free=free, undecided={}, on_progress=reports.append)
     last = reports[-1]
     iterate = last.iterate
     assert iterate.accepted[0]

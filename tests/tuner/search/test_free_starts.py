@@ -55,7 +55,7 @@ def test_a_search_ends_where_its_loss_is_least_from_the_start_that_it_found(away
         (last,),
         beginning(fit, true[None] + away),
         free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
-        undecided=(),
+        undecided={},
         on_progress=lambda _: None,
     )
     found = Point(progress.points.coefficients[0], progress.points.offsets[0])

@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tuner.uncertainty.making import problem, with_data
+from tests.tuner.uncertainty.making import NOISE, problem, with_data
 from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
@@ -29,7 +30,7 @@ def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, 
         schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=10),
         beginning(fit, np.asarray(fit.space.initial)[None]),
         free=Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
-        undecided=("sees_markers",),
+        undecided={"sees_markers": np.ones(2, bool)},
         on_progress=lambda _: None,
     )
     assert progress.loop == Loop(sees_markers=flown)
@@ -53,7 +54,7 @@ def test_who_sees_the_markers_is_tried_from_where_the_search_began():
         stages[: at + 1],
         there,
         free=Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
-        undecided=("sees_markers",),
+        undecided={"sees_markers": np.ones(2, bool)},
         on_progress=reports.append,
         start=start,
     )
@@ -63,3 +64,27 @@ def test_who_sees_the_markers_is_tried_from_where_the_search_began():
         np.testing.assert_array_equal(report.points.coefficients, astray)
         assert (report.stage, report.loop) == (at, start.loop)
         assert len(report.iterations) == report.evaluations == report.steps
+
+
+@pytest.mark.parametrize("flown", [0.0, 1.0])
+def test_what_saturates_is_decided_by_the_flights_that_clip(flown):
+    """The other was recorded metres away, which takes up most of the loss."""
+    fit, turning = problem(("inertia_zz",)), jnp.asarray([0.0, 12.0])
+    fit = eqx.tree_at(lambda o: o.segments.inlet.yaw_rate, fit, turning)
+    recorded = with_data(with_loop(fit, Loop(flown)), fit.start(fit.space.initial))
+    recorded = with_loop(recorded, Loop(1.0 - flown))
+    away = np.array([2000.0, 0.0]) * NOISE["position"]
+    fit = eqx.tree_at(
+        lambda o: o.segments.measured["position"].values, recorded, replace_fn=lambda p: p + away
+    )
+    stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=4)
+    stages = [stage for stage in stages if stage.decides]
+    progress = grow(
+        fit,
+        tuple(stages),
+        beginning(fit, np.asarray(fit.space.initial)[None]),
+        free=Free(np.ones(1, bool), np.zeros((len(OFFSETS), 2), bool)),
+        undecided={"saturation_feedback": np.array([False, True])},
+        on_progress=lambda _: None,
+    )
+    assert progress.loop.saturation_feedback == flown

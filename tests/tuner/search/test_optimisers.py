@@ -67,7 +67,7 @@ def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
         tuple(stages),
         beginning(fit, start[None]),
         free=Free(np.array([True, True, False]), np.zeros((len(OFFSETS), 2), bool)),
-        undecided=(),
+        undecided={},
         on_progress=reports.append,
     )
     assert {report.iterations[-1].stage for report in reports} == {"first 3 s", WHOLE}
@@ -84,7 +84,7 @@ def test_least_squares_reports_its_damping():
         (stage,),
         beginning(fit, np.asarray(fit.space.initial)[None] + [[0.05], [0.06]]),
         free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
-        undecided=(),
+        undecided={},
         on_progress=lambda _: None,
     )
     first, second, *_ = (iteration.damping for iteration in progress.iterations)

@@ -19,13 +19,13 @@ PLAIN = ("motor_constant", "inertia_xx", "inertia_yy")
 def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch, own, choice):
     """A model that lacked terms may have chosen the wrong one."""
     own = Loop()._replace(**{choice: own})
-    objective = with_loop(problem(PLAIN), own)
+    objective, tell = with_loop(problem(PLAIN), own), np.ones(len(FLIGHTS), bool)
     fitted = fitted_of(with_loop(objective, own.switched(choice)), truth(objective))
     job = SimpleNamespace(
         objective=objective,
         settings=SimpleNamespace(job=JobFile()),
         fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
-        undecided=lambda _: (choice,),
+        undecided=lambda _: {choice: tell},
     )
     asked = {}
 
@@ -39,10 +39,10 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
     free = Free(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
     said = {"free": free, "title": "again", "on_progress": lambda _: None}
     again = estimation.searched_again(job, fitted, objective.space.initial, **said)
-    assert asked == {"undecided": (choice,), "loop": own}
+    assert asked == {"undecided": {choice: tell}, "loop": own}
     assert loop_of(again.objective) == own.switched(choice)
     estimation.polished(job, again, **said)
-    assert asked == {"undecided": (), "loop": own.switched(choice)}
+    assert asked == {"undecided": {}, "loop": own.switched(choice)}
 
 
 @pytest.mark.parametrize(("left", "steps"), [(None, 2), (1e-3, 1)])

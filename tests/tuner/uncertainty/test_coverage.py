@@ -36,7 +36,7 @@ def test_intervals_cover_the_truth():
         noisy = with_data(exact, truth(exact), noise=np.random.default_rng(100 + repeat))
         progress = beginning(noisy, np.asarray(exact.space.initial)[None] + 0.02)
         progress = grow(
-            noisy, stages, progress, free=free, undecided=(), on_progress=lambda _: None
+            noisy, stages, progress, free=free, undecided={}, on_progress=lambda _: None
         )
         uncertainty = uncertainty_of(fitted_of(noisy, point_of(progress.points, 0)))
         for number, name in enumerate(FREE):
