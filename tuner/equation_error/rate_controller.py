@@ -172,13 +172,22 @@ def _share_lateness(known: list[dict[str, _Part]]) -> None:
 
 
 def _regression(signals: Signals, axis: int) -> tuple[Array, Array]:
-    """Return columns (N, 3) and torque (N,), about their means."""
+    """Return columns (N, 3) and torque (N,), about their trends.
+
+    What a recorded gyro reads when at rest is not what the loop heard, and its integral is a ramp.
+    """
     error, step = signals.error[:, axis], signals.step
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (error[1:] + error[:-1]))]) * step
     faster = np.gradient(signals.rate[:, axis], step)
     columns = np.column_stack([error, integral, faster])
-    torque = signals.torque[:, axis]
-    return columns - columns.mean(axis=0), torque - torque.mean()
+    return _detrended(columns), _detrended(signals.torque[:, axis])
+
+
+def _detrended(series: Array) -> Array:
+    """Return a series (N, ...) less its mean and its slope."""
+    time = np.linspace(-1.0, 1.0, len(series))
+    about = series - series.mean(axis=0)
+    return np.asarray(about - np.multiply.outer(time, time @ about / (time @ time)))
 
 
 def _condition(square: Array) -> float:

@@ -12,7 +12,9 @@ RATE, SECONDS = 100.0, 40.0
 P_GAIN, I_GAIN, D_GAIN = 0.15, 0.2, 0.003
 
 
-def flight(random, *, p=P_GAIN, i=I_GAIN, d=D_GAIN, late=0.0, gusts=0.0, noise=0.0) -> Signals:
+def flight(
+    random, *, p=P_GAIN, i=I_GAIN, d=D_GAIN, late=0.0, gusts=0.0, noise=0.0, bias=0.0
+) -> Signals:
     """Return what a loop hears and says whose rate follows its set-point and is pushed."""
     time = np.arange(round(RATE * SECONDS)) / RATE
     wanted = np.random.default_rng(7).normal(size=(len(time), 3))  # what is asked for is the same
@@ -29,7 +31,7 @@ def flight(random, *, p=P_GAIN, i=I_GAIN, d=D_GAIN, late=0.0, gusts=0.0, noise=0
     error = wanted - heard
     integral = np.cumsum(error, axis=0) / RATE
     torque = p * error + i * integral - p / P_GAIN * d * np.gradient(heard, 1.0 / RATE, axis=0)
-    read = rate + noise * random.normal(size=rate.shape)
+    read = rate + bias + noise * random.normal(size=rate.shape)
     return Signals(1.0 / RATE, wanted - read, read, torque)
 
 
@@ -62,6 +64,14 @@ def test_a_slower_filter_is_told_of_roll_and_pitch_together():
 
 def test_the_file_that_flew_is_not_doubted():
     assert sum(bool(told(seed)) for seed in range(60)) <= 1
+
+
+def test_what_a_gyro_reads_at_rest_is_not_what_the_loop_integrated():
+    random = np.random.default_rng(0)
+    real, made = flight(random, gusts=0.2, noise=0.01, bias=0.02), flight(random)
+    found = answers([real], [made])
+    assert not any(answer.differs for answer in found)
+    assert max(answer.sd for answer in found if answer.part == "I") < 0.05
 
 
 def test_one_step_of_a_set_point_tells_nothing():
