@@ -25,13 +25,16 @@ UNOPTIMISED = "LANES_UNOPTIMISED"
 """An environment variable: where it is set, LLVM optimises nothing, which builds in half the time
 what runs more slowly and fuses no product with a sum."""
 
-_SELECTION = {"pre-RA-sched": "default", "combiner-disabled": "false"}
-"""Options of LLVM's selection of instructions."""
-_UNOPTIMISED_SELECTION = {"pre-RA-sched": "linearize", "combiner-disabled": "true"}
-"""The same where nothing is optimised: to order and to combine instructions takes five sixths of
-the time in which a large kernel is emitted."""
+_SELECTION = {"pre-RA-sched": ("linearize", "default"), "combiner-disabled": ("true", "false")}
+"""Options of LLVM's selection of instructions where nothing is optimised, and where it is.
+
+To order and to combine instructions takes five sixths of the time in which a large kernel that is
+not optimised is emitted. A process that optimises all never sets them: LLVM ends one that sets an
+option that its version does not know."""
 
 _lock = Lock()
+_selected: list[int] = []
+"""The level for which instructions are selected, once a kernel was not optimised."""
 _folder: list[Path] = []
 
 
@@ -86,8 +89,10 @@ def _compiled(text: str) -> bytes:
     builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
     with _lock:
-        for option, value in (_SELECTION if level else _UNOPTIMISED_SELECTION).items():
-            llvm.set_option("", f"-{option}={value}")
+        if _selected != [level] and (_selected or not level):
+            _selected[:] = [level]
+            for option, values in _SELECTION.items():
+                llvm.set_option("", f"-{option}={values[bool(level)]}")
         code: bytes = machine.emit_object(module)
     return code
 
