@@ -408,9 +408,11 @@ class _Compiled:
             else np.ascontiguousarray(leaf)
             for leaf, a in zip(leaves, program.arguments, strict=True)
         ]
+        begins = turn[::own_lanes] + np.arange(each)[:, None]
         for number, t in zip(program.moving, tangents, strict=True):
-            rows = t.astype(program.arguments[number].dtype)[turn + np.arange(each)[:, None]]
-            given.append(np.ascontiguousarray(np.moveaxis(rows, 1, -1)))
+            rows = np.moveaxis(t.astype(program.arguments[number].dtype)[begins], 1, -1)
+            repeated = np.repeat(rows, own_lanes, axis=-1)[..., : len(place)]
+            given.append(np.ascontiguousarray(repeated))
         sizes = {stand_in: lengths[name] for name, stand_in in self.lengths.items()}
         asked = (
             [True] * len(self.outputs) if wanted is None else self.structure.flatten_up_to(wanted)

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from lanes import Argument, program_of
 from sim_jax.environment import Air
@@ -33,6 +34,8 @@ MOTOR_STEP = 1e-2
 ROTORS = 4
 EVERY = 5
 """Steps of which one tells how the noise of rotor speeds moves what is computed."""
+AT_ONCE = 2048
+"""Of these, how many are computed at once: a call costs as much as a thousand of them."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class Linear:
     left
         (N, 6) recorded accelerations minus the model's.
     columns
-        (N, 6, K) derivatives of the model's.
+        (N, 6, K) derivatives of the model's, or by fewer coordinates where only these are asked.
     moved
         (2, 2, 6, K, K): how the noise of rotor speeds moves columns together; the mean over steps
         and sum over rotors of products of derivatives by a rotor's speed and by its acceleration.
@@ -92,60 +95,74 @@ class ModelAccelerations:
         """The same with rotor speeds that are taken as they are."""
         return replace(self, flights=tuple(replace(part, noise=0.0) for part in self.flights))
 
-    def at(self, point: Array) -> tuple[Linear, ...]:
+    def at(self, point: Array, by: NDArray[np.intp] | None = None) -> tuple[Linear, ...]:
         """Return each flight's accelerations about a point (K,) of scaled coordinates.
 
-        With noise, which takes most of the time.
+        With derivatives by some of these; by all is the default. Noise takes most of the time.
         """
-        flights, size = self._with_rotors(point), len(self.parameters)
-        made = _made(self.model, self.parameters, point, flights)
+        flights, by = self._with_rotors(point), np.arange(len(point)) if by is None else by
+        made = _made(self.model, self.parameters, point, flights, by)
         left = [
             part.accelerations - values for part, (values, _) in zip(flights, made, strict=True)
         ]
         columns = [of_flight.copy() for _, of_flight in made]
-        for number, parameter in enumerate(self.parameters if self.commands else ()):
+        for number, which in enumerate(by if self.commands else ()):
+            parameter = self.parameters[which]
             if moves_rotors(parameter.name):
                 step = MOTOR_STEP * (parameter.usual or 1.0)
-                beside = self._with_rotors(point + step * np.eye(size)[number])
-                ends = _made(self._model(point), (), np.zeros(0), beside)
+                beside = self._with_rotors(point + step * np.eye(len(point))[which])
+                ends = _made(self._model(point), (), np.zeros(0), beside, by[:0])
                 for flight, (part, (modelled, _)) in enumerate(zip(beside, ends, strict=True)):
                     change = left[flight] - (part.accelerations - modelled)
                     columns[flight][:, :, number] = change / step
-        moved = np.zeros((len(left), 2, 2, 6, size, size))
-        crossed = np.zeros((len(left), 2, 2, 6, size))
-        for rotor in range(ROTORS if self.noisy else 0):
-            slopes = [
-                self._slopes(point, flights, which * np.eye(ROTORS)[rotor])
-                for which in np.eye(2)[:, :, None]
-            ]
-            for number, of_flight in enumerate(zip(*slopes, strict=True)):
-                values, columns_by = (
-                    np.stack(parts).swapaxes(1, 2) for parts in zip(*of_flight, strict=True)
-                )
-                mean = columns_by.mT / values.shape[-1]
-                moved[number] += mean[:, None] @ columns_by
-                crossed[number] += (mean[:, None] @ values[..., None])[..., 0]
+        moved, crossed = self._moved(point, flights, by)
         return tuple(map(Linear, flights, left, columns, moved, crossed))
 
-    def _slopes(
-        self, point: Array, flights: Sequence[Steps], by: Array
-    ) -> list[tuple[Array, Array]]:
-        """Return each flight's derivatives of accelerations (n, 6) and of columns (n, 6, K).
+    def _moved(
+        self, point: Array, flights: Sequence[Steps], by: NDArray[np.intp]
+    ) -> tuple[Array, Array]:
+        """Return `Linear.moved` and `Linear.crossed` of all flights, of every so manyth step."""
+        size = len(by)
+        moved, crossed = (np.zeros((len(flights), 2, 2, 6, *k)) for k in ((size, size), (size,)))
+        if not self.noisy:
+            return moved, crossed
+        steps = _side_by_side(flights, every=EVERY)
+        counts = [len(part.time[::EVERY]) for part in flights]
+        flight = np.repeat(np.arange(len(flights)), counts)
+        for first in range(0, len(flight), AT_ONCE):
+            some = slice(first, first + AT_ONCE)
+            here = jax.tree.map(lambda a, s=some: a[..., s], steps)
+            values, columns = self._slopes(point, here, by)
+            for number in np.unique(flight[some]):
+                own = flight[some] == number
+                slopes = columns[:, :, :, own].reshape(2, 6, -1, size)
+                mean = slopes.mT[:, None] / counts[number]
+                moved[number] += mean @ slopes
+                crossed[number] += (mean @ values[:, :, :, own].reshape(2, 6, -1, 1))[..., 0]
+        return moved, crossed
 
-        By the rotors' speed, accelerations or both, which move by (2, 4) of their steps.
+    def _slopes(self, point: Array, steps: Any, by: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Return derivatives of n steps' accelerations (2, 6, 4, n) and columns (2, 6, 4, n, K).
+
+        By each rotor's speed, and by its acceleration.
         """
-        change = np.array([[SPEED_STEP], [CHANGE_STEP]]) * by
-        above, below = (
-            _made(self.model, self.parameters, point, [_faster(part, c) for part in flights])
-            for c in (change, -change)
+        motion, speeds, changes = steps
+        unit, count = np.eye(2 * ROTORS), speeds.shape[1]
+        both = np.stack([unit, -unit])[..., None]
+        beside = (
+            jax.tree.map(lambda leaf: np.tile(leaf, 4 * ROTORS), motion),
+            _in_lanes(speeds * (1.0 + SPEED_STEP * both[:, :, :ROTORS])),
+            _in_lanes(changes + CHANGE_STEP * both[:, :, ROTORS:]),
         )
-        spans = [
-            2.0 * (part.rotor_speed[::EVERY] @ change[0] + change[1].sum()) for part in flights
-        ]
-        return [
-            ((high[0] - low[0]) / span[:, None], (high[1] - low[1]) / span[:, None, None])
-            for high, low, span in zip(above, below, spans, strict=True)
-        ]
+        span = 2.0 * np.concatenate([SPEED_STEP * speeds, np.full(speeds.shape, CHANGE_STEP)])
+
+        def slope(made: Array) -> Array:
+            above, below = made.reshape(2, 2, ROTORS, count, *made.shape[1:])
+            slopes = (above - below) / span.reshape(2, ROTORS, count, *[1] * (made.ndim - 1))
+            return np.moveaxis(slopes, 3, 1)
+
+        values, columns = _computed(self.model, self.parameters, point, beside, by)
+        return slope(values), slope(columns)
 
     def _model(self, point: Array) -> Model:
         values = values_at(self.parameters, point)
@@ -174,29 +191,45 @@ def values_at(parameters: Sequence[Parameter], point: Array) -> dict[str, float]
     }
 
 
-def _faster(part: Steps, change: Array) -> Steps:
-    """Return every so manyth step, with rotors (4,) faster by a share, and so many rad/s²."""
-    return replace(
-        part,
-        motion=jax.tree.map(lambda leaf: leaf[::EVERY], part.motion),
-        rotor_speed=part.rotor_speed[::EVERY] * (1.0 + change[0]),
-        rotor_acceleration=part.rotor_acceleration[::EVERY] + change[1],
+def _side_by_side(flights: Sequence[Steps], every: int = 1) -> Any:
+    """Return motion, rotor speeds and accelerations of all flights' every so manyth step (N,)."""
+    return jax.tree.map(
+        lambda *leaves: np.concatenate([leaf[..., ::every] for leaf in leaves], axis=-1),
+        *((part.motion, part.rotor_speed.T, part.rotor_acceleration.T) for part in flights),
     )
 
 
+def _in_lanes(rotors: Array) -> Array:
+    """Return rotors (..., 4, n) as (4, lanes)."""
+    return np.moveaxis(rotors, -2, 0).reshape(ROTORS, -1)
+
+
 def _made(
-    model: Model, parameters: Sequence[Parameter], point: Array, flights: Sequence[Steps]
+    model: Model,
+    parameters: Sequence[Parameter],
+    point: Array,
+    flights: Sequence[Steps],
+    by: NDArray[np.intp],
 ) -> list[tuple[Array, Array]]:
-    """Return each flight's modelled accelerations (N, 6) and columns (N, 6, K)."""
+    """Return each flight's modelled accelerations (N, 6) and columns (N, 6, k) by k coordinates."""
+    values, columns = _computed(model, parameters, point, _side_by_side(flights), by)
+    ends = np.cumsum([len(part.rotor_speed) for part in flights])[:-1]
+    return list(zip(np.split(values, ends), np.split(columns, ends), strict=True))
+
+
+def _computed(
+    model: Model,
+    parameters: Sequence[Parameter],
+    point: Array,
+    steps: Any,
+    by: NDArray[np.intp],
+) -> tuple[Array, Array]:
+    """Return the modelled accelerations (N, 6) and columns (N, 6, k) of `_side_by_side`'s steps."""
     values, slopes = values_at(parameters, point), dict[str, Array]()
     for number, parameter in enumerate(parameters):
         for name, ratio in parameter.ratios.items():
             slope = values[name] if parameter.scale == "log" else ratio
-            slopes[name] = slope * np.eye(len(parameters))[number]
-    steps = jax.tree.map(
-        lambda *leaves: np.concatenate(leaves, axis=-1),
-        *((part.motion, part.rotor_speed.T, part.rotor_acceleration.T) for part in flights),
-    )
+            slopes[name] = slope * (by == number)
     numbers = {name: np.asarray(values[name]) for name in sorted(values)}
     given = (jax.tree.map(np.asarray, model), numbers, steps)
     arguments = (
@@ -208,9 +241,7 @@ def _made(
         _accelerations, arguments, name="accelerations", made_of=total.TERMS, packages=CODE
     )
     run = program(given, [slopes[name] for name in numbers], lanes=steps[1].shape[1])
-    columns = run.columns if numbers else np.zeros((*run.values.shape, 0))
-    ends = np.cumsum([len(part.rotor_speed) for part in flights])[:-1]
-    return list(zip(np.split(run.values, ends), np.split(columns, ends), strict=True))
+    return run.values, run.columns if numbers else np.zeros((*run.values.shape, 0))
 
 
 def _accelerations(given: Any, _: Mapping[str, int]) -> jax.Array:

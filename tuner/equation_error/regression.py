@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
 from tuner.core.numerics import Z95, Array, huber_weights, robust_sd
@@ -170,14 +171,23 @@ def _sums_at(
     """
     prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
     parts = 1 if len(made.flights) >= FEWEST_UNITS else FEWEST_UNITS
-    sums = [filtered_sums(one, filters(one), parts) for one in made.at(point)]
-    information, slope, loss = (np.concatenate([s[i] for s in sums]) for i in range(3))
+    by = np.flatnonzero(free) if free.any() else np.arange(len(free))
+    sums = [filtered_sums(one, filters(one), parts) for one in made.at(point, by)]
+    information, slope, loss, noise, crossed = (
+        _among(len(free), by, np.concatenate(some)) for some in zip(*sums, strict=True)
+    )
     if made.noisy:
-        noise, crossed = (np.concatenate([s[i] for s in sums]) for i in (3, 4))
         taken = _taken(information.sum(axis=0) + np.diag(prior), noise.sum(axis=0), free)
         information -= taken @ noise @ taken.T
         slope += crossed @ (taken @ taken).T
     return NormalEquations(information, slope, loss, prior, prior * (mean - point))
+
+
+def _among(count: int, by: NDArray[np.intp], sums: Array) -> Array:
+    """Return sums (U, k) or (U, k, k) among those of all K coordinates, of which others are 0."""
+    whole = np.zeros((len(sums), *[count] * (sums.ndim - 1)))
+    whole[np.ix_(np.arange(len(sums)), *[by] * (sums.ndim - 1))] = sums
+    return whole
 
 
 def _taken(information: Array, noise: Array, free: Mask) -> Array:
