@@ -7,6 +7,7 @@ a pendulum's angle.
 from __future__ import annotations
 
 import math
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -226,8 +227,9 @@ def open_table(path: Path) -> TabularRecording:
     from tuner.recordings.table import Table  # noqa: PLC0415 (pyarrow takes a third of a second)
 
     try:
-        if path.is_dir() or path.stat().st_size > MAX_BYTES:
-            raise RecordingError(path, "is a folder or larger than 200 MB", "cut it to the rig's")
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode) or about.st_size > MAX_BYTES:
+            raise RecordingError(path, "is no file, or larger than 200 MB", "cut it to the rig's")
         return Table(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "no valid path"

@@ -42,9 +42,11 @@ from tuner.recordings.recording import (
     reason_of,
 )
 
-#: Tables with more columns or cells are no flight.
+#: Tables with more columns, or more cells to be read, are no flight.
 MOST_COLUMNS = 10_000
 MOST_CELLS = 500_000_000
+#: Nor are those that hold so many cells in each byte, for numbers differ; small ones may.
+MOST_CELLS_A_BYTE, CELLS_AT_LEAST = 20, 20_000_000
 
 
 class Table(TabularRecording):
@@ -64,6 +66,7 @@ class Table(TabularRecording):
     def __init__(self, path: Path) -> None:
         self.path = path
         self._skipped = 0
+        self._rows = 0
         self.units: Mapping[str, str] = {}
         with path.open("rb") as stream:
             self._parquet = stream.read(4) == b"PAR1"
@@ -103,14 +106,15 @@ class Table(TabularRecording):
 
         try:
             with parquet.ParquetFile(self.path) as file:
-                about = file.metadata
-                if about.num_rows * about.num_columns > MOST_CELLS:
-                    raise RecordingError(self.path, "claims an absurd size", "write it again")
+                self._rows = file.metadata.num_rows
                 return list(file.schema_arrow.names)
         except (ArrowException, OSError, ValueError) as err:
             raise RecordingError(self.path, _why(err), "write it again") from None
 
     def _read(self, names: list[str]) -> pyarrow.Table:
+        cells, size = self._rows * len(names), self.path.stat().st_size
+        if cells > min(MOST_CELLS, max(CELLS_AT_LEAST, MOST_CELLS_A_BYTE * size)):
+            raise RecordingError(self.path, "claims an absurd size", "write it again")
         try:
             if self._parquet:
                 from pyarrow import parquet  # noqa: PLC0415

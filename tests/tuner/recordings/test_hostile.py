@@ -5,6 +5,7 @@ from __future__ import annotations
 import bz2
 import io
 import json
+import os
 import sqlite3
 import struct
 import subprocess
@@ -17,7 +18,9 @@ from time import process_time
 
 import lz4.frame
 import numpy as np
+import pyarrow
 import pytest
+from pyarrow import parquet
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from tests.tuner.recordings import fuzz, making
@@ -25,8 +28,18 @@ from tuner.core.errors import InputError
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause, NoteCode
-from tuner.recordings.ros.container import Chunk, DamagedError, FileBytes, read_wanted, unpack, zstd
+from tuner.recordings.ros.container import (
+    LARGEST_CHUNK,
+    Chunk,
+    DamagedError,
+    FileBytes,
+    joined,
+    read_wanted,
+    unpack,
+    zstd,
+)
 from tuner.recordings.ros.messages import Definitions, missing_fields
+from tuner.recordings.ros.recording import unpacked_block
 
 
 @contextmanager
@@ -163,6 +176,46 @@ def test_metadata_that_multiplies(tmp_path: Path) -> None:
     with bounded():
         inspections, errors = inspect_recordings([folder], cache=False)
     assert len(inspections) + len(errors) == 1
+
+
+def test_messages_that_unpack_to_too_much_together() -> None:
+    bomb = zstd().compress(bytes(100 << 20))
+    with bounded(megabytes=500.0):
+        block = unpacked_block(joined([0] * 50, [bomb] * 50))
+    assert int((block.end - block.start).sum()) <= LARGEST_CHUNK
+    few = unpacked_block(joined([1, 2, 3], [zstd().compress(b"ab"), b"damaged", bomb[:9]]))
+    assert (few.end - few.start).tolist() == [2, 0, 0]
+
+
+def test_a_database_that_unpacks_to_too_much(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("tuner.recordings.ros.recording.UNPACKED_AT_LEAST", 1 << 20)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "x.db3.zstd").write_bytes(zstd().compress(bytes(64 << 20)))
+    assert "x.db3.zstd unpacks to an absurd size" in refused(tmp_path / "b")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes there")
+@pytest.mark.parametrize("name", ["x.mcap", "x.db3.zstd"])
+def test_a_pipe_in_a_folder_of_ros_2_is_not_waited_for(name: str, tmp_path: Path) -> None:
+    folder = tmp_path / "b"
+    folder.mkdir()
+    os.mkfifo(folder / name)
+    about = {"relative_file_paths": [name] * 1000}
+    (folder / "metadata.yaml").write_text(json.dumps({"rosbag2_bagfile_information": about}))
+    assert f"{name} is no file" in refused(folder)
+
+
+def test_a_parquet_table_that_unpacks_to_too_much(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.parquet"
+    schema = pyarrow.schema(
+        [(name, pyarrow.float64()) for name in ("time", *"xyz", "qw", "qx", "qy", "qz")]
+    )
+    with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+        zeros = pyarrow.array(np.zeros(1_000_000))
+        for _ in range(8):
+            writer.write_table(pyarrow.table([zeros] * len(schema), schema=schema))
+    assert path.stat().st_size < 400_000
+    assert "claims an absurd size" in refused(path)
 
 
 def test_message_longer_than_its_chunk_or_shorter_than_its_type(tmp_path: Path) -> None:

@@ -52,8 +52,9 @@ from tuner.recordings.ros.messages import (
     missing_fields,
 )
 
-#: Files compressed as a whole are unpacked beside the others up to this size.
-LARGEST_UNPACKED = 32 << 30
+#: Files compressed as a whole are unpacked to so many times their size, and to so many bytes if
+#: they are small: flights do not come to more.
+MOST_TIMES_PACKED, UNPACKED_AT_LEAST = 100, 1 << 30
 
 
 @dataclass
@@ -101,7 +102,7 @@ class Folder(Container):
             inside = [inner for inner, number in here.items() if number in wanted]
             known = len(container.damage)
             for inner, block in container.blocks(inside):
-                yield here[inner], self._unpacked_block(block) if self._compressed else block
+                yield here[inner], unpacked_block(block) if self._compressed else block
             self.damage += container.damage[known:]
 
     def _metadata(self) -> tuple[list[str], str]:
@@ -112,7 +113,7 @@ class Folder(Container):
             about = about["rosbag2_bagfile_information"]
             names, mode = about["relative_file_paths"], about.get("compression_mode") or ""
             if names and all(isinstance(name, str) for name in (*names, mode)):
-                return names, mode.lower()
+                return list(dict.fromkeys(names)), mode.lower()
             raise ValueError("it names no file")
         except (ConfigError, ValueError, KeyError, TypeError, AttributeError):
             names = sorted(
@@ -125,36 +126,44 @@ class Folder(Container):
 
     def _unpack(self, path: Path) -> Path:
         """Unpack a file that was compressed as a whole."""
+        if not path.is_file():  # a pipe is never read
+            raise DamagedError(f"{path.name} is no file")
         if self._unpacked is None:
             self._unpacked = Path(mkdtemp(prefix="tune-"))
             weakref.finalize(self, shutil.rmtree, self._unpacked, True)
         target = self._unpacked / file_name(path.stem)
-        written = 0
+        room = max(UNPACKED_AT_LEAST, MOST_TIMES_PACKED * path.stat().st_size)
         try:
             with zstd().open(path, "rb") as packed, target.open("wb") as stream:
                 while part := packed.read(1 << 20):
-                    written += len(part)
-                    if written > LARGEST_UNPACKED:
+                    room -= len(part)
+                    if room < 0:
                         raise DamagedError(f"{path.name} unpacks to an absurd size")
                     stream.write(part)
         except (zstd().ZstdError, EOFError) as err:
             raise DamagedError(f"{path.name} cannot be unpacked ({err})") from None
         return target
 
-    def _unpacked_block(self, block: Block) -> Block:
-        """Unpack messages that were compressed one by one; a damaged one becomes empty."""
-        payloads = []
-        for start, end in zip(block.start, block.end, strict=True):
-            try:
-                packed = block.buffer[start:end].tobytes()
-                payloads.append(unpack("zstd", packed, LARGEST_CHUNK))
-            except DamagedError:
-                payloads.append(b"")
-        return joined(block.time.tolist(), payloads)
+
+def unpacked_block(block: Block) -> Block:
+    """Unpack messages that were compressed one by one; a damaged one becomes empty.
+
+    So do those behind `LARGEST_CHUNK` bytes.
+    """
+    payloads, room = [], LARGEST_CHUNK
+    for start, end in zip(block.start, block.end, strict=True):
+        try:
+            payloads.append(unpack("zstd", block.buffer[start:end].tobytes(), room))
+        except DamagedError:
+            payloads.append(b"")
+        room -= len(payloads[-1])
+    return joined(block.time.tolist(), payloads)
 
 
 def open_file(path: Path) -> Container:
     """Open one data file of a ROS 2 recording by what it begins with."""
+    if not path.is_file():
+        raise DamagedError(f"{path.name} is no file")
     with path.open("rb") as stream:
         magic = stream.read(16)
     return Db3(path) if magic.startswith(b"SQLite format 3") else Mcap(path)
