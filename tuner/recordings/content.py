@@ -387,10 +387,10 @@ def extract(
         values = np.column_stack([samples.fields[name] for name in place.fields])
         raw = Raw(place.topic, time, values)
         unit = _unit(recording, signal, place, raw, signals.get("position"))
-        if unit != place.unit:
+        if unit and unit != place.unit:
             count, names = len(time), (signal, NAMES[unit])
             inferred.append(Note(NoteCode.UNIT_READ, "warning", place.topic, count, names=names))
-        values = _values(samples, signal, place, to_si(values, unit))
+        values = _values(samples, signal, place, to_si(values, unit or "si"))
         if is_tabular(recording.format):  # a row without the signal is no sample of it
             there = np.isfinite(values).any(axis=1)
             time, values = time[there], values[there]
@@ -403,7 +403,10 @@ def extract(
 def _unit(
     recording: Recording, signal: str, place: Place, recorded: Raw, position: Raw | None
 ) -> str:
-    """Return the unit of recorded numbers: the map's, or else the one in which they make sense."""
+    """Return the unit of recorded numbers: the map's, or else the one in which they make sense.
+
+    It is empty where they make sense in none.
+    """
     if place.source.unit is not None:
         return place.unit
     if signal not in ATTITUDES or place.source.quaternion != "rpy":

@@ -32,7 +32,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "rate_setpoint": (-1e4, 1e4),
     "attitude_setpoint": (-1e3, 1e3),
     "lap": (-1e6, 1e6),
-    "command": (-0.02, 1.02),
+    "command": (-0.025, 1.02),  # an ESC that is off gets less than its first step
     "thrust_setpoint": (-0.02, 1.02),
     "commanded_thrust": (-1e4, 1e4),
     "commanded_torque": (-1e4, 1e4),
@@ -93,9 +93,10 @@ def clean(
     low, high = RANGES.get(signal, (-np.inf, np.inf))
     beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
     dropped = int(beyond.any(axis=1).sum())
-    if dropped > WRONG_UNIT_SHARE * len(values):
+    if dropped > WRONG_UNIT_SHARE * int((values != 0).any(axis=1).sum()):  # 0 is 0 in each unit
         median = float(np.nanmedian(values))
         note(dropped, NoteCode.UNIT_UNKNOWN, "warning", lower=low, upper=high, median=median)
+        beyond |= True  # what is left would be held for all of it
     else:
         note(dropped, NoteCode.OUT_OF_RANGE, lower=low, upper=high)
     values = np.where(beyond, np.nan, values)

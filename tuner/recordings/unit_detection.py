@@ -42,6 +42,7 @@ UNITS: Mapping[str, tuple[float, float]] = {
     "percent": (1e-2, 0.0),
     "pwm_us": (1e-3, -1.0),
     "pwm_16bit": (1 / 65535, 0.0),
+    "dshot": (1 / 1999, -48 / 1999),
     "signed": (0.5, 0.5),
 }
 
@@ -404,6 +405,8 @@ MOST_TILT, LEAST_TILT = 0.55 * math.pi, 0.06
 def unit_by_range(signal: str, values: Array, assumed: str) -> str:
     """Return the unit of `UNITS` in which recorded numbers make sense; the assumed one if unsure.
 
+    It is empty where that cannot be: of commands that are no pulses, as an ESC's digital steps.
+
     Parameters
     ----------
     signal
@@ -415,7 +418,18 @@ def unit_by_range(signal: str, values: Array, assumed: str) -> str:
     known = values[np.isfinite(values).all(axis=1)] if signal != "command" else values
     if rule is None or len(known) < FEWEST_SAMPLES or not np.isfinite(known).any():
         return assumed
-    return rule(known) or assumed
+    found = rule(known)
+    return found or ("" if assumed == "pwm_us" and _no_pulses(known) else assumed)
+
+
+NO_PULSE = (1.02, 850.0)
+"""Between them are no commands from 0 to 1, and no widths of pulses in µs."""
+
+
+def _no_pulses(values: Array) -> bool:
+    low, high = NO_PULSE
+    known = values[np.isfinite(values) & (values != 0)]
+    return bool(np.mean((known > low) & (known < high)) > 0.01) if len(known) else False
 
 
 def _command(values: Array) -> str | None:

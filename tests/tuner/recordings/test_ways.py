@@ -12,11 +12,12 @@ import yaml
 from scipy import signal
 from scipy.io import savemat
 
-from tests.tuner.recordings import ways
+from tests.tuner.recordings import making, ways
 from tuner.config import Options, settle
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.findings.findings import one_line
 from tuner.objective.rotor_signals import levers, order_findings
+from tuner.recordings.content import ReadOptions, read_content
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.inspector import suggested_map
 from tuner.recordings.loader import load_flight, read_inertial
@@ -158,6 +159,31 @@ def test_commands_in_no_certain_unit_are_dropped_with_a_warning(change, tmp_path
     (note,) = [n for n in flight.notes if n.code is NoteCode.UNIT_UNKNOWN]
     assert note.kind == "warning"
     assert note_in_words(note).endswith("give command its 'unit' in the topic map")
+
+
+@pytest.mark.parametrize("standing", [0.0, 0.7])
+def test_commands_of_a_log_in_steps_are_not_read_as_pulses(standing: float, tmp_path: Path) -> None:
+    """Nor where they are zero for most of the time, of motors that stand before they idle."""
+    columns = making.px4_messages(making.CIRCLE)
+    pulses = columns["actuator_outputs"]
+    steps = 48 + 1999 * (pulses.values / 1000 - 1)
+    columns["actuator_outputs"] = making.Column(pulses.time, steps)
+    first = int(standing * len(steps))
+    steps[:first], steps[first : first + len(steps) // 20] = 0, 158
+    boot = int(pulses.time[0]) - 5_000_000_000
+    path = making.to_ulog(columns, tmp_path / "log.ulg", boot=boot)
+    flight = load_flight(path)
+    assert not flight.has("command")
+    (note,) = [n for n in flight.notes if n.code is NoteCode.UNIT_UNKNOWN]
+    assert (note.kind, note.names[0]) == ("warning", "command")
+    (tmp_path / "own.yaml").write_text(
+        "name: own\nformat: ulog\nextends: px4_ulog\nsignals:\n"
+        "  command: {topic: actuator_outputs, unit: dshot}\n"
+    )
+    told = read_content(ReadOptions.of(path, tmp_path / "own.yaml")).series["command"].values
+    assert np.median(told[-100:], axis=0) == pytest.approx(
+        np.median(pulses.values[-100:], axis=0) / 1000 - 1
+    )
 
 
 @pytest.mark.parametrize("unit", ["deg", "si"])
