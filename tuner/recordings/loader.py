@@ -132,10 +132,16 @@ def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> A
 
 def _cache_file(options: ReadOptions) -> Path:
     """Return the file of the cache for the flights of a recording, read so."""
-    path, given = options.path, options.given
+    path = options.path
+    return cached("flights", digest(path), path.name, *read_by(options))
+
+
+def read_by(options: ReadOptions) -> tuple[str, ...]:
+    """Return all that decides how a recording's content is read but this program."""
+    given = options.given
     messages = [digest(file) for file in given.messages if file.exists()] if given else []
     inputs = (options.namespace, options.rate, options.sidecar, given, messages)
-    return cached("flights", digest(path), path.name, *map(repr, inputs))
+    return tuple(map(repr, inputs))
 
 
 def load_flights(

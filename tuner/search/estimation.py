@@ -26,6 +26,9 @@ from tuner.objective.criterion import Point
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
+from tuner.recordings.content import ReadOptions
+from tuner.recordings.flight import Flight
+from tuner.recordings.loader import read_by
 from tuner.search.continuation import Undecided, grow
 from tuner.search.findings import findings_at, unmatched
 from tuner.search.iteration import Iteration, Outcome
@@ -50,7 +53,7 @@ def fingerprint(job: Job) -> str:
     """Return a digest of everything that decides a job's numbers."""
     settings = job.settings
     parts = {
-        "flights": [(flight.name, flight.sha256) for flight in job.flights],
+        "flights": [(flight.name, flight.sha256, *_read_by(flight, job)) for flight in job.flights],
         "vehicle": settings.vehicle.model_dump(mode="json"),
         "controller": settings.controller.model_dump(mode="json"),
         "job": settings.job.model_dump(mode="json"),
@@ -58,6 +61,12 @@ def fingerprint(job: Job) -> str:
     if settings.bench is not None:
         parts["bench"] = [settings.bench.mean.tolist(), settings.bench.information.tolist()]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def _read_by(flight: Flight, job: Job) -> tuple[str, ...]:
+    """Return how a flight's recording is read: a map or a side-car may have changed since."""
+    given = job.settings.job
+    return read_by(ReadOptions.of(Path(flight.path), given.topics, given.namespace))
 
 
 def save(path: Path, key: str, progress: Progress, seconds: float) -> None:

@@ -1,5 +1,6 @@
 """What a search starts from, and when it asks for a second opinion."""
 
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -7,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import fitted_of, problem, truth
-from tuner.config import JobFile
+from tuner.config import JobFile, Options, settle
 from tuner.config.job import Search
 from tuner.findings.findings import Code, sentence
 from tuner.objective.space import space_of
 from tuner.search import estimation as module
-from tuner.search.estimation import starting_vectors
+from tuner.search.estimation import fingerprint, starting_vectors
 from tuner.search.findings import end_findings, unmatched, voltage_taken
 from tuner.search.iteration import Outcome
 from tuner.search.progress import Loop
@@ -128,3 +129,20 @@ def test_time_left_falls_to_nothing():
     assert remaining == sorted(remaining, reverse=True)
     assert remaining[-1] == 0.0
     assert np.isnan(left(stages, 0, 0, 0.0))
+
+
+def test_a_checkpoint_is_of_flights_that_are_read_alike(bag, tmp_path):
+    recording = shutil.copy(bag, tmp_path / "flight.bag")
+    (tmp_path / "own.yaml").write_text("name: own\nformat: ros\nextends: mavros\nsignals: {}\n")
+
+    def digest(topics=None):
+        settings = settle(Options([str(recording)], topics=topics))
+        flight = SimpleNamespace(name="flight", sha256="0", path=str(recording))
+        return fingerprint(SimpleNamespace(settings=settings, flights=[flight]))
+
+    own, before = digest(str(tmp_path / "own.yaml")), digest()
+    assert digest() == before
+    (tmp_path / "own.yaml").write_text("name: other\nformat: ros\nextends: mavros\nsignals: {}\n")
+    assert digest(str(tmp_path / "own.yaml")) != own
+    (tmp_path / "flight.yaml").write_text("start: 1.0\n")
+    assert digest() != before
