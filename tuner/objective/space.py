@@ -201,9 +201,38 @@ def space_of(
             groups.pop(name)
         groups[group[0]] = tuple(group)
     size = size_of(vehicle)
-    parameters = [parameter_of(names, values, job, size) for names in groups.values()]
+    bounded = _with_filter_bounded(job, controller, values) if CUTOFF in free else job
+    parameters = [parameter_of(names, values, bounded, size) for names in groups.values()]
     fixed = {n: v for n, v in values.items() if n not in free}
     return Space(parameters, fixed, joint_prior, size)
+
+
+CUTOFF = "gyro_cutoff"
+
+
+def _with_filter_bounded(
+    job: JobFile, controller: ControllerFile, values: Mapping[str, float]
+) -> JobFile:
+    """Return a job that looks for no filter of the gyro that the simulated rate loop cannot have.
+
+    Raises
+    ------
+    ConfigError
+        The job file asks for one.
+    """
+    given, half = job.coefficients.get(CUTOFF, CoefficientSettings()), controller.rate.rate / 2
+    if given.upper is not None and given.upper >= half:
+        what = f"its upper bound {given.upper:g} Hz is not below half of rate.rate ({half:g} Hz)"
+        raise ConfigError(CUTOFF, what, "lower it")
+    _, upper = COEFFICIENTS[CUTOFF].limits(values[CUTOFF])
+    if given.upper is not None or upper < half:
+        return job
+    changed = given.replace(upper=INSIDE_HALF * half)
+    return job.replace(coefficients={**job.coefficients, CUTOFF: changed})
+
+
+INSIDE_HALF = 0.99
+"""Share of half the rate loop's rate that a filter of the gyro may reach."""
 
 
 def _free_names(job: JobFile, bypassed: Collection[str], freed: Collection[str]) -> tuple[str, ...]:

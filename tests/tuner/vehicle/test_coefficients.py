@@ -77,6 +77,19 @@ def test_a_start_on_its_bound_is_moved_inside_and_remembered(vehicle):
     assert 0 < parameter.initial < 0.02
 
 
+def test_a_filter_that_the_rate_loop_cannot_have_is_not_looked_for(vehicle):
+    free, slow = ("gyro_cutoff",), ControllerFile.model_validate({"rate": {"rate": 250.0}})
+    (parameter,) = space_of(vehicle, ControllerFile(), JobFile(free=free)).parameters
+    assert parameter.upper == 4 * ControllerFile().filters.gyro_cutoff
+    (parameter,) = space_of(vehicle, slow, JobFile(free=free)).parameters
+    assert 120.0 < parameter.upper < 125.0
+    asked = JobFile.model_validate(
+        {"free": free, "coefficients": {"gyro_cutoff": {"upper": 130.0}}}
+    )
+    with pytest.raises(ConfigError, match=r"not below half of rate\.rate \(125 Hz\); lower it"):
+        space_of(vehicle, slow, asked)
+
+
 def test_tied_coefficients_keep_their_ratio(vehicle):
     job = JobFile(free=("inertia_xx", "inertia_zz"), ties=(("inertia_xx", "inertia_zz"),))
     space = space_of(vehicle, ControllerFile(), job)
