@@ -303,15 +303,14 @@ def folder_for(out: Path | None, *, resume: bool = False) -> Path:
     return out
 
 
-def result_folder(out: Path | None) -> Path:
-    """Make the folder of `folder_for`, and return it.
-
-    A new one is of this process alone, whatever else began within the same second.
+@contextmanager
+def result_folder(out: Path | None) -> Iterator[Path]:
+    """Make the folder of `folder_for`, and give it to nobody else meanwhile.
 
     Raises
     ------
     OutputError
-        A file is in the way, or the system refuses.
+        A file is in the way, the system refuses, or another run writes there.
     """
     folder = folder_for(out)
     make_folder(folder if out is not None else folder.parent)
@@ -320,4 +319,40 @@ def result_folder(out: Path | None) -> Path:
             folder.mkdir()
             break
         folder = folder.with_name(f"{folder.name.partition('.')[0]}.{number}")
-    return folder
+    with _locked(folder):
+        yield folder
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the system's lock of a folder, which ends with the process, where there are locks."""
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl  # noqa: PLC0415 (not on Windows)
+
+    with _refusals(folder):
+        handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            what, remedy = "another run writes there", "wait for its end, or name another folder"
+            raise OutputError(folder, what, remedy) from None
+        except OSError:  # some network drives lock no folder
+            pass
+        yield
+    finally:
+        os.close(handle)
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file, if there is one.
+
+    Raises
+    ------
+    OutputError
+        It is a folder, or the system refuses.
+    """
+    with _refusals(path):
+        path.unlink(missing_ok=True)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import csv
+import errno
 import io
 import math
+import stat
+import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, ClassVar, Self
 from zipfile import BadZipFile
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
@@ -15,6 +18,7 @@ from pydantic_core import from_json
 
 from tuner.core.disk import write_text
 from tuner.core.errors import ConfigError, InputError
+from tuner.core.phrases import visible
 from tuner.core.validation import config_error
 
 if TYPE_CHECKING:
@@ -22,16 +26,37 @@ if TYPE_CHECKING:
 
 MAX_BYTES = 50_000_000
 """Of a JSON file of a result folder."""
+MAX_ARRAYS = 1 << 28
+"""Bytes of all arrays of a file together, unpacked."""
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return CSV text, numbers in full precision and nothing for None."""
+    """Return CSV text, numbers in full precision and nothing for None.
+
+    A word that a spreadsheet would compute, as the name of a recording may be, gets an apostrophe.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    for row in rows:
-        writer.writerow(["" if v is None else repr(v) if isinstance(v, float) else v for v in row])
+    writer.writerows([_cell(value) for value in row] for row in (header, *rows))
     return text.getvalue()
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, str):
+        shown = visible(value)
+        return f"'{shown}" if shown.lstrip().startswith(("=", "+", "-", "@")) else shown
+    return repr(value) if isinstance(value, float) else value
+
+
+def _opened(path: Path) -> BinaryIO:
+    """Open a file, and no pipe or device in a folder: none of its bytes may ever come.
+
+    Those of ``/dev`` are what a shell makes of ``<(command)``.
+    """
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or path.is_relative_to("/dev")):
+        raise OSError(errno.EINVAL, "it is no file")
+    return path.open("rb")
 
 
 def read_bytes(path: Path, *, most: int, remedy: str) -> bytes:
@@ -43,7 +68,7 @@ def read_bytes(path: Path, *, most: int, remedy: str) -> bytes:
         The file does not exist, cannot be read or is larger; ``remedy`` says what to do.
     """
     try:
-        with path.open("rb") as file:
+        with _opened(path) as file:
             raw = file.read(most + 1)
     except (FileNotFoundError, NotADirectoryError):
         raise ConfigError(path, "does not exist", remedy) from None
@@ -60,14 +85,19 @@ def read_arrays(path: Path, *, remedy: str) -> dict[str, NDArray[Any]]:
     Raises
     ------
     InputError
-        The file cannot be read or is damaged; ``remedy`` says what to do.
+        The file cannot be read, is damaged or holds too much; ``remedy`` says what to do.
     """
     import numpy as np  # noqa: PLC0415 (`tune --help` answers without it)
 
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+        with _opened(path) as file, np.load(file, allow_pickle=False) as data:
+            size = sum(part.file_size for part in data.zip.infolist())
+            if size > MAX_ARRAYS:
+                raise ValueError(f"it unpacks to {size} bytes")
             return {name: data[name] for name in data.files}
-    except (OSError, EOFError, BadZipFile, ValueError, TypeError, AttributeError) as error:
+    except (EOFError, MemoryError, AttributeError) as error:
+        raise InputError(path, f"is damaged ({type(error).__name__})", remedy) from None
+    except (OSError, BadZipFile, ValueError, TypeError, RuntimeError, zlib.error) as error:
         raise InputError(path, f"is damaged ({error})", remedy) from None
 
 

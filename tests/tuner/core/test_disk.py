@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import os
 import sys
+import tracemalloc
+import zipfile
+from contextlib import ExitStack
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tuner.core.disk import (
@@ -19,7 +25,7 @@ from tuner.core.disk import (
     write_text,
 )
 from tuner.core.errors import ConfigError, InputError, OutputError
-from tuner.core.files import read_arrays
+from tuner.core.files import csv_text, read_arrays, read_bytes
 from tuner.core.shipped import configs_folder, find_config
 
 
@@ -103,6 +109,79 @@ def test_damaged_arrays_are_one_line(content, tmp_path):
         read_arrays(tmp_path / "none.npz", remedy="run tune again")
 
 
+def test_arrays_that_unpack_to_too_much_are_not_unpacked(tmp_path):
+    path = tmp_path / "x.npz"
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open("a.npy", "w") as a,
+    ):
+        np.lib.format.write_array_header_1_0(
+            a, {"descr": "<f8", "fortran_order": False, "shape": (1 << 27,)}
+        )
+        for _ in range(1 << 10):
+            a.write(bytes(1 << 20))
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"x\.npz: is damaged .*; run tune again"):
+        read_arrays(path, remedy="run tune again")
+    assert tracemalloc.get_traced_memory()[1] < 1 << 24
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("shape", [(1 << 45,), (1 << 62, 1 << 62), (-1,)])
+def test_arrays_that_claim_too_much_are_damaged(shape, tmp_path):
+    path = tmp_path / "x.npz"
+    with zipfile.ZipFile(path, "w") as archive, archive.open("a.npy", "w") as a:
+        np.lib.format.write_array_header_1_0(
+            a, {"descr": "<f8", "fortran_order": False, "shape": shape}
+        )
+    with pytest.raises(InputError, match=r"x\.npz: is damaged"):
+        read_arrays(path, remedy="run tune again")
+
+
+@pytest.mark.parametrize("damage", ["crc", "encrypted", "method"])
+def test_a_damaged_archive_is_one_line(damage, tmp_path):
+    path = tmp_path / "x.npz"
+    np.savez(path, a=np.arange(1000.0))
+    raw = bytearray(path.read_bytes())
+    entry = raw.index(b"PK\x01\x02")
+    match damage:
+        case "crc":
+            raw[500] ^= 1
+        case "encrypted":
+            raw[entry + 8] |= 1
+        case "method":
+            raw[entry + 10] = 99
+    path.write_bytes(raw)
+    with pytest.raises(InputError, match=r"x\.npz: is damaged"):
+        read_arrays(path, remedy="run tune again")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes there")
+def test_a_pipe_in_a_folder_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "x")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for name in ("x", "zero"):
+        with pytest.raises(InputError, match="it is no file"):
+            read_arrays(tmp_path / name, remedy="run tune again")
+        with pytest.raises(ConfigError, match=r"cannot be read \(it is no file\)"):
+            read_bytes(tmp_path / name, most=10, remedy="run tune again")
+
+
+@pytest.mark.parametrize("word", ["=cmd|' /C calc'!A0", "+1+1", "-2+3", "@SUM(A1)", "\t =1"])
+def test_a_spreadsheet_takes_no_word_of_a_table_for_a_formula(word):
+    text = csv_text(("name", "value"), [(word, -1.5)])
+    assert list(csv.reader(io.StringIO(text, newline=""))) == [
+        ["name", "value"],
+        [f"'{word}", "-1.5"],
+    ]
+
+
+def test_a_name_with_a_line_break_makes_no_row_of_its_own():
+    text = csv_text(("name",), [("a\r=1",), ("a\n=1",)])
+    assert [len(row) for row in csv.reader(io.StringIO(text, newline=""))] == [1, 1, 1]
+    assert "\r" not in text
+
+
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -123,7 +202,17 @@ def test_a_path_is_a_path_and_a_bare_name_is_a_shipped_file(tmp_path):
 
 def test_runs_that_begin_within_a_second_get_folders_of_their_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    folders = {result_folder(None) for _ in range(5)}
+    with ExitStack() as stack:
+        folders = {stack.enter_context(result_folder(None)) for _ in range(5)}
     assert len(folders) == 5
     assert {folder.parent for folder in folders} == {Path("runs")}
-    assert result_folder(tmp_path / "named") == result_folder(tmp_path / "named")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of folders there")
+def test_a_named_folder_is_of_one_run_at_a_time(tmp_path):
+    with result_folder(tmp_path / "named") as folder:
+        assert folder == tmp_path / "named"
+        with pytest.raises(OutputError, match="named: another run writes there; wait for its end"):
+            result_folder(folder).__enter__()
+    with result_folder(folder):  # let go of
+        assert not list(folder.iterdir())
