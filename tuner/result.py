@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer, field_validator
+from pydantic_core import from_json
 
-from tuner.core.disk import exists
-from tuner.core.errors import InputError
-from tuner.core.files import FiniteOrNone, Part, ResultFile
+from tuner.core.disk import exists, folder_for, inside, remove_file
+from tuner.core.errors import InputError, OutputError
+from tuner.core.files import MAX_BYTES, FiniteOrNone, Part, ResultFile, read_bytes
 from tuner.core.yaml_section import refuse
 from tuner.design.proposals import LogProposal
 from tuner.evaluate.records import AxesRmse, PredictedErrors
@@ -26,6 +28,19 @@ EXPORTS = "export"
 """Folder of a result folder, for its exports."""
 BEST_FIT_FILE = "best_fit.yaml"
 EFFECTIVE_FILE = "effective.yaml"
+CHECKPOINTS = "checkpoint*.npz"
+OF_A_RUN = (
+    BEST_FIT_FILE, EFFECTIVE_FILE, "controller.yaml", "report.html", "traces.npz",
+    *(f"{name}.json" for name in ("about", "bench", "exports", "laps", "result", "search")),
+    *(f"{name}.csv" for name in ("bootstrap", "cross_validation", "information_shares", "metrics")),
+    *(f"{name}.csv" for name in ("correlation", "covariance", "information")),
+    *(
+        f"{name}.{suffix}"
+        for name in ("global_sensitivity", "next_flight", "profile", "profiles", "sensitivity")
+        for suffix in ("csv", "json")
+    ),
+)  # fmt: skip
+"""Files of a result folder beside checkpoints: those that one run or another writes there."""
 REMEDY = "give the result folder of a finished run, made by this version of tune (or run it again)"
 
 
@@ -326,6 +341,50 @@ class Run(BaseModel):
     result: RunResult
     vehicle: VehicleFile = Field(description="best_fit.yaml")
     effective: VehicleFile | None = Field(default=None, description="effective.yaml")
+
+
+def place_for(out: Path | None, *, resume: bool = False) -> Path:
+    """Return the folder of `folder_for`, in which there is nothing but what runs wrote.
+
+    Raises
+    ------
+    InputError
+        As of `folder_for`, or a file that no run wrote there would be replaced.
+    """
+    folder = folder_for(out, resume=resume)
+    theirs = [name for name in (*OF_A_RUN, EXPORTS) if exists(folder / name)]
+    if theirs and not _is_of_a_run(folder):
+        what = f"holds a {theirs[0]} that is of no run and would be replaced"
+        raise OutputError(folder, what, "name another folder, or move it away")
+    return folder
+
+
+def _is_of_a_run(folder: Path) -> bool:
+    """Return whether a run, of any version, was written into a folder."""
+    if any(folder.glob(CHECKPOINTS)):
+        return True
+    for name in ("result.json", "about.json"):
+        with suppress(InputError, ValueError):
+            content = from_json(read_bytes(folder / name, most=MAX_BYTES, remedy=REMEDY))
+            if isinstance(content, dict) and "schema_version" in content:
+                return True
+    return False
+
+
+def forget(folder: Path) -> None:
+    """Remove what an earlier run left in a folder: it would be taken for the next one's.
+
+    Raises
+    ------
+    OutputError
+        The system refuses.
+    """
+    with suppress(InputError):  # of another version
+        for record in (ExportRecords.read_if_any(folder) or ExportRecords()).exports.values():
+            if record.file.startswith(f"{EXPORTS}/"):
+                remove_file(inside(folder / EXPORTS, record.file.removeprefix(f"{EXPORTS}/")))
+    for name in OF_A_RUN:
+        remove_file(folder / name)
 
 
 def read_run(folder: str | Path) -> Run:

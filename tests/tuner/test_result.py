@@ -3,9 +3,9 @@ import json
 import pytest
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
-from tuner.core.errors import InputError
+from tuner.core.errors import InputError, OutputError
 from tuner.findings.findings import Code, Finding
-from tuner.result import read_run
+from tuner.result import ExportRecord, ExportRecords, forget, read_run
 
 
 def test_a_result_comes_back_from_its_file_as_it_was(make_run):  # noqa: F811
@@ -79,3 +79,27 @@ def test_a_folder_without_a_result_is_named(tmp_path):
     (tmp_path / "result.json").write_text("{")
     with pytest.raises(InputError, match=r"result\.json"):
         read_run(tmp_path)
+
+
+def test_nothing_of_an_earlier_run_is_left_for_the_next_one(make_run):  # noqa: F811
+    folder = make_run().folder
+    exports = folder / "export"
+    exports.mkdir()
+    for path in (folder / "bootstrap.csv", folder / "notes.txt", exports / "quad.sdf"):
+        path.touch()
+    (exports / "own.sdf").touch()
+    records = {
+        kind: ExportRecord(format=kind, file=file)
+        for kind, file in {"sdf": "export/quad.sdf", "px4": "export/../notes.txt"}.items()
+    }
+    ExportRecords(exports=records).write(folder)
+    forget(folder)
+    left = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert left == {"notes.txt", "export/own.sdf"}
+
+
+def test_what_cannot_be_removed_is_one_line(make_run):  # noqa: F811
+    folder = make_run().folder
+    (folder / "report.html").mkdir()
+    with pytest.raises(OutputError, match=r"report\.html: cannot be written"):
+        forget(folder)

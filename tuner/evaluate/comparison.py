@@ -400,6 +400,10 @@ def compare(
     for path in out:
         check_table_file(path)
     settings, logged = as_logged(settle(options, fits=False))
+    read = {flight.resolve() for flight in settings.flights}
+    for path in out:
+        if path.resolve() in read:
+            raise InputError("--out", f"{path} is one of the flights", "name another file")
     if not vehicles:
         raise InputError("--vehicle", "names no vehicle", "name the vehicles to compare")
     if not isinstance(vehicles, Mapping):

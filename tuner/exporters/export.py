@@ -30,6 +30,7 @@ from tuner.options import ExportOptions
 from tuner.report.result_texts import what_is_exported, what_is_lost
 from tuner.result import (
     EXPORTS,
+    OF_A_RUN,
     EffectiveResult,
     ExportRecord,
     ExportRecords,
@@ -90,6 +91,8 @@ def export(
     """
     target, into, out = target_of(asked.format), asked.into, asked.out
     own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
+    if out is not None and out.name in OF_A_RUN:
+        _keep(out, run.folder / out.name)
     if out is None or out.suffix:  # before anything is computed
         check_file(out or into or inside(run.folder, own))
     target = target.for_simulator(asked.simulator, into)
@@ -126,6 +129,12 @@ def export(
     return Exported(places[0], gates, notes)
 
 
+def _keep(out: Path, read: Path) -> None:
+    """Refuse to write over what the numbers come from."""
+    if out.resolve() == read.resolve():
+        raise ExportError("--out", f"{out} is what is exported", "name another file")
+
+
 def _record(folder: Path, made: ExportRecord) -> None:
     """Note in a result folder what was exported into it, or was not."""
     known = ExportRecords.read_if_any(folder) or ExportRecords()
@@ -150,6 +159,8 @@ def export_vehicle(file: Path, asked: ExportOptions, *, today: date) -> Exported
         As of `export`.
     """
     vehicle = read_vehicle(file)
+    if asked.out is not None:
+        _keep(asked.out, file)
     target = target_of(asked.format).for_simulator(asked.simulator, asked.into)
     simulator = target.simulator
     check_every_coefficient(vehicle, target)

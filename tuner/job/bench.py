@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
-from tuner.core.disk import folder_for, result_folder
-from tuner.core.errors import ConfigError
+from tuner.core.disk import result_folder
+from tuner.core.errors import ConfigError, InputError
 from tuner.core.numerics import Z95
 from tuner.core.runtime import PROGRAM, versions
 from tuner.core.shipped import find_config
@@ -21,14 +21,16 @@ from tuner.ground.experiments import measure, names_of
 from tuner.ground.measurement import Measurement, error_of, scaled_of, value_of
 from tuner.ground.plan import BenchFile, YawSpin, read_bench
 from tuner.report import render
-from tuner.report.contents import forget
 from tuner.result import (
     BEST_FIT_FILE,
+    CHECKPOINTS,
     CoefficientResult,
     Ending,
     RunResult,
     SearchResult,
     Status,
+    forget,
+    place_for,
 )
 from tuner.uncertainty.verdict import NOT_FITTED, Reason, ReasonCode, Verdict, judge_by_error
 from tuner.vehicle import (
@@ -82,7 +84,8 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
     """
     began = time.perf_counter()
     plan = read_bench(path)
-    folder_for(out)
+    if any(place_for(out).glob(CHECKPOINTS)):
+        raise InputError("--out", f"{out} holds the result of a fit", "name another folder")
     given = read_vehicle(find_config("vehicles", plan.vehicle, path.parent))
     start = given if plan.weighed_mass is None else given.replace(mass=plan.weighed_mass)
     measurements, combination, vehicle = _estimate(path, plan, start)
@@ -149,13 +152,13 @@ def written(
             message=Ending.NO_FURTHER_GAIN,
         ),
     )
-    folder = result_folder(out)
-    forget(folder)
     made_by = {"made_by": f"{PROGRAM} {result.versions[PROGRAM]}", **source}
-    write_vehicle(vehicle.replace(source=made_by), folder / BEST_FIT_FILE, header=header)
-    bench_record(combination, measurements).write(folder)
-    result.write(folder)
-    render(folder)
+    with result_folder(out) as folder:
+        forget(folder)
+        write_vehicle(vehicle.replace(source=made_by), folder / BEST_FIT_FILE, header=header)
+        bench_record(combination, measurements).write(folder)
+        result.write(folder)
+        render(folder)
     return BenchResult(folder, result, measurements, combination)
 
 

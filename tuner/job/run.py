@@ -14,7 +14,7 @@ from math import nan
 from pathlib import Path
 
 from tuner.config import Options, Settings, settle
-from tuner.core.disk import folder_for, result_folder
+from tuner.core.disk import result_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.core.phrases import clause
 from tuner.core.spans import span
@@ -45,10 +45,9 @@ from tuner.job.results import (
     write_next_flight,
 )
 from tuner.report import render, write_search, write_traces
-from tuner.report.contents import forget
 from tuner.report.outcome import OTHER_INPUTS
 from tuner.report.result_texts import export_sentence
-from tuner.result import BEST_FIT_FILE, Run, RunResult
+from tuner.result import BEST_FIT_FILE, OF_A_RUN, Run, RunResult, forget, place_for
 from tuner.search.estimation import OnProgress
 from tuner.search.explanation import Explanation
 from tuner.search.findings import inputs_late, turning_unexplained, voltage_taken
@@ -106,7 +105,7 @@ def run(
     """
     settings, logged = as_logged(settle(options))
     listener.on_settings(settings)
-    _check_place(options, folder_for(out, resume=resume))
+    _check_place(options, settings, place_for(out, resume=resume))
     job, findings = prepared(settings)
     findings = (*logged, *findings)
     _check_refits(options, job)
@@ -115,10 +114,37 @@ def run(
     with span("check"):
         at_start = tuple(check_information(job))
     _check(at_start, explanation, listener, force=options.force)
-    folder = result_folder(out)
+    with result_folder(out) as folder:
+        result = _fit(
+            job,
+            folder,
+            options,
+            settings=settings,
+            findings=(*findings, *at_start),
+            explanation=explanation,
+            listener=listener,
+            command=command,
+            resume=resume,
+        )
+    return folder, result
+
+
+def _fit(
+    job: Job,
+    folder: Path,
+    options: Options,
+    *,
+    settings: Settings,
+    findings: tuple[Finding, ...],
+    explanation: Explanation,
+    listener: Listener,
+    command: str,
+    resume: bool,
+) -> RunResult:
+    """Search, validate, and write everything into a folder; findings are of the check before."""
     found, validation, (selected, fitted, examination) = _fitted(
         job,
-        (*findings, *at_start),
+        findings,
         folder,
         explanation,
         listener,
@@ -179,7 +205,7 @@ def run(
         result = result.model_copy(update={"findings": findings})
         result.write(folder)
     explanation.part("page", partial(render, folder), None)
-    return folder, result
+    return result
 
 
 def prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
@@ -327,10 +353,15 @@ def _with_refits(
     return result
 
 
-def _check_place(options: Options, folder: Path) -> None:
+def _check_place(options: Options, settings: Settings, folder: Path) -> None:
     """Refuse a result folder of which the run reads what it would write there."""
     if options.bench and folder.resolve() == Path(options.bench).resolve():
         raise InputError("--out", "is the folder of --bench", "name another folder")
+    read = (options.vehicle, options.controller, settings.job.vehicle, settings.job.controller)
+    for file in map(Path, filter(lambda named: isinstance(named, str | Path), read)):
+        if file.name in OF_A_RUN and file.resolve().parent == folder.resolve():
+            what = f"is the folder of {file}, which would be replaced"
+            raise InputError("--out", what, "name another folder")
 
 
 def _check_refits(options: Options, job: Job) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tuner.config import Settings, settle
-from tuner.core.disk import exists, folder_for, result_folder
+from tuner.core.disk import exists, result_folder
 from tuner.core.errors import InputError, did_you_mean
 from tuner.core.runtime import versions
 from tuner.design.proposals import Proposals
@@ -20,8 +20,8 @@ from tuner.job.results import write_knowledge, write_next_flight
 from tuner.objective.normal_equations import Objective, misfit, root_mean_squares, sums_at
 from tuner.options import ExaminationOptions
 from tuner.report import render
-from tuner.report.contents import About, Recording, forget, write_traces
-from tuner.result import RunResult
+from tuner.report.contents import About, Recording, write_traces
+from tuner.result import RunResult, forget, place_for
 from tuner.search.continuation import SWITCH_GAIN
 from tuner.search.findings import UNMATCHED, loop_findings
 from tuner.search.job_flights import as_logged, read_usable
@@ -118,25 +118,25 @@ def examine_vehicle(
     settings, logged = as_logged(settle(asked, fits=False))
     room = None if arena is None else Arena.of(arena)
     check_names(asked.profile or (), "--profile")
-    if exists(folder_for(asked.out) / RunResult.FILE):
+    if exists(place_for(asked.out) / RunResult.FILE):
         raise InputError("--out", f"{asked.out} holds the result of a fit", "name another folder")
     recordings, noticed = read_usable(settings, holdout=())
     job = job_of(settings, recordings)
-    out = result_folder(asked.out)
-    forget(out)
-    fitted = unfitted(job)
-    fitted = replace(fitted, findings=(*logged, *noticed, *fitted.findings))
-    on_message("simulating, and differentiating by every coefficient")
-    examination = examine(
-        fitted, otherwise=alternatives_of(fitted.objective, fitted.point), at_minimum=False
-    )
-    knowledge = write_knowledge(out, job, examination, fitted)
-    on_message("simulating what could be flown next")
-    proposals = write_next_flight(out, job, examination, fitted, room)
-    _write_requested(asked, job, fitted, examination, folder=out, on_message=on_message)
-    write_traces(out, {"simulated": comparison_of(job, fitted).fly(settings.vehicle)})
-    _about(settings, job, fitted, command).write(out)
-    render(out)
+    with result_folder(asked.out) as out:
+        fitted = unfitted(job)
+        fitted = replace(fitted, findings=(*logged, *noticed, *fitted.findings))
+        on_message("simulating, and differentiating by every coefficient")
+        examination = examine(
+            fitted, otherwise=alternatives_of(fitted.objective, fitted.point), at_minimum=False
+        )
+        forget(out)
+        _about(settings, job, fitted, command).write(out)
+        knowledge = write_knowledge(out, job, examination, fitted)
+        on_message("simulating what could be flown next")
+        proposals = write_next_flight(out, job, examination, fitted, room)
+        _write_requested(asked, job, fitted, examination, folder=out, on_message=on_message)
+        write_traces(out, {"simulated": comparison_of(job, fitted).fly(settings.vehicle)})
+        render(out)
     return SensitivityResult(out, knowledge, proposals, fitted.findings)
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from tuner.config import Settings
-from tuner.core.disk import folder_for
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.evaluate.validation import WORSE
 from tuner.findings.findings import Code, Finding, Level
@@ -22,6 +21,7 @@ from tuner.inertial.signals import stretches_of
 from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.job.listener import SILENT, Listener
 from tuner.recordings.loader import InertialFlight
+from tuner.result import place_for
 from tuner.search.job_flights import left_out_of
 from tuner.vehicle import VehicleFile, values_of, with_values
 
@@ -63,7 +63,7 @@ def fit_without_pose(
     """
     began = time.perf_counter()
     start = settings.vehicle
-    folder_for(out)
+    place_for(out)
     held_out = [flight for flight in flights if flight.name in settings.job.holdout]
     to_fit = [flight for flight in flights if flight.name not in settings.job.holdout]
     measured, used, unusable = _measured(to_fit, start, listener)

@@ -141,16 +141,6 @@ class About(ResultFile):
     flights: list[Recording]
 
 
-def forget(folder: Path) -> None:
-    """Remove what an earlier run left in a folder: the page would take it for the next one's."""
-    kinds = (
-        RunResult, About, Knowledge, Proposals, GlobalSensitivity, Profiles, BenchRecord,
-        SearchRecord, Table, ExportRecords,
-    )  # fmt: skip
-    for name in (*(kind.FILE for kind in kinds), TRACES_FILE):
-        (folder / name).unlink(missing_ok=True)
-
-
 def write_search(folder: Path, fitted: Fitted) -> None:
     """Write ``search.json`` of a finished search."""
     iterations, starts = list(fitted.iterations), list(fitted.outcomes)

@@ -18,7 +18,7 @@ from typing import IO, Any
 
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import digest_of, inside
-from tuner.result import RunResult
+from tuner.result import CHECKPOINTS, RunResult
 from tuner.service.errors import full_disk
 from tuner.service.queue import Claim, Outcome
 from tuner.service.request import FLIGHTS, CheckedRequest
@@ -27,7 +27,6 @@ from tuner.service.tables import State
 from tuner.service.worker import RESULT, Assignment
 
 WORKER = [sys.executable, "-m", "tuner.service.worker"]
-CHECKPOINTS = "checkpoint*.npz"
 BEAT = 0.5
 """s between two looks at whether the attempt is still wanted"""
 LONGEST_LINE = 1_000_000

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from tuner.cli import main
+from tuner.core.disk import result_folder
 
 BAG = Path(__file__).parents[3] / "reference_flights" / "yaw_spin_3rps.bag"
+BENCH = BAG.parents[1] / "examples" / "bench" / "bench.yaml"
 LONG = "x" * 300
 TUNE = ("--flights", "{bag}")
 SENSITIVITY = ("sensitivity", "--flights", "{bag}")
@@ -114,6 +116,58 @@ def test_a_folder_that_does_not_exist_is_made(command, lab):
 @pytest.mark.parametrize(("command", "expected"), IN)
 def test_a_place_that_cannot_be_read(command, expected, lab, capsys):
     refused(command, expected, lab, capsys)
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        ((*TUNE, "--mass", "2"), "controller.yaml"),
+        (TUNE, "result.json"),
+        (SENSITIVITY, "sensitivity.csv"),
+        (("bench", str(BENCH)), "best_fit.yaml"),
+        (("fetch", "00", "--server", "{server}"), "report.html"),
+    ],
+)
+def test_a_folder_of_somebody_else(command, name, lab, capsys, monkeypatch):
+    job = {"id": "00", "state": "done", "files": [name]}
+    monkeypatch.setattr("tuner.client.client.Client.job", lambda *_: job)
+    command = [word.replace("{server}", "http://127.0.0.1:9") for word in command]
+    (lab / "theirs").mkdir()
+    (lab / "theirs" / name).write_text("{}")
+    expected = f"theirs: holds a {name} that is of no run and would be replaced; name another"
+    refused((*command, "--out", "{lab}/theirs"), expected, lab, capsys)
+
+
+def test_a_vehicle_in_the_folder_of_the_result(lab, capsys):
+    command = (*TUNE, "--vehicle", "{lab}/run/best_fit.yaml")
+    refused((*command, "--out", "{lab}/run"), "best_fit.yaml, which would be replaced", lab, capsys)
+
+
+def test_ground_measurements_into_the_folder_of_a_fit(lab, capsys):
+    (lab / "run" / "checkpoint.npz").touch()
+    command = ("bench", str(BENCH), "--out", "{lab}/run")
+    refused(command, "run holds the result of a fit; name another folder", lab, capsys)
+
+
+def test_a_table_over_a_flight(lab, capsys, monkeypatch):
+    monkeypatch.setattr("tuner.evaluate.comparison.check_table_file", lambda _: None)
+    refused((*COMPARE, "--out", "{bag}"), "spin.bag is one of the flights", lab, capsys)
+
+
+@pytest.mark.parametrize(
+    ("source", "out"),
+    [("{lab}/run", "{lab}/run/result.json"), ("{lab}/own.yaml", "{lab}/own.yaml")],
+)
+def test_an_export_over_what_it_reads(source, out, lab, capsys):
+    (lab / "own.yaml").write_bytes((lab / "run" / "best_fit.yaml").read_bytes())
+    command = ("export", source, "--format", "yaml", "--out", out)
+    refused(command, "is what is exported; name another file", lab, capsys)
+
+
+@pytest.mark.parametrize("command", [TUNE, ("bench", str(BENCH))])
+def test_a_folder_that_another_run_writes_into(command, lab, capsys):
+    with result_folder(lab / "run"):
+        refused((*command, "--out", "{lab}/run"), "another run writes there", lab, capsys)
 
 
 @pytest.mark.parametrize("command", [COMPARE, ("inspect", "{bag}")])

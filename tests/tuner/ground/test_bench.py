@@ -66,6 +66,7 @@ def test_the_terminal_gets_each_experiment_and_the_agreement(tmp_path, capsys):
     left = tmp_path / "out" / "sensitivity.json"  # of an earlier run
     left.parent.mkdir()
     left.write_text("{}")
+    (left.parent / "about.json").write_text('{"schema_version": 1}')
     assert run(tmp_path, plan, "--out", str(tmp_path / "out")) == 0
     assert not left.exists()
     out = capsys.readouterr().out

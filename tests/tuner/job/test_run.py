@@ -25,7 +25,7 @@ from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause
 from tuner.report import render
 from tuner.report.contents import SearchRecord
-from tuner.result import read_run
+from tuner.result import OF_A_RUN, read_run
 from tuner.search.iteration import PointEstimate
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, read_controller, read_vehicle, values_of
@@ -138,6 +138,8 @@ def test_the_set_ups_integrator_is_identified_and_reported(finished):
 @pytest.mark.slow
 def test_the_folder_holds_what_later_commands_read(finished):
     folder, result = finished
+    files = {path.name for path in folder.iterdir() if path.is_file() if path.suffix != ".npz"}
+    assert files <= set(OF_A_RUN)
     vehicle = read_vehicle(folder / "best_fit.yaml")
     for name, value in values_of(vehicle).items():
         assert value == result.coefficients[name].best
@@ -263,7 +265,7 @@ def test_an_interrupted_run_goes_on_elsewhere_to_the_same_numbers(broken, salvag
 
     job = Options([str(broken)], **SHORT)
     (tmp_path / "cut").mkdir()
-    (tmp_path / "cut" / "result.json").write_text("of an earlier run")
+    (tmp_path / "cut" / "result.json").write_text('{"schema_version": 1}')
     with pytest.raises(KeyboardInterrupt):
         run(job, out=tmp_path / "cut", listener=Listener(on_iteration=interrupt))
     assert (tmp_path / "cut" / "best_fit.yaml").exists()

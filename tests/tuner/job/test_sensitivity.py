@@ -9,6 +9,7 @@ from tuner.cli import main
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
 from tuner.job.results import arena_of
+from tuner.result import OF_A_RUN
 from tuner.vehicle import ControllerFile
 
 pytestmark = pytest.mark.slow
@@ -31,24 +32,28 @@ def examined(bag, updated, tmp_path_factory):
 
 def test_the_folder_holds_tables_matrices_and_the_report(examined):
     names = {path.name for path in examined.folder.iterdir()}
-    assert {
-        "sensitivity.csv",
-        "sensitivity.json",
-        "information_shares.csv",
-        "correlation.csv",
-        "covariance.csv",
-        "information.csv",
-        "next_flight.csv",
-        "about.json",
-        "report.html",
-    } <= names
+    assert (
+        {
+            "sensitivity.csv",
+            "sensitivity.json",
+            "information_shares.csv",
+            "correlation.csv",
+            "covariance.csv",
+            "information.csv",
+            "next_flight.csv",
+            "about.json",
+            "report.html",
+        }
+        <= names
+        <= {*OF_A_RUN}
+    )
     about = json.loads((examined.folder / "about.json").read_text())
     assert about["flights"][0]["name"] == "small_circle"
     assert len(about["flights"][0]["sha256"]) == 64
 
 
 def test_the_folder_of_a_fit_is_left_alone(bag, tmp_path):
-    (tmp_path / "result.json").write_text("{}")
+    (tmp_path / "result.json").write_text('{"schema_version": 1}')
     with pytest.raises(InputError, match="holds the result of a fit"):
         tuner.sensitivity([bag], out=tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["result.json"]
