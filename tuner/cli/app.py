@@ -8,6 +8,7 @@ import shlex
 import sys
 import traceback
 from collections.abc import Sequence
+from io import TextIOWrapper
 from typing import NoReturn
 
 from cyclopts import App, CycloptsError
@@ -162,6 +163,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
     TYPED.set(shlex.join(["tune", *given]))
+    for stream in (sys.stdout, sys.stderr):  # a terminal of another encoding lacks letters
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")
     logging.basicConfig(level=logging.WARNING, format="tune: %(message)s", stream=sys.stderr)
     logging.captureWarnings(True)
     status = DONE

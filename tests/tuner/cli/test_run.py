@@ -177,3 +177,14 @@ def test_a_name_that_is_not_utf_8_is_refused(arguments, tmp_path, capsys):
     err = capsys.readouterr().err
     assert "its name is not UTF-8" in err
     assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_terminal_that_lacks_letters_shows_others(encoding):
+    script = "import sys\nfrom tuner.cli import main\nsys.exit(main(['inspect', sys.argv[1]]))"
+    bag = ROOT / "reference_flights" / "yaw_spin_3rps.bag"
+    environment = os.environ | {"PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"}
+    done = subprocess.run(
+        [sys.executable, "-c", script, bag], capture_output=True, env=environment, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
