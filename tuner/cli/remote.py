@@ -93,11 +93,11 @@ def submit(
     from tuner.cli.progress import listening
     from tuner.cli.results import print_run
     from tuner.client.client import ended_well
-    from tuner.core.disk import folder_for
+    from tuner.result import place_for
 
     with client_of(server, token) as client:
         if wait:
-            folder_for(out)
+            place_for(out)
         job = client.submit(fitted, name=name)
         if not wait:
             print(job if quiet else f"job {job}: {client.url}/jobs/{job}")
@@ -225,8 +225,8 @@ def cancel(job: JobName, /, *, server: Server = None, token: Token = None) -> No
         Its id.
     """
     with client_of(server, token) as client:
-        client.cancel(job)
-    print(f"job {job}: cancelled")
+        cancelled = client.cancel(job)["id"]
+    print(f"job {_plain(cancelled)}: cancelled")
 
 
 def watch_folder(

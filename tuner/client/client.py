@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import quote
 
 from tuner.config import Settings, settle
-from tuner.core.disk import folder_for, inside, result_folder, whole_file
+from tuner.core.disk import inside, result_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.core.shipped import Kind, configs_folder, find_config
 from tuner.core.yaml_document import read_yaml
@@ -21,7 +21,7 @@ from tuner.core.yaml_section import Section
 from tuner.options import FILES, FitOptions, taking
 from tuner.recordings.cache import digest
 from tuner.recordings.topics import load_topic_map
-from tuner.result import Run, read_run
+from tuner.result import Run, RunResult, forget, place_for, read_run
 from tuner.vehicle import read_vehicle
 from tuner.vehicle.controller import read_controller
 
@@ -29,6 +29,7 @@ Named = str | Path
 Event = tuple[str, dict[str, Any]]
 API = "/api/v1"
 DEFAULT_SERVER = "http://127.0.0.1:8000"
+EVENT_STREAM = "text/event-stream"
 PATIENCE = 60.0
 """s for which a server that answers no more is waited for while a job is followed"""
 
@@ -68,7 +69,7 @@ class Client:
         except (ValueError, httpx.InvalidURL):
             what = f"{url!r} is no address"
             raise InputError("--server", what, f"write {DEFAULT_SERVER}") from None
-        self._errors = httpx.TransportError
+        self._errors = httpx.RequestError
         self._http = httpx.Client(
             base_url=self.url,
             headers={"Authorization": f"Bearer {token}"} if token else {},
@@ -110,7 +111,7 @@ class Client:
             The server could not finish the job.
         """
         given = FitOptions.of(flights, **options)
-        folder_for(None if out is None else Path(out))
+        place_for(None if out is None else Path(out))
         job = self.submit(given, name=name)
         self.wait(job)
         return self.fetch(job, out)
@@ -193,7 +194,10 @@ class Client:
                         if answer.status_code < 500:
                             self._check(answer)
                         raise self._errors("the server is ending")
-                    for number, kind, content in _events(answer.iter_lines()):
+                    if not answer.headers.get("content-type", "").startswith(EVENT_STREAM):
+                        raise self._stranger()
+                    for number, kind, data in _events(answer.iter_lines()):
+                        content = self._said_in(data)
                         last, since = number or last, time.monotonic()
                         yield kind, content
                         if kind == "job" and content["ended"] is not None:
@@ -236,12 +240,15 @@ class Client:
         found = ended_well(self.job(job))
         if found["state"] != "done":
             raise InputError(f"job {job}", f"is {found['state']}", f"tune watch {job}")
-        folder = result_folder(None if out is None else Path(out))
-        for name in found["files"]:
-            target = inside(folder, name)
-            with whole_file(target) as unfinished:
-                self._download(f"{_at(job)}/files/{quote(name)}", unfinished)
-        return read_run(folder)
+        place = None if out is None else Path(out)
+        place_for(place)
+        with result_folder(place) as folder:
+            forget(folder)
+            for name in sorted(found["files"], key=lambda name: name != RunResult.FILE):
+                target = inside(folder, name)
+                with whole_file(target) as unfinished:
+                    self._download(f"{_at(job)}/files/{quote(name)}", unfinished)
+            return read_run(folder)
 
     def history(self, vehicle: str) -> dict[str, Any]:
         """Return each coefficient over a vehicle's jobs."""
@@ -275,10 +282,16 @@ class Client:
         if may_lack and answer.status_code == 404:
             return {}
         self._check(answer)
+        return self._said_in(answer.content)
+
+    def _said_in(self, text: str | bytes) -> dict[str, Any]:
+        """Return what a server said in JSON."""
         try:
-            found: dict[str, Any] = answer.json()
+            found = json.loads(text, object_hook=lambda said: _Said(said, self._stranger()))
         except ValueError:
-            raise self._stranger() from None
+            found = None
+        if not isinstance(found, dict):
+            raise self._stranger()
         return found
 
     def _check(self, answer: Any) -> None:
@@ -309,6 +322,17 @@ class Client:
 
     def _stranger(self) -> InputError:
         return InputError("--server", f"{self.url} is no tuning service", "check the address")
+
+
+class _Said(dict[str, Any]):
+    """What a server said: a key that it left out is no key of a tuning service."""
+
+    def __init__(self, content: dict[str, Any], otherwise: InputError) -> None:
+        super().__init__(content)
+        self._otherwise = otherwise
+
+    def __missing__(self, key: str) -> Any:
+        raise self._otherwise
 
 
 def ended_well(job: dict[str, Any]) -> dict[str, Any]:
@@ -344,13 +368,13 @@ def _at(job: str) -> str:
     return f"/jobs/{quote(job, safe='')}"
 
 
-def _events(lines: Iterator[str]) -> Iterator[tuple[str | None, str, dict[str, Any]]]:
-    """Yield number, kind and content of each event of a stream."""
+def _events(lines: Iterator[str]) -> Iterator[tuple[str | None, str, str]]:
+    """Yield number, kind and data of each event of a stream."""
     number, kind, data = None, "message", ""
     for line in lines:
         if not line:
             if data:
-                yield number, kind, json.loads(data)
+                yield number, kind, data
             number, kind, data = None, "message", ""
             continue
         field, _, value = line.partition(": ")

@@ -81,10 +81,18 @@ def _new(folder: Path) -> dict[Path, Marks]:
     """Return the recordings that were not submitted as they are now."""
     before = Submitted.read_if_any(folder) or Submitted()
     found = {}
-    for path in sorted(folder.iterdir()):
+    try:
+        paths = sorted(folder.iterdir())
+    except OSError as error:
+        what = f"cannot be read any more ({error.strerror})"
+        raise InputError(folder, what, "check the folder and the disk") from None
+    for path in paths:
         if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or not path.is_file():
             continue
-        about = path.stat()
+        try:
+            about = path.stat()
+        except FileNotFoundError:  # it was moved away just now
+            continue
         marks = (about.st_size, about.st_mtime_ns)
         if before.recordings.get(path.name, (0, 0, ""))[:2] != marks:
             found[path] = marks

@@ -358,7 +358,7 @@ def _check_place(options: Options, settings: Settings, folder: Path) -> None:
     if options.bench and folder.resolve() == Path(options.bench).resolve():
         raise InputError("--out", "is the folder of --bench", "name another folder")
     read = (options.vehicle, options.controller, settings.job.vehicle, settings.job.controller)
-    for file in map(Path, filter(lambda named: isinstance(named, str | Path), read)):
+    for file in [Path(named) for named in read if isinstance(named, str | Path)]:
         if file.name in OF_A_RUN and file.resolve().parent == folder.resolve():
             what = f"is the folder of {file}, which would be replaced"
             raise InputError("--out", what, "name another folder")

@@ -27,9 +27,9 @@ from tuner.core.errors import EngineError, InputError
 from tuner.core.runtime import cores
 from tuner.engine.engine import Engine
 from tuner.engine.engine import Report as Channel
+from tuner.result import CHECKPOINTS
 from tuner.service.attempt import (
     BEAT,
-    CHECKPOINTS,
     DiedError,
     Events,
     Report,

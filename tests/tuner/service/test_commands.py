@@ -6,7 +6,9 @@ import json
 import subprocess
 import sys
 import time
+from pathlib import Path
 
+import httpx
 import pytest
 
 import tuner
@@ -173,6 +175,61 @@ def test_a_recording_that_still_grows_is_waited_for(tmp_path, table):
     time.sleep(0.01)
     (tmp_path / "a.csv").write_bytes(table.read_bytes())
     assert folder_module._new(tmp_path) != first
+
+
+def test_a_recording_that_is_moved_away_is_passed_over(tmp_path, table, monkeypatch):
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_bytes(table.read_bytes())
+    is_file = Path.is_file
+
+    def then_moved(path):
+        there = is_file(path)
+        if path.name == "a.csv":
+            path.unlink()
+        return there
+
+    monkeypatch.setattr(Path, "is_file", then_moved)
+    assert [path.name for path in folder_module._new(tmp_path)] == ["b.csv"]
+    with pytest.raises(InputError, match=r"gone: cannot be read any more \(No such file"):
+        folder_module._new(tmp_path / "gone")
+
+
+STREAM = {"Content-Type": "text/event-stream"}
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        *(
+            (200, {}, text)
+            for text in (b"", b"[]", b"5", b"{}", b'{"jobs": [{}]}', b"<p>", b"\xff")
+        ),
+        (302, {"Location": "http://elsewhere"}, b""),
+        (404, {}, b'{"detail": "not found"}'),
+        (200, {"Content-Encoding": "gzip"}, b"no gzip"),
+        *((200, STREAM, b"event: job\ndata: %s\n\n" % data) for data in (b"{}", b"no json", b"[]")),
+    ],
+)
+@pytest.mark.parametrize(
+    "command", [["jobs"], ["watch", "0"], ["fetch", "0"], ["cancel", "0"], ["submit", "--flights"]]
+)
+def test_what_is_no_tuning_service_is_one_line(command, answer, table, capsys, monkeypatch):
+    made = httpx.Client
+
+    def answered(_):
+        status, headers, content = answer
+        return httpx.Response(status, headers=headers, stream=httpx.ByteStream(content))
+
+    def answering(**given):
+        return made(**given, transport=httpx.MockTransport(answered))
+
+    monkeypatch.setattr(httpx, "Client", answering)
+    monkeypatch.setattr("tuner.client.client.PATIENCE", -1.0)
+    if command == ["submit", "--flights"]:
+        command = [*command, str(table)]
+    assert main([*command, "--server", "http://other"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("tune: --server: http://other ")
 
 
 def test_plain_tune_loads_nothing_of_the_service():
