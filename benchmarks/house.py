@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from docs.generate.house import ROOT, imported
+from docs.generate.house import ROOT, imported, statements
 
 PACKAGES = ("tuner", "sim_jax", "lanes")
 SMALL = 60
@@ -26,20 +26,21 @@ def counts(root: Path) -> dict[str, float]:
     """Return what is counted of a checkout's packages."""
     files = [f for p in PACKAGES for f in sorted((root / p).rglob("*.py"))]
     lines = {f: len(f.read_text(encoding="utf-8").splitlines()) for f in files}
-    nodes = [n for f in files for n in ast.walk(ast.parse(f.read_text(encoding="utf-8")))]
+    nodes = [n for f in files for n in statements(f)]
+    imports = {f: set(imported(f)) for f in files}
     modules = [f for f in files if f.name != "__init__.py"]
     names = {".".join(f.relative_to(root).with_suffix("").parts) for f in modules}
-    importers = Counter(m for f in files for m in set(imported(f)) if m in names)
+    importers = Counter(m for found in imports.values() for m in found if m in names)
     rooms = {f.relative_to(root).parts[:2] for f in files if len(f.relative_to(root).parts) > 2}
     between = {
         (f.relative_to(root).parts[1], m.split(".")[1])
         for f in files
-        for m in imported(f)
+        for m in imports[f]
         if f.is_relative_to(root / "tuner") and m.startswith("tuner.")
     }
     return {
         "lines": sum(lines.values()),
-        "statements": sum(isinstance(n, ast.stmt) for n in nodes),
+        "statements": len(nodes),
         "files": len(files),
         "lines of a file in the mean": statistics.mean(lines[f] for f in modules),
         f"modules under {SMALL} lines": sum(lines[f] < SMALL for f in modules),

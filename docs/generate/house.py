@@ -46,9 +46,21 @@ def rooms() -> list[str]:
     return layers
 
 
+def statements(file: Path) -> Iterator[ast.stmt]:
+    """Yield a file's statements, wherever in it they stand."""
+    left: list[ast.AST] = [ast.parse(file.read_text(encoding="utf-8"))]
+    while left:
+        node = left.pop()
+        if isinstance(node, ast.stmt):
+            yield node
+        for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+            inside = getattr(node, field, None)
+            left += inside if isinstance(inside, list) else ()
+
+
 def imported(file: Path) -> Iterator[str]:
     """Yield the modules that a file imports from, wherever in it that stands."""
-    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+    for node in statements(file):
         if isinstance(node, ast.ImportFrom) and node.module:
             yield node.module
             yield from (f"{node.module}.{alias.name}" for alias in node.names)

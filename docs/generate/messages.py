@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -216,10 +217,12 @@ def _sites() -> Iterator[tuple[str, list[Message]]]:
 
 
 def _errors_made(scope: ast.FunctionDef) -> Iterator[ast.Call]:
-    inner = {id(n) for f in ast.walk(scope) if isinstance(f, ast.FunctionDef) and f is not scope
-             for n in ast.walk(f)}  # fmt: skip
-    for node in ast.walk(scope):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and id(node) not in inner:
+    """Yield the calls that make an error, those of functions within left to these."""
+    left: deque[ast.AST] = deque([scope])
+    while left:
+        node = left.popleft()
+        left += (n for n in ast.iter_child_nodes(node) if not isinstance(n, ast.FunctionDef))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
             made = node.func.id.endswith("Error") and len(node.args) == 3
             refused = node.func.id == "refuse" and len(node.args) == 2
             if made or refused:

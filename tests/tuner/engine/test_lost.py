@@ -28,7 +28,7 @@ def cluster(tmp_path):
     ends = ("--scheduler-file", str(file))
     place = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
     scheduler = subprocess.Popen([*SCHEDULER, *place, *ends], **quiet)
-    worker = subprocess.Popen([*WORKER, *ends, "--nthreads", "1", "--no-dashboard"], **quiet)
+    worker = subprocess.Popen([*WORKER, *ends, "--nthreads", "1", "--no-nanny", "--no-dashboard"], **quiet)
     try:
         while not file.exists() or not file.read_text().strip().endswith("}"):
             time.sleep(0.1)
@@ -118,7 +118,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)
     print("begins", flush=True)
     try:
-        with engine_for(2) as engine:
+        with engine_for(int(sys.argv[2])) as engine:
             engine.map(
                 tasks.until_stopped, [sys.argv[1]] * 4, lambda *_: print("works", flush=True)
             )
@@ -144,12 +144,12 @@ def processes_of(group):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moment", ["workers start", "workers work"])
-def test_ctrl_c_ends_every_process(tmp_path, moment):
+@pytest.mark.parametrize(("moment", "workers"), [("workers start", 1), ("workers work", 2)])
+def test_ctrl_c_ends_every_process(tmp_path, moment, workers):
     script = tmp_path / "impatient.py"
     script.write_text(IMPATIENT)
     user = subprocess.Popen(
-        [sys.executable, str(script), str(tmp_path / "ended")],
+        [sys.executable, str(script), str(tmp_path / "ended"), str(workers)],
         env=ENVIRONMENT,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -29,7 +29,7 @@ from tests.tuner.recordings import making
 from tests.tuner.recordings.micro_sd import log_of
 from tuner.core.errors import InputError
 from tuner.recordings.inspection import inspect_recordings
-from tuner.search.job_flights import load_flights
+from tuner.recordings.loader import load_flights
 
 #: Seconds that one case may take, and MB that all of them may occupy at the worst moment.
 PATIENCE = 20
