@@ -25,12 +25,12 @@ UNOPTIMISED = "LANES_UNOPTIMISED"
 """An environment variable: where it is set, LLVM optimises nothing, which builds in half the time
 what runs more slowly and fuses no product with a sum."""
 
-_SELECTION = {"pre-RA-sched": ("linearize", "default"), "combiner-disabled": ("true", "false")}
-"""Options of LLVM's selection of instructions where nothing is optimised, and where it is.
+_SCHEDULERS = ("fast", "default")
+"""How LLVM orders the instructions that it selects where nothing is optimised, and where it is.
 
-To order and to combine instructions takes five sixths of the time in which a large kernel that is
-not optimised is emitted. A process that optimises all never sets them: LLVM ends one that sets an
-option that its version does not know."""
+To order them by default takes half of the time in which a large kernel that is not optimised is
+emitted; LLVM's "linearize" orders some wrongly. A process that optimises all never sets it: LLVM
+ends one that sets an option that its version does not know."""
 
 _lock = Lock()
 _selected: list[int] = []
@@ -76,7 +76,9 @@ def _machine_name() -> str:
     triple = _target_machine(level).triple
     features = sorted(name for name, has in llvm.get_host_cpu_features().items() if has)
     versions = (llvmlite.__version__, *llvm.llvm_version_info)
-    return repr((versions, triple, llvm.get_host_cpu_name(), features, level))
+    return repr(
+        (versions, triple, llvm.get_host_cpu_name(), features, level, _SCHEDULERS[bool(level)])
+    )
 
 
 def _compiled(text: str) -> bytes:
@@ -91,8 +93,7 @@ def _compiled(text: str) -> bytes:
     with _lock:
         if _selected != [level] and (_selected or not level):
             _selected[:] = [level]
-            for option, values in _SELECTION.items():
-                llvm.set_option("", f"-{option}={values[bool(level)]}")
+            llvm.set_option("", f"-pre-RA-sched={_SCHEDULERS[bool(level)]}")
         code: bytes = machine.emit_object(module)
     return code
 

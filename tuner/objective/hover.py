@@ -16,6 +16,7 @@ rest.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import chdtrc  # scipy.stats takes a quarter of a second to import
@@ -126,6 +127,17 @@ def _filtered(hover: Mapping[int, Series]) -> tuple[Array, Array]:
     One row along the heading, one to its left. All strengths of unrest are filtered side by side,
     and the likeliest of each row is taken.
     """
+    samples = {state: (s.time.tobytes(), s.values.tobytes()) for state, s in hover.items()}
+    return _filtered_of(tuple(samples.items()))
+
+
+@lru_cache(maxsize=256)
+def _filtered_of(content: tuple[tuple[int, tuple[bytes, bytes]], ...]) -> tuple[Array, Array]:
+    """Return the same of a hover's samples; a fit, its check and its exports ask for the same."""
+    hover = {
+        state: Series(np.frombuffer(time), np.frombuffer(values).reshape(-1, 2))
+        for state, (time, values) in content
+    }
     mean = np.zeros((2, len(STRENGTHS), 5))
     mean[..., POSITION] = hover[POSITION].values[0, :, None]
     covariance = np.diag([0.01, 0.1, TRIM, 0.1, TRIM]) ** 2 * np.ones((2, len(STRENGTHS), 1, 1))
@@ -139,8 +151,9 @@ def _filtered(hover: Mapping[int, Series]) -> tuple[Array, Array]:
     samples.sort(key=lambda sample: sample[0])
     now = samples[0][0]
     for time, state, values in samples:
-        mean, covariance = _predicted(mean, covariance, time - now)
-        now = time
+        if time > now:
+            mean, covariance = _predicted(mean, covariance, time - now)
+            now = time
         variance = covariance[..., state, state] + noises[state][:, None] ** 2
         gain = covariance[..., state] / variance[..., None]
         surprise = values[:, None] - mean[..., state]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Literal
 
 import numpy as np
@@ -143,4 +144,4 @@ def _size(mark: Line | Bars | Heat) -> int:
 
 def rounded(values: NDArray[np.float64], digits: int) -> list[float | None]:
     """Return a curve for the page, None where it is not finite."""
-    return [round(float(v), digits) if np.isfinite(v) else None for v in np.asarray(values)]
+    return [round(v, digits) if isfinite(v) else None for v in np.asarray(values, float).tolist()]

@@ -28,7 +28,8 @@ def cluster(tmp_path):
     ends = ("--scheduler-file", str(file))
     place = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
     scheduler = subprocess.Popen([*SCHEDULER, *place, *ends], **quiet)
-    worker = subprocess.Popen([*WORKER, *ends, "--nthreads", "1", "--no-nanny", "--no-dashboard"], **quiet)
+    alone = ("--nthreads", "1", "--no-nanny", "--no-dashboard")
+    worker = subprocess.Popen([*WORKER, *ends, *alone], **quiet)
     try:
         while not file.exists() or not file.read_text().strip().endswith("}"):
             time.sleep(0.1)

@@ -121,14 +121,16 @@ def motor_steps(random: np.random.Generator, *, rate: float = 500.0, second: flo
         goal[edge - before + delay :] = dense[edge]
     goal = TRUTH["input_scaling"] * goal + TRUTH["zero_position_armed"]
     level, slow = goal[0], goal[0]
-    series = np.empty_like(goal)
-    step = 1 / (rate * fine)
-    for index, asked in enumerate(goal):
-        series[index] = slow  # the value at the sample, before the command acts on the next piece
-        constant = TRUTH["time_constant_up"] if asked > level else TRUTH["time_constant_down"]
-        level += (1 - math.exp(-step / constant)) * (asked - level)
-        slow = level if second == 0 else slow + (1 - math.exp(-step / second)) * (level - slow)
-    speed = series[::fine] + random.normal(0, 4.0, len(time))
+    series = []
+    up, down, after = (
+        1 - math.exp(-1 / (rate * fine * constant)) if constant else 1.0
+        for constant in (TRUTH["time_constant_up"], TRUTH["time_constant_down"], second)
+    )
+    for asked in goal.tolist():
+        series.append(slow)  # the value at the sample, before the command acts on the next piece
+        level += (up if asked > level else down) * (asked - level)
+        slow += after * (level - slow)
+    speed = np.array(series[::fine]) + random.normal(0, 4.0, len(time))
     return {"time": time, "command": command, "rotor_speed": outliers(random, speed, 0.005)}
 
 
