@@ -154,7 +154,6 @@ def candidate_problem(
         flight=np.arange(count),
         resting=None if recorded.resting is None else np.ones(count, bool),
         log_voltage=_filled(recorded.log_voltage, count, np.nan),
-        wander=_filled(recorded.wander, count, 0.0),
         freedom=_filled(recorded.freedom, count, 0.0),
         freed=recorded.freed,
     )

@@ -20,7 +20,6 @@ from sim_jax.state import Start
 from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
 from tuner.objective.battery import log_voltage_of
-from tuner.objective.hover import wander_of
 from tuner.objective.initial_conditions import (
     freedom_of,
     freedom_of_spin,
@@ -93,8 +92,6 @@ class Segments(eqx.Module):
     """Logarithm of the battery's voltage in V, one a control tick; NaN where it is unknown."""
     disturbance: Disturbance | None = None
     """What pushes them, as far as that is known."""
-    wander: Float[Array, "L F"] | None = None
-    """How far from rest each hover was at its end (`tuner.objective.hover`); None at rest."""
     freedom: Float[Array, "L F"] | None = None
     """Standard deviations of what is free of the start; None if it is known."""
     freed: tuple[int, ...] = eqx.field(static=True, default=())
@@ -152,7 +149,6 @@ def segments_of(
                 "holds no reference and none is named",
                 "name its trajectory in the job file, or fit through another inlet",
             )
-    wander = wander_of(flights)
     inlet = INLETS["reference"].lay(flights, schedule)
     assert isinstance(inlet, ReferenceInlet)
     freed = {}
@@ -167,7 +163,6 @@ def segments_of(
         measured={name: _measured(flights, name, sd, weights) for name, sd in noise.items()},
         flight=np.arange(len(flights)),
         resting=np.asarray([rests(flight.initial) for flight in flights]),
-        wander=None if wander is None else np.asarray(wander),
         log_voltage=log_voltage_of(flights, [Window(flight, 0.0) for flight in flights], schedule),
         freedom=np.asarray(np.stack(list(freed.values()))) if freed else None,
         freed=tuple(freed),

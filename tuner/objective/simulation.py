@@ -381,8 +381,6 @@ def beginning_of(
         start = in_trim(
             model.vehicle, model.controller, start, segments.resting, speed_factor=factor
         )
-    if segments.wander is not None:
-        start = moved(start, segments.wander)
     if segments.turning is not None:
         start = spun_up(start, model.vehicle, segments.turning, speed_factor=factor)
     if states is not None and segments.freedom is not None:
