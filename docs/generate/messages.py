@@ -64,6 +64,7 @@ STAGES: Mapping[str, tuple[str, ...]] = {
     ),
     "Before the search": (
         *("same_recording", "vehicle_not", "mass_not", "wrong_vehicle", "cannot_hover"),
+        "lifts_otherwise",
         *("still_axes", "no_yaw", "implausible", "start_on_bound"),
         *("not_finite", "nothing_has", "no_effect", "singular", "setpoints", "heading_flown"),
         *("input_late", "turning_regressed", "turning_not"),
@@ -89,6 +90,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "the flight lacks what its inlet needs: it is left out; the line says why and what to do.",
     Code.SALVAGED: "The recording is broken, and the flight is what was salvaged of it; the line "
     "states what was lost. Record the flight again if that matters.",
+    Code.LIFTS_OTHERWISE: "In hover, rotors lift more or less of the weight at the same commands "
+    "(or speeds) than in the other flights: battery, payload, propellers or the whole vehicle are "
+    "others. Fit flights of one vehicle and payload, each kind by itself.",
     Code.SATURATION_FEEDBACK: "Rotors were clipped at their lower limit, and the recordings agree "
     "with a mixer that desaturates and a rate integrator that stops then, as PX4's do, or with "
     "neither, other than the controller file has it; it was simulated so. Set "
@@ -128,8 +132,8 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.DISTURBANCES_FOLLOWED: "The residuals hold more than noise, as gusts leave it, and a "
     "Kalman filter estimates the disturbances. Nothing to do.",
     Code.FLIGHT_UNMATCHED: "The simulation does not match this flight, and its weight in the fit "
-    "was lowered accordingly. Look at its figures: the controller, the clock, wind, damage or the "
-    "vehicle may differ.",
+    "was lowered accordingly. Leave it out: its vehicle, payload, controller, clock or wind may be "
+    "others.",
 }
 
 FINDINGS = """## Findings of a run

@@ -106,6 +106,11 @@ class Code(Worded):
         ),
         GIVE_VEHICLE,
     )
+    LIFTS_OTHERWISE = (
+        "lifts_otherwise",  # more (share); names: the signal, battery?
+        sentences.lifts_otherwise,
+        "Fit flights of one vehicle and payload, each kind by itself.",
+    )
     SPARSE_INPUT = (
         "sparse_input",  # recorded, needed (Hz); names: the signal
         (
@@ -358,7 +363,7 @@ class Code(Worded):
     FLIGHT_UNMATCHED = (
         "flight_unmatched",  # channel -> multiple of the noise
         sentences.flight_unmatched,
-        "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ.",
+        "Leave it out: its vehicle, payload, controller, clock or wind may be others.",
     )
     MODEL_UNMATCHED = (
         "model_unmatched",  # unmatched, flights, noise_multiple

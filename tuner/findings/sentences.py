@@ -73,6 +73,17 @@ def salvaged(finding: Finding) -> str:
     return f"It is broken: {damage}; what was salvaged is used."
 
 
+def lifts_otherwise(finding: Finding) -> str:
+    """Return what may be another one in these flights, and how much more or less rotors lift."""
+    signal, *others = finding.names
+    more = finding.numbers["more"]
+    return (
+        f"Another {', '.join([*others, 'payload', 'propeller'])} or vehicle flew: at the same "
+        f"{signal.replace('_', ' ')}s rotors lift {percent(abs(more))} "
+        f"{'more' if more > 0.0 else 'less'} of the weight than in the other flights."
+    )
+
+
 def inlet_chosen(finding: Finding) -> str:
     """Return why a flight enters further down the loop than it was recorded for."""
     inlet, signal, *order = finding.names

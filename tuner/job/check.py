@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from itertools import pairwise
 from typing import get_args
 
 import numpy as np
@@ -11,11 +12,13 @@ import numpy as np
 from sim_jax.constants import GRAVITY
 from sim_jax.control.mixer import ROTORS
 from tuner.core.numerics import Array, symmetric_eigen, unit_diagonal
+from tuner.equation_error.recorded_accelerations import FEWEST, rows_of, steps_with
 from tuner.findings.findings import Code, Finding
+from tuner.objective.battery import VOLTAGE
 from tuner.objective.inlets import INLETS, bypassed_by, sparse
 from tuner.objective.rotor_signals import Source, order_findings, squared_speed
 from tuner.objective.setpoints import setpoint_findings
-from tuner.recordings.flight import Flight
+from tuner.recordings.flight import Flight, Series
 from tuner.search.problem import Job
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import COEFFICIENTS, VehicleFile
@@ -39,6 +42,11 @@ FOREIGN = 3.0
 scaling laws know thrust to a few tens of percent."""
 IDLE = 0.7
 """Share of the weight from which a vehicle that idles cannot descend."""
+APART = 1.07
+"""Factor between flights of the acceleration that one speed of the rotors lifts in hover: simulated
+flights of one vehicle differ by 1 %, real ones with one battery after the other by 4 %."""
+SLOW, LEVEL, SMOOTHED = 1.0, 0.1, 31
+"""m/s, share of gravity and samples within which, averaged, a vehicle nearly hovers."""
 GAP = 0.25
 """s without a pose inside a mission that a user should know of."""
 
@@ -57,6 +65,7 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
         *_recorded_twice(job),
         *_not_given(job),
         *_wrong_vehicle(job),
+        *_lifting_otherwise(job),
         *_excitation(job),
         *_bounds(job),
         *_starts_on_bounds(job),
@@ -168,6 +177,68 @@ def _lift(flight: Flight, vehicle: VehicleFile) -> float:
 def _lift_of(recorded: Array, vehicle: VehicleFile, source: Source) -> float:
     squares = squared_speed(vehicle, source, recorded).sum(axis=1)
     return float(np.nanmean(squares)) * vehicle.aerodynamics.motor_constant
+
+
+def _lifting_otherwise(job: Job) -> Iterator[Finding]:
+    """Warn of flights in whose hover rotors lift another acceleration at the same speed.
+
+    Of one vehicle with one payload that is the same from flight to flight; by commands it goes with
+    the square of the battery's voltage at most, and not at all where speeds are controlled.
+    """
+    vehicle = job.settings.vehicle
+    seen = {f.name: there for f in job.flights if (there := _hovering(f, vehicle))}
+    source: Source = "rotor_speed" if all("rotor_speed" in s for s in seen.values()) else "command"
+    lifts = {name: there[source] for name, there in seen.items() if source in there}
+    volts = {
+        flight.name: float(np.nanmean(flight.series[VOLTAGE].values))
+        for flight in job.flights
+        if flight.name in lifts and VOLTAGE in flight.series
+    }
+    found = _apart(lifts)
+    if found is not None and source == "command" and len(volts) == len(lifts):
+        charged = _apart({name: lift / volts[name] ** 2 for name, lift in lifts.items()})
+        found = None if charged is None else found
+    if found is not None:
+        odd, more = found
+        names = (source,) if source == "rotor_speed" else (source, "battery")
+        yield Finding(Code.LIFTS_OTHERWISE, "warning", ", ".join(odd), {"more": more}, names)
+
+
+def _apart(lifts: Mapping[str, float]) -> tuple[list[str], float] | None:
+    """Return the smaller part of flights that a gap of `APART` divides, and what it lifts more."""
+    ranked = sorted(lifts, key=lambda name: lifts[name])
+    gaps = [lifts[above] / lifts[below] for below, above in pairwise(ranked)]
+    if max(gaps, default=1.0) < APART:
+        return None
+    cut = int(np.argmax(gaps)) + 1
+    odd, others = sorted((ranked[:cut], ranked[cut:]), key=len)
+    of_odd, of_others = (np.median([lifts[name] for name in some]) for some in (odd, others))
+    return odd, float(of_odd / of_others) - 1.0
+
+
+def _hovering(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
+    """Return by which signals a flight tells what its rotors lift where it nearly hovers.
+
+    m/s² per (rad/s)² of all rotors.
+    """
+    found: dict[Source, float] = {}
+    for source in get_args(Source):
+        series = flight.series.get(source)
+        known = None if series is None else np.isfinite(series.values).all(axis=1)
+        if series is None or known is None or known.sum() < FEWEST:
+            continue
+        speeds = np.sqrt(squared_speed(vehicle, source, series.values[known]))
+        steps = steps_with(flight, Series(series.time[known], speeds), noise=0.0)
+        if steps is None:
+            continue
+        pull = np.nan_to_num(steps.accelerations[:, 2])
+        smooth = np.convolve(pull, np.full(SMOOTHED, 1.0 / SMOOTHED), "same")
+        slow = np.linalg.norm(rows_of(steps.motion.velocity), axis=1) < SLOW
+        hovers = steps.known & slow & (np.abs(smooth / GRAVITY - 1.0) < LEVEL)
+        if hovers.sum() >= FEWEST:
+            squares = np.square(steps.rotor_speed[hovers]).sum()
+            found[source] = float(pull[hovers].sum() / squares)
+    return found
 
 
 def _motor_orders(job: Job) -> Iterator[Finding]:

@@ -40,7 +40,7 @@ NOT_FLOWN = frozenset(
     }
 )
 """Warnings of vehicles and controllers that did not fly, on which a simulation may fail."""
-OTHER_INPUTS = NOT_FLOWN | {Code.MASS_NOT_GIVEN, Code.SAME_RECORDING}
+OTHER_INPUTS = NOT_FLOWN | {Code.MASS_NOT_GIVEN, Code.SAME_RECORDING, Code.LIFTS_OTHERWISE}
 """Warnings that what was given is not what flew: all numbers follow from that."""
 CAUSES = OTHER_INPUTS | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS, Code.INLET_CHOSEN}
 """Warnings that say why others arise."""
@@ -185,7 +185,9 @@ def next_step(
         if len(found.flights) == 1:
             return "Record a second flight, and hold it out.", "tune ... --holdout FLIGHT"
         told = Counter(row.reason.flight for row in result.coefficients.values() if row.fitted)
-        flight = min(reversed(found.flights), key=lambda flight: told[flight.name]).name
+        odd = {one.subject for one in result.findings if one.code is Code.FLIGHT_UNMATCHED}
+        alike = [one for one in reversed(found.flights) if one.name not in odd] or found.flights
+        flight = min(alike, key=lambda flight: told[flight.name]).name
         words = "Hold a flight out, which then checks the fit."
         return words, f"tune ... --holdout {shlex.quote(flight)}"
     if not found.flights:

@@ -10,7 +10,7 @@ from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, Loop, loop_of
+from tuner.search.progress import COLOURED, Fitted, Loop, loop_of
 from tuner.vehicle import VehicleFile
 
 UNMATCHED = 10.0
@@ -39,6 +39,17 @@ def unmatched(scales: Scales) -> dict[str, dict[str, float]]:
         if len(bad) > len(channels) / 2:
             lost[flight] = bad
     return lost
+
+
+def odd_flights(scales: Scales) -> frozenset[str]:
+    """Return the flights that are not matched while all others are, to the noise.
+
+    Another vehicle flew them, or something disturbed them alone: what is missing there is missing
+    in none of the others. Scales are those of `unmatched`.
+    """
+    lost = unmatched(scales)
+    others = [max(channels.values()) for name, channels in scales.items() if name not in lost]
+    return frozenset(lost if len(lost) < len(others) and max(others) < COLOURED else ())
 
 
 def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:
@@ -71,7 +82,7 @@ def end_findings(job: Job, loop: Loop, scales: Scales) -> tuple[Finding, ...]:
     findings = list(loop_findings(job, loop, "warning"))
     lost = unmatched(scales)
     typical = float(np.median([_size(channels) for channels in scales.values()]))
-    alone = {name for name in lost if len(scales) == 1 or _size(scales[name]) > ODD * typical}
+    alone = {name for name in lost if _size(scales[name]) > ODD * typical}
     findings += [
         Finding(Code.FLIGHT_UNMATCHED, "warning", name, lost[name]) for name in sorted(alone)
     ]

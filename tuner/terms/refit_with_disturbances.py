@@ -17,6 +17,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.search.estimation import LAST, free_offsets, polished
 from tuner.search.explanation import Explanation
+from tuner.search.findings import odd_flights
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
 from tuner.terms.candidates import Selected, names_in
@@ -57,11 +58,11 @@ def examined(
     """Return the fit with estimated disturbances, or with what the flights leave open held.
 
     And how well each coefficient is known; first the terms, of which innovations may call for
-    others.
+    others. Where flights contradict the fit, or all but odd ones are matched, nothing is followed.
     """
     follow = partial(with_disturbances, on_progress=on_progress, on_message=on_message)
-    followed = None
-    if not selected.refuted:
+    followed, asked = None, selected.job.settings.job.disturbances
+    if not (selected.refuted or (asked == "auto" and odd_flights(selected.fitted.scales))):
         followed = explanation.part("disturbances", partial(follow, selected), None)
     if followed is not None and (
         refuted := set(refuted_by_commands(*followed[:2])).difference(selected.kept)

@@ -30,7 +30,7 @@ from sim_jax.vehicle import Motor
 from tuner.core.numerics import Array
 from tuner.equation_error.omitted_laws import Law, Pair, unexplained
 from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, answers
-from tuner.equation_error.recorded_accelerations import FEWEST, Steps, steps_of
+from tuner.equation_error.recorded_accelerations import FEWEST, Mask, Steps, steps_of
 from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import log_voltage_of, read_again
 from tuner.objective.criterion import Point
@@ -39,6 +39,7 @@ from tuner.objective.normal_equations import Objective
 from tuner.objective.simulation import MOTION, SETPOINTS, SPEEDS, TURNED, Flown, environment_of, fly
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
+from tuner.search.findings import odd_flights
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import (
     DRAWS,
@@ -121,6 +122,8 @@ class Lack:
 def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
     """Return what the model of a fit lacks; None if that is nothing, or cannot be told.
 
+    Of flights as of `odd_flights` nothing is taken.
+
     Parameters
     ----------
     fitted
@@ -164,7 +167,10 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         channels=(*_CHANNELS, MOTION, TURNED, SETPOINTS),
     )
     rate = float(schedule.log_rate)
-    told = _heard(flights, flown, model.controller.mixer, rate)
+    odd = odd_flights(fitted.scales)
+    tell = ~np.isfinite(np.asarray(flown.crash_time))
+    tell[[number for number, name in enumerate(fitted.scales) if name in odd]] = False
+    told = _heard(flights, flown, model.controller.mixer, rate, tell)
     heard = tuple(answer for answer in told if answer.differs)
     apart = {}
     for name in set(GAINS) & set(objective.space.names):
@@ -173,7 +179,7 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
     pairs = {
         number: Pair(one, _simulated(one, flown.channels, conditions, number, rate), by_command)
         for number, (one, by_command) in enumerate(zip(read, driven, strict=True))
-        if one is not None and not np.isfinite(flown.crash_time[number])
+        if one is not None and tell[number]
     }
     if not pairs:
         return Lack((), None, heard, gains=apart).or_none
@@ -377,14 +383,17 @@ def _answering(gains: RateGains, answer: Answer) -> RateGains:
 
 
 def _heard(
-    flights: Sequence[Flight], flown: Flown, mixer: MixerSettings, rate: float
+    flights: Sequence[Flight], flown: Flown, mixer: MixerSettings, rate: float, tell: Mask
 ) -> tuple[Answer, ...]:
-    """Return how the rate controllers of recorded flights answer, beside those of the fit's."""
+    """Return how the rate controllers of recorded flights answer, beside those of the fit's.
+
+    ``tell`` (F,) says which flights are looked at.
+    """
     recorded, simulated = [], []
     for number, flight in enumerate(flights):
         series = flight.series
         known = set(LOOP_SIGNALS) <= set(series)
-        if not known or np.isfinite(flown.crash_time[number]):
+        if not (known and tell[number]):
             continue
         clock = np.arange(flown.channels["command"].shape[1]) / rate
         time = series["command"].time

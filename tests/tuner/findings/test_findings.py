@@ -38,6 +38,9 @@ MADE = {
     Code.MISSING_SIGNALS: Finding(
         Code.MISSING_SIGNALS, "warning", "a", names=("rotor_speed", "command")
     ),
+    Code.LIFTS_OTHERWISE: Finding(
+        Code.LIFTS_OTHERWISE, "warning", "a, b", {"more": -0.13}, ("command", "battery")
+    ),
     Code.WRONG_VEHICLE: Finding(
         Code.WRONG_VEHICLE, "warning", "quad", {"lift": 98.0, "weight": 0.33, "mass": 0.034}
     ),

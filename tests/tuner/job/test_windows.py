@@ -112,6 +112,22 @@ def test_a_flight_given_twice_is_named(full_flight, full_bag, updated):
     assert (said.subject, said.names) == ("copy", (full_flight.name,))
 
 
+@pytest.mark.parametrize(("lifts", "named"), [(1.0, None), (1.05, None), (0.88, ("heavy",))])
+def test_a_flight_of_another_payload_is_named(full_flight, full_bag, updated, lifts, named):
+    """The same speeds of the rotors, or ones that would lift so many times as much of it."""
+    job = job_through("actuator", full_flight, full_bag, updated)
+    (own,) = job.recordings
+    speeds = full_flight.series["rotor_speed"]
+    other = replace(speeds, values=speeds.values / np.sqrt(lifts))
+    heavy = replace(full_flight, name="heavy", series=full_flight.series | {"rotor_speed": other})
+    third = replace(own, flight=replace(full_flight, name="third"))
+    mixed = replace(job, recordings=(own, third, replace(own, flight=heavy, holdout=True)))
+    said = [one for one in check_recordings(mixed) if one.code is Code.LIFTS_OTHERWISE]
+    assert [tuple(one.subject.split(", ")) for one in said] == ([] if named is None else [named])
+    for one in said:
+        assert one.numbers["more"] == pytest.approx(lifts - 1.0, abs=0.01)
+
+
 def test_a_mass_that_no_user_gave_is_named(full_flight, full_bag, updated):
     job = job_through("actuator", full_flight, full_bag, updated)
     noticed = (Code.VEHICLE_NOT_GIVEN, Code.MASS_NOT_GIVEN)

@@ -14,7 +14,7 @@ from tuner.findings.findings import Code, sentence
 from tuner.objective.space import space_of
 from tuner.search import estimation as module
 from tuner.search.estimation import fingerprint, starting_vectors
-from tuner.search.findings import end_findings, unmatched, voltage_taken
+from tuner.search.findings import end_findings, odd_flights, unmatched, voltage_taken
 from tuner.search.iteration import Outcome
 from tuner.search.progress import Loop
 from tuner.search.stages import left, plan
@@ -87,8 +87,10 @@ def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
             )
         )
     )
-    one_stray = {"a": {"position": 1.0}, "b": {"position": 1.2}, "c": {"position": 90.0}}
-    assert set(unmatched(one_stray)) == {"c"}
+    one_stray = {"a": {"position": 1.0}, "b": {"position": 1.1}, "c": {"position": 90.0}}
+    assert set(unmatched(one_stray)) == odd_flights(one_stray) == {"c"}
+    assert not odd_flights(one_stray | {"b": {"position": 1.5}})
+    assert not odd_flights({name: one_stray[name] for name in "ac"})
     (finding,) = end_findings(job, Loop(), one_stray)
     assert (finding.code, finding.subject) == (Code.FLIGHT_UNMATCHED, "c")
     all_far = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}

@@ -43,20 +43,32 @@ def ended_with(thrust: float, monkeypatch: pytest.MonkeyPatch) -> tuple[Selected
     return found, tried
 
 
+def followed(selected: Selected, monkeypatch: pytest.MonkeyPatch) -> bool:
+    """Return whether disturbances are estimated of a selection's fit."""
+    tried = list[str]()
+    held = selected.fitted, SimpleNamespace()
+
+    def following(*_: Any, **__: Any) -> None:
+        tried.append("disturbances")
+
+    monkeypatch.setattr(refit_with_disturbances, "with_disturbances", following)
+    monkeypatch.setattr(refit_with_disturbances, "with_undetermined_held", lambda *_, **__: held)
+    silent = (lambda *_: None), (lambda _: None), Explanation(lambda _: None)
+    assert refit_with_disturbances.examined(selected, *silent) == (selected, *held)
+    return bool(tried)
+
+
 @pytest.mark.parametrize(("thrust", "flies"), [(1.0, True), (0.3, False)])
 def test_neither_terms_nor_disturbances_explain_a_vehicle_that_falls(thrust, flies, monkeypatch):
     found, tried = ended_with(thrust, monkeypatch)
     assert found.refuted is not flies
     assert tried == (["terms"] if flies else [])
+    assert followed(found, monkeypatch) is flies
 
-    def following(*_: Any, **__: Any) -> None:
-        tried.append("disturbances")
 
-    held = SimpleNamespace()
-    monkeypatch.setattr(refit_with_disturbances, "with_disturbances", following)
-    monkeypatch.setattr(
-        refit_with_disturbances, "with_undetermined_held", lambda *_, **__: (found.fitted, held)
-    )
-    silent = (lambda *_: None), (lambda _: None), Explanation(lambda _: None)
-    assert refit_with_disturbances.examined(found, *silent) == (found, found.fitted, held)
-    assert tried == (["terms", "disturbances"] if flies else [])
+@pytest.mark.parametrize(("others", "follows"), [(1.0, False), (2.0 * COLOURED, True)])
+def test_what_one_flight_alone_lacks_is_no_disturbance(others, follows, monkeypatch):
+    found, _ = ended_with(1.0, monkeypatch)
+    scales = {"a": {"position": others}, "stray": {"position": 50.0}, "b": {"position": others}}
+    found = replace(found, fitted=replace(found.fitted, scales=scales))
+    assert followed(found, monkeypatch) is follows
