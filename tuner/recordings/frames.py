@@ -45,6 +45,9 @@ LEAST_ACCELERATION = 0.3
 LEAST_TURN_RATE = 0.1
 LEAST_SPEED = 0.2
 """Motion below these, in m/s^2, rad/s and m/s, contradicts nothing."""
+OFF_CENTRE = 0.1
+"""m by which markers may sit off the centre of mass: what accelerates them as the vehicle turns
+does not tilt it."""
 GOOD_AGREEMENT = 0.6
 LEAST_GAIN = 0.3
 """Agreement that is believed without a look at alternatives, and how much better one must be."""
@@ -123,13 +126,15 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     pull = push + np.array([0.0, 0.0, GRAVITY])
     gyro = on_clock(series, "body_rate", clock) if "body_rate" in series else None
     force = on_clock(series, "acceleration", clock) if "acceleration" in series else None
+    turns = [smooth(rate) for rate in (body_rate_of(q), gyro) if rate is not None]
+    of_markers = OFF_CENTRE * min(np.nan_to_num(rate**2).sum(axis=1).mean() for rate in turns)
 
     def agreement(reading: Callable[[Array], Array]) -> tuple[float, float]:
         """Return how well a reading fits the motion, and how far thrust carries the vehicle."""
         turned = reading(q)
         up = upward(turned)
         scores = []
-        if rms(push[:, :2]) > LEAST_ACCELERATION:
+        if rms(push[:, :2]) > LEAST_ACCELERATION + of_markers:
             scores.append(correlation(smooth(up[:, :2], 0.2), push[:, :2]))
         if gyro is not None and rms(gyro) > LEAST_TURN_RATE:
             # The gyro's own axes may be wrong too, though two errors are less likely than one.

@@ -163,6 +163,19 @@ def test_a_vehicle_that_leans_by_more_than_60_degrees_is_not_doubted() -> None:
     assert doubt.code is NoteCode.ATTITUDE_DOUBTED
 
 
+def test_markers_off_the_centre_of_a_vehicle_that_spins_doubt_no_attitude() -> None:
+    """They are pulled inwards, by 0.36 m/s², whichever way the vehicle leans in its trim."""
+    turned = Rotation.from_rotvec(np.outer(TIME, [0.0, 0.0, 3.0]))
+    attitude = turned * Rotation.from_rotvec([0.0, 0.01, 0.0])
+    markers = attitude.apply([0.04, 0.0, 0.0]) + np.array([0.0, 0.0, 1.0])
+    signals = {
+        "position": Series(TIME, markers),
+        "attitude": Series(TIME, attitude.as_quat(scalar_first=True)),
+        "body_rate": Series(TIME, attitude.inv().apply([0.0, 0.0, 3.0])),
+    }
+    assert correct_frames(signals, {})[1] == ()
+
+
 @pytest.mark.parametrize("wind", [3.0, 6.0, 12.0])
 @pytest.mark.parametrize("axes", ["in body axes", "in NED axes"])
 def test_a_velocity_in_other_axes_is_turned_into_the_worlds(axes: str, wind: float) -> None:
