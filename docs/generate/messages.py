@@ -93,6 +93,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.LIFTS_OTHERWISE: "In hover, rotors lift more or less of the weight at the same commands "
     "(or speeds) than in the other flights: battery, payload, propellers or the whole vehicle are "
     "others. Fit flights of one vehicle and payload, each kind by itself.",
+    Code.GROUND_CONFLICT: "Ground measurements and flights disagree, model error included. What "
+    "flights show over the mass alone names the mass at which they would agree: weigh the vehicle "
+    "again. Else find out which is wrong, the rig or the model.",
     Code.SATURATION_FEEDBACK: "Rotors were clipped at their lower limit, and the recordings agree "
     "with a mixer that desaturates and a rate integrator that stops then, as PX4's do, or with "
     "neither, other than the controller file has it; it was simulated so. Set "

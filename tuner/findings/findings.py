@@ -420,12 +420,9 @@ class Code(Worded):
         "",
     )
     GROUND_CONFLICT = (
-        "ground_conflict",  # deviation (standard errors), ground, flights; names: unit
-        (
-            "Ground and flights disagree: {ground:.5g} {unit} and {flights:.5g} {unit}, "
-            "{deviation:+.1f} standard errors apart, model error included."
-        ),
-        "Find out which is wrong, the rig or the model.",
+        "ground_conflict",  # deviation (standard errors), ground, flights, mass (kg)?; names: unit
+        sentences.ground_conflict,
+        sentences.ground_remedy,
     )
     SCALES_WITH_MASS = (
         "scales_with_mass",  # mass (kg); names: the coefficients

@@ -84,6 +84,26 @@ def lifts_otherwise(finding: Finding) -> str:
     )
 
 
+def ground_conflict(finding: Finding) -> str:
+    """Return what ground and flights say, and with which mass flights would say the same."""
+    numbers, (unit,) = finding.numbers, finding.names
+    apart = f"{numbers['deviation']:+.1f} standard errors apart, model error included."
+    ground, flights = (f"{numbers[name]:.5g} {unit}" for name in ("ground", "flights"))
+    if "mass" not in numbers:
+        return f"Ground and flights disagree: {ground} and {flights}, {apart}"
+    return (
+        f"Ground and flights agree at {numbers['mass']:.4g} kg alone: with the mass given it is "
+        f"{ground} on the ground and {flights} in flight, {apart}"
+    )
+
+
+def ground_remedy(finding: Finding) -> str:
+    """Return what may be wrong."""
+    if "mass" in finding.numbers:
+        return "Weigh the vehicle again; else look for what is wrong with the rig, or the model."
+    return "Find out which is wrong, the rig or the model."
+
+
 def inlet_chosen(finding: Finding) -> str:
     """Return why a flight enters further down the loop than it was recorded for."""
     inlet, signal, *order = finding.names

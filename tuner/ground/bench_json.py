@@ -331,7 +331,8 @@ def bench_in_words(record: BenchRecord) -> str:
         what = f"{count} flight{s} without a pose; none was simulated"
     else:
         what = f"{count} ground experiment{s}; no flight was used"
-    return f"{len(record.names)} coefficients come from {what}."
+    come = "coefficient comes" if len(record.names) == 1 else "coefficients come"
+    return f"{len(record.names)} {come} from {what}."
 
 
 def of_flights(record: BenchRecord) -> bool:

@@ -295,7 +295,7 @@ def _known(
     sources: dict[str, Sources] = explanation.part(
         "ground measurements", partial(sources_of, fitted, uncertainty, known), {}
     )
-    explanation.notice(ground_conflicts(sources))
+    explanation.notice(ground_conflicts(sources, fitted.objective.space.fixed.get("mass")))
     return sources
 
 

@@ -72,18 +72,19 @@ def _error(space: Space, index: int, scaled: float, error: float) -> float:
     return float(error * value) if space.is_log[index] else float(error)
 
 
-def ground_conflicts(sources: Mapping[str, Sources]) -> tuple[Finding, ...]:
-    """Return the coefficients of which ground measurements and flights say different things."""
-    return tuple(
-        Finding(
-            Code.GROUND_CONFLICT,
-            "warning",
-            name,
-            {"deviation": source.deviation, "ground": source.ground, "flights": source.flights},
-            (COEFFICIENTS[name].unit,),
-        )
-        for name, source in sources.items()
-        if source.deviation is not None
-        and source.flights is not None
-        and abs(source.deviation) > CONFLICT
-    )
+def ground_conflicts(sources: Mapping[str, Sources], mass: float | None) -> tuple[Finding, ...]:
+    """Return the coefficients of which ground measurements and flights say different things.
+
+    With the mass at which they would not, where flights show a coefficient over the mass alone;
+    ``mass`` is the one that they were fitted with in kg, None if it was fitted.
+    """
+    findings = []
+    for name, source in sources.items():
+        if source.flights is None or source.deviation is None or abs(source.deviation) <= CONFLICT:
+            continue
+        row, ground, flights = COEFFICIENTS[name], source.ground, source.flights
+        numbers = {"deviation": source.deviation, "ground": ground, "flights": flights}
+        if mass is not None and row.mass_exponent == 1:
+            numbers["mass"] = mass * ground / flights
+        findings.append(Finding(Code.GROUND_CONFLICT, "warning", name, numbers, (row.unit,)))
+    return tuple(findings)

@@ -227,7 +227,7 @@ MADE = {
         Code.GROUND_CONFLICT,
         "warning",
         "motor_constant",
-        {"deviation": 4.2, "ground": 1.5e-5, "flights": 1.4e-5},
+        {"deviation": 4.2, "ground": 1.5e-5, "flights": 1.4e-5, "mass": 2.1},
         ("N s²/rad²",),
     ),
     Code.BENCH_CONFLICT: Finding(

@@ -138,15 +138,18 @@ def test_flights_alone_are_what_they_would_have_given():
     assert motor.ground == pytest.approx(1.4e-5)
     assert motor.ground_error == pytest.approx(0.01 * 1.4e-5)
     assert motor.deviation == pytest.approx(0.01 / np.hypot(0.01, 0.01))
-    assert ground_conflicts(sources) == ()
+    assert ground_conflicts(sources, 2.0) == ()
 
 
 def test_a_contradiction_is_a_finding():
     flights = MEAN + np.array([0.1, 0.0, 0.0])
     spread = np.diag([0.01, 0.03, 0.001])
     sources = side_by_side(flights, np.linalg.inv(spread @ spread))
-    (finding,) = ground_conflicts(sources)
+    (finding,) = ground_conflicts(sources, 2.0)
     assert (finding.code, finding.subject) == (Code.GROUND_CONFLICT, "motor_constant")
+    assert finding.numbers["mass"] == pytest.approx(2.0 * np.exp(-0.1))  # they go with it
+    (free,) = ground_conflicts(sources, None)
+    assert "mass" not in free.numbers
     assert finding.numbers["deviation"] == pytest.approx(0.1 / np.hypot(0.01, 0.01))
 
 
