@@ -23,7 +23,7 @@ MOST = 256 * 2**20
 _BYTES_OF_DIGEST = 32
 UNOPTIMISED = "LANES_UNOPTIMISED"
 """An environment variable: where it is set, LLVM optimises nothing, which builds in half the time
-what runs more slowly and fuses no product with a sum."""
+what runs more slowly and fuses no product with a sum, and one kernel serves few lanes and many."""
 
 _SCHEDULERS = ("fast", "default")
 """How LLVM orders the instructions that it selects where nothing is optimised, and where it is.
@@ -46,9 +46,14 @@ def keep_code_in(folder: Path | None) -> None:
     _folder[:] = [] if folder is None else [folder]
 
 
+def optimises() -> bool:
+    """Return whether LLVM optimises."""
+    return not os.environ.get(UNOPTIMISED)
+
+
 def _level() -> int:
     """Return how much LLVM optimises, as its -O says."""
-    return 0 if os.environ.get(UNOPTIMISED) else 2
+    return 2 if optimises() else 0
 
 
 @cache

@@ -28,7 +28,7 @@ from lanes.dependence import dependent
 from lanes.digest import UnknownError, digest_of
 from lanes.layout import Argument, Layout, Lengths, is_laid_by_loop
 from lanes.lowering import MOST_COLUMNS
-from lanes.machine import Code, keep_code_in, kept, object_code, register_bytes
+from lanes.machine import Code, keep_code_in, kept, object_code, optimises, register_bytes
 from lanes.values import UnsupportedError
 
 __all__ = ["Argument", "Program", "Run", "joined", "keep_code_in", "program_of"]
@@ -55,7 +55,8 @@ ONE_BY_ONE = 64
 IN_CACHE = 2**18
 """bytes that are laid out at a time."""
 MANY = 256
-"""Lanes from which a block without columns is two vectors wide: one computes while one waits."""
+"""Lanes from which a block without columns is two vectors wide, where LLVM optimises: one computes
+while one waits."""
 FORWARD = 3
 """Columns that take as long as the values and the factors that columns share."""
 FEW = 512
@@ -213,7 +214,7 @@ class Program:
 
     def _kernel(self, lanes: int = 1) -> _Compiled | None:
         """Return the kernel for so many lanes, or None where something has no rule."""
-        vectors = 2 if lanes >= MANY and not self.moving else 1
+        vectors = 2 if lanes >= MANY and not self.moving and optimises() else 1
         if vectors not in self._kernels:
             self._kernels[vectors] = None
             try:
