@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -13,12 +12,8 @@ from tests.tuner.recordings import making
 @pytest.fixture(scope="session")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The circle's first twelve seconds of mission, uncompressed."""
-
-    def first(_: str, time: int, message: Any) -> list[tuple[int, Any]]:
-        return [(time, message)] if time < 1_664_800_016_000_000_000 else []
-
     path = tmp_path_factory.mktemp("short") / "short.bag"
-    return making.rewrite(making.CIRCLE, path, first, chunk=1 << 18)
+    return making.rewrite(making.CIRCLE, path, chunk=1 << 18, until=1_664_800_016_000_000_000)
 
 
 @pytest.fixture(autouse=True)

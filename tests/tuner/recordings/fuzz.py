@@ -45,12 +45,9 @@ class TooSlowError(BaseException):
 @functools.cache
 def _short_content() -> bytes:
     """Return the circle's first three seconds of mission as a bag."""
-
-    def first(_: str, when: int, message: Any) -> list[tuple[int, Any]]:
-        return [(when, message)] if when < 1_664_800_007_000_000_000 else []
-
     with tempfile.TemporaryDirectory() as folder:
-        path = making.rewrite(making.CIRCLE, Path(folder) / "base.bag", first, chunk=1 << 15)
+        path = Path(folder) / "base.bag"
+        making.rewrite(making.CIRCLE, path, chunk=1 << 15, until=1_664_800_007_000_000_000)
         return path.read_bytes()
 
 

@@ -68,10 +68,12 @@ def rewrite(
     compression: str = "none",
     rename: Callable[[str], str] = lambda topic: topic,
     chunk: int | None = None,
+    until: int | None = None,
 ) -> Path:
     """Write a bag again, each message passed through `change(topic, time, message)`.
 
-    It returns the messages to write instead, each with its time of recording.
+    It returns the messages to write instead, each with its time of recording. Those that were
+    recorded ``until`` a time, in ns, or later are left out.
     """
     store = store_of(bag, ros2=False)
     writer = BagWriter(target)
@@ -86,7 +88,7 @@ def rewrite(
             )
             for c in reader.connections
         }
-        for connection, time, raw in reader.messages():
+        for connection, time, raw in reader.messages(stop=until):
             connection_out = connections[connection.id]
             if change is None:
                 writer.write(connection_out, time, raw)

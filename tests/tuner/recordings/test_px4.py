@@ -44,8 +44,8 @@ AS_BETAFLIGHT = {"CA_ROTOR_COUNT": 4} | {
 
 
 @pytest.fixture(scope="module")
-def messages() -> dict[str, making.Column]:
-    return making.px4_messages(making.CIRCLE)
+def messages(short: Path) -> dict[str, making.Column]:
+    return making.px4_messages(short)
 
 
 def log(
@@ -162,23 +162,18 @@ def test_what_to_log_more_of() -> None:
 
 
 @pytest.fixture(scope="module")
-def bridged() -> dict[str, making.Column]:
-    return making.px4_messages(making.CIRCLE)
-
-
-@pytest.fixture(scope="module")
-def pose() -> making.Column:
+def pose(short: Path) -> making.Column:
     topic = "/optitrack/pose"
-    return making.columns_of(making.CIRCLE, {topic: list(making.LAB[topic])})[topic]
+    return making.columns_of(short, {topic: list(making.LAB[topic])})[topic]
 
 
 @pytest.fixture(scope="module")
-def truth() -> Flight:
-    return load_flight(making.CIRCLE)
+def truth(short: Path) -> Flight:
+    return load_flight(short)
 
 
-def boot_of(bridged: dict[str, making.Column]) -> int:
-    return int(bridged["vehicle_attitude"].time[0]) - 5_000_000_000
+def boot_of(messages: dict[str, making.Column]) -> int:
+    return int(messages["vehicle_attitude"].time[0]) - 5_000_000_000
 
 
 def near(flight: Flight, truth: Flight, *names: str) -> None:
@@ -192,10 +187,10 @@ def near(flight: Flight, truth: Flight, *names: str) -> None:
 
 @pytest.mark.parametrize("driver", making.MOCAPS)
 def test_motion_capture_beside_the_bridge(
-    driver: str, bridged, pose, truth, tmp_path: Path
+    driver: str, messages, pose, truth, tmp_path: Path
 ) -> None:
-    beside = {n: m for n, m in bridged.items() if n != "vehicle_attitude"}
-    boot = boot_of(bridged)
+    beside = {n: m for n, m in messages.items() if n != "vehicle_attitude"}
+    boot = boot_of(messages)
     folder = making.to_px4_ros2(beside, tmp_path / driver, boot=boot, poses={driver: pose})
     flight = load_flight(folder)
     near(flight, truth, "position", "attitude", "body_rate", "rate_setpoint", "command")
@@ -206,19 +201,19 @@ def test_motion_capture_beside_the_bridge(
     assert verdict_of(inspection).inlets == ("body_rate",)
 
 
-def test_the_bridges_odometry_alone(bridged, truth, tmp_path: Path) -> None:
-    local, attitude = bridged["vehicle_local_position"], bridged["vehicle_attitude"]
-    rates = bridged["vehicle_angular_velocity"]
+def test_the_bridges_odometry_alone(messages, truth, tmp_path: Path) -> None:
+    local, attitude = messages["vehicle_local_position"], messages["vehicle_attitude"]
+    rates = messages["vehicle_angular_velocity"]
     gyro = np.column_stack([np.interp(local.time, rates.time, c) for c in rates.values.T])
     values = np.hstack([local.values[:, :3], attitude.values, local.values[:, 3:], gyro])
-    commands = bridged["actuator_outputs"]
+    commands = messages["actuator_outputs"]
     sent = {
         "vehicle_odometry": making.Column(local.time, values),
-        "vehicle_rates_setpoint": bridged["vehicle_rates_setpoint"],
+        "vehicle_rates_setpoint": messages["vehicle_rates_setpoint"],
         "actuator_motors": making.Column(commands.time, commands.values / 1000 - 1),
-        "esc_status": bridged["esc_status"],
+        "esc_status": messages["esc_status"],
     }
-    folder = making.to_px4_ros2(sent, tmp_path / "odometry", boot=boot_of(bridged))
+    folder = making.to_px4_ros2(sent, tmp_path / "odometry", boot=boot_of(messages))
     flight = load_flight(folder)
     near(flight, truth, "position", "attitude", "rate_setpoint", "thrust_setpoint", "command")
     assert flight.has("velocity")
@@ -238,10 +233,10 @@ def test_databases_without_definitions_know_motion_capture(
     assert np.abs(position[:100] - pose.values[:100, :3]).max() < 0.01
 
 
-def test_px4s_messages_without_definitions_are_asked_for(bridged, tmp_path: Path) -> None:
-    few = {n: bridged[n] for n in ("vehicle_local_position", "vehicle_attitude")}
+def test_px4s_messages_without_definitions_are_asked_for(messages, tmp_path: Path) -> None:
+    few = {n: messages[n] for n in ("vehicle_local_position", "vehicle_attitude")}
     folder = making.to_px4_ros2(
-        few, tmp_path / "old", boot=boot_of(bridged), storage=StoragePlugin.SQLITE3
+        few, tmp_path / "old", boot=boot_of(messages), storage=StoragePlugin.SQLITE3
     )
     making.without_definitions(folder)
     with pytest.raises(RecordingError, match="not the definition of its type px4_msgs") as caught:

@@ -162,9 +162,11 @@ def test_commands_in_no_certain_unit_are_dropped_with_a_warning(change, tmp_path
 
 
 @pytest.mark.parametrize("standing", [0.0, 0.7])
-def test_commands_of_a_log_in_steps_are_not_read_as_pulses(standing: float, tmp_path: Path) -> None:
+def test_commands_of_a_log_in_steps_are_not_read_as_pulses(
+    standing: float, tmp_path: Path, short: Path
+) -> None:
     """Nor where they are zero for most of the time, of motors that stand before they idle."""
-    columns = making.px4_messages(making.CIRCLE)
+    columns = making.px4_messages(short)
     pulses = columns["actuator_outputs"]
     steps = 48 + 1999 * (pulses.values / 1000 - 1)
     columns["actuator_outputs"] = making.Column(pulses.time, steps)
