@@ -7,6 +7,8 @@ READY := $(VENV)/.ready
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 export OPENBLAS_NUM_THREADS ?= 1
+# a new environment holds no bytecode: unwritten, every process would compile its libraries anew
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-all test-fast lint docs bench clean
 

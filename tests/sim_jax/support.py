@@ -21,7 +21,16 @@ from sim_jax.vehicle import Vehicle
 from tests.golden_check.coefficients import golden_vehicle
 from tests.golden_check.controllers import golden_controller
 
-compiled_rollout = eqx.filter_jit(rollout)
+_compiled = eqx.filter_jit(rollout)
+
+
+def compiled_rollout(*given: object, **named: object) -> Rollout:
+    """Fly; a number that was Python's is of the kind of all others, and shares their program."""
+
+    def strong(leaf: object) -> object:
+        return jnp.asarray(leaf, leaf.dtype) if isinstance(leaf, Array) else leaf
+
+    return _compiled(*jax.tree.map(strong, given), **jax.tree.map(strong, named))  # type: ignore[no-any-return]
 
 
 def vehicle() -> Vehicle:

@@ -71,8 +71,16 @@ def test_a_vehicle_that_sinks_is_frozen_on_the_ground_at_the_right_time() -> Non
     assert apart(height[step + 2 :], height[-1]) == 0.0
     assert float(height[-1]) == pytest.approx(0.227, abs=0.03)
     assert apart(flown.log.rotor_speed[0][step + 2 :], flown.log.rotor_speed[0][-1]) == 0.0
-    assert bool(fly(with_motor_constants(WEAK), samples=step).crashed)
-    assert not bool(fly(with_motor_constants(WEAK), samples=step - 1).crashed)
+
+
+def test_a_crash_after_the_last_sample_is_none() -> None:
+    weak = with_motor_constants(*(WEAK * share for share in (0.7, 1.0, 1.3, 2.0)))
+    crash = fly(weak).crash_time
+    step = round(float(crash[0]) * 100)
+    before = crash <= step / 100
+    assert before.tolist() == [True, False, False, False]
+    assert round(float(crash[1]) * 100) == step + 1
+    assert fly(weak, samples=step).crashed.tolist() == before.tolist()
 
 
 @pytest.mark.parametrize(

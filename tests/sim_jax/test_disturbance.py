@@ -28,6 +28,12 @@ def series(*values: float) -> Vec3:
     return Vec3(*(jnp.full(TICKS, float(value)) for value in values))
 
 
+def acting(**parts: object) -> Environment:
+    """Return what acts, of parts that are all there: those that are not named are zero."""
+    none = Disturbance(series(0, 0, 0), series(0, 0, 0), jnp.zeros(TICKS), series(0, 0, 0))
+    return Environment(disturbance=replace(none, **parts))  # type: ignore[arg-type]
+
+
 @eqx.filter_jit
 def fallen(around: Environment) -> Rollout:
     """Return the flight of a vehicle at rest whose rotors stand still, in nothing that drags."""
@@ -39,7 +45,7 @@ def fallen(around: Environment) -> Rollout:
 
 
 def test_a_force_accelerates_by_newtons_law() -> None:
-    pushed = fallen(Environment(disturbance=Disturbance(force=series(0.3, -0.2, 0.5))))
+    pushed = fallen(acting(force=series(0.3, -0.2, 0.5)))
     free = fallen(NOTHING_AROUND)
     mass = float(vehicle().body.mass)
     gained = pushed.log.motion.velocity - free.log.motion.velocity
@@ -48,10 +54,10 @@ def test_a_force_accelerates_by_newtons_law() -> None:
 
 
 def test_a_moment_turns_by_eulers_law_and_thrust_acts_along_the_bodys_axis() -> None:
-    turned = fallen(Environment(disturbance=Disturbance(moment=series(0.0, 0.002, 0.0))))
+    turned = fallen(acting(moment=series(0.0, 0.002, 0.0)))
     rate = float(turned.log.motion.body_rate.y[-1])
     assert rate == pytest.approx(0.002 / float(vehicle().body.inertia_yy) * SECONDS, rel=1e-9)
-    lifted = fallen(Environment(disturbance=Disturbance(thrust=jnp.full(TICKS, 0.4))))
+    lifted = fallen(acting(thrust=jnp.full(TICKS, 0.4)))
     gained = lifted.log.motion.velocity.z[-1] - fallen(NOTHING_AROUND).log.motion.velocity.z[-1]
     assert float(gained) == pytest.approx(0.4 / float(vehicle().body.mass) * SECONDS, rel=1e-9)
 
@@ -92,13 +98,12 @@ def flown(around: Environment) -> Rollout:
 
 def test_a_steady_gust_is_a_wind() -> None:
     wind = vec(1.0, -0.5, 0.2)
-    gust = Environment(disturbance=Disturbance(gust=series(1.0, -0.5, 0.2)))
+    gust = acting(gust=series(1.0, -0.5, 0.2))
     assert apart(flown(gust).log, flown(Environment(wind)).log) < 1e-12
 
 
 def test_a_disturbance_of_zero_moves_nothing() -> None:
-    nothing = Disturbance(series(0, 0, 0), series(0, 0, 0), jnp.zeros(TICKS), series(0, 0, 0))
-    assert apart(flown(Environment(disturbance=nothing)).log, flown(NOTHING_AROUND).log) < 1e-12
+    assert apart(flown(acting()).log, flown(NOTHING_AROUND).log) < 1e-12
 
 
 def test_values_are_linear_between_control_ticks() -> None:

@@ -100,7 +100,7 @@ def hovered(effects, *, sees_markers):
 
 def test_who_sees_a_tilted_frame_hovers_level_and_away_from_where_it_is_sent():
     """Position control asks for the tilt that it sees: g·tilt over its gain from the point."""
-    motion = hovered(TILT, sees_markers=True).motion
+    motion = hovered({**dict.fromkeys(FRAME, 0.0), **TILT}, sees_markers=True).motion
     gain = controller_file().position.kp[0]
     lift = GRAVITY + controller_file().position.kp[2] * (1.0 - float(motion.position.z[-1]))
     # the frame leans by tilt_y towards +x and by -tilt_x towards +y, where the thrust is asked for
