@@ -218,7 +218,7 @@ def refuse(subject: Path, gates: Sequence[Gate], accept: str, remedy: str) -> No
     ExportError
         They are refused.
     """
-    refused = [objection for gate in gates for objection in gate.objections]
+    refused = dict.fromkeys(objection for gate in gates for objection in gate.objections)
     if refused and not accept:
         raise ExportError(
             subject,

@@ -105,7 +105,11 @@ def check_hover(wanted: VehicleFile, there: VehicleFile) -> Gate:
 
 
 def _crashes(flown: Mapping[str, AxesRmse]) -> list[str]:
-    return [f"{name} crashes" for name, rmse in flown.items() if rmse.x is None]
+    return [_crash(name) for name, rmse in flown.items() if rmse.x is None]
+
+
+def _crash(flight: str) -> str:
+    return f"{flight} crashes"
 
 
 def _differing(run: Run, flown: Mapping[str, AxesRmse]) -> list[str]:
@@ -129,6 +133,9 @@ def _worse(run: Run) -> list[str]:
     for flight in [one for one in flights if one.split == "holdout"] or flights:
         for what, unit in (("position", "m"), ("attitude", "degrees")):
             before, after = flight.rmse_initial.length(what), flight.rmse_best.length(what)
+            if math.isinf(after):
+                objections.append(_crash(flight.name))
+                break
             if after > before * (1 + WORSE) + SAME_ABSOLUTE:
                 objections.append(f"{flight.name} {what} {after:.4g} {unit}, before {before:.4g}")
     return objections

@@ -97,6 +97,8 @@ def test_a_missing_model_is_named(make_run, tmp_path):
         exported(make_run(), "sdf", into=tmp_path / "gone.sdf")
 
 
+CRASHED = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"))
+
 BAD = [
     (
         {"flights": {"held": {"rmse_best": rmse(0.2)}}},
@@ -111,6 +113,7 @@ BAD = [
         "motor_constant 1.45e-05 is its upper",
     ),
     ({"coefficients": {"inertia_xx": {"lower": 0.028}}}, "inertia_xx 0.028 is its lower"),
+    ({"flights": {"held": {"rmse_best": CRASHED}}}, "fit to export: held crashes; fit again"),
 ]
 
 
@@ -146,8 +149,7 @@ def test_a_reason_of_any_letters_leaves_the_file_readable(make_run, kind, tmp_pa
 
 def test_a_crash_or_another_rmse_when_flown_again_is_refused(make_run):
     def crashes(run, vehicle):
-        crashed = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"))
-        return as_the_run_says(run, vehicle) | {"circle": rmse(0.1).model_copy(update=crashed)}
+        return as_the_run_says(run, vehicle) | {"circle": rmse(0.1).model_copy(update=CRASHED)}
 
     def differs(run, vehicle):
         return as_the_run_says(run, vehicle) | {"circle": rmse(0.0012)}

@@ -233,6 +233,26 @@ def test_poses_of_links_and_inertials_count(vehicle, tmp_path):
     assert any("rotor_0 sits" in objection for objection in draft.gates[0].objections)
 
 
+@pytest.mark.parametrize(("number", "says"), [(4, "is of another vehicle"), (3, "beside the base")])
+def test_a_model_that_is_too_heavy_is_of_another_vehicle_or_has_heavy_links(
+    vehicle, tmp_path, number, says
+):
+    """A fifth rotor, or a heavier fourth."""
+    text = CLASSIC.read_text(encoding="utf-8")
+    link = text[text.index("    <link name='rotor_3'>") :]
+    link = link[: link.index("</link>") + len("</link>\n")]
+    plugin = text[text.index("    <plugin name='rear_right_motor'") :]
+    plugin = plugin[: plugin.index("</plugin>") + len("</plugin>\n")]
+    heavy = link.replace("<mass>0.006</mass>", "<mass>0.9</mass>")
+    if number == 4:
+        fifth = (heavy + plugin).replace("rotor_3", "rotor_4")
+        text = text.replace(plugin, plugin + fifth.replace("Number>3<", "Number>4<"))
+    else:
+        text = text.replace(link, heavy)
+    with pytest.raises(ExportError, match=says):
+        patched(tmp_path, vehicle, text)
+
+
 def test_what_has_no_tag_is_said(vehicle):
     vehicle = vehicle.replace(
         motor=vehicle.motor.replace(quadratic=-50.0),

@@ -153,9 +153,12 @@ def _base(model: Model, vehicle: VehicleFile) -> Inertial:
             centre=centre,
         )
     except ValueError as error:
-        raise ExportError(
-            model.path, str(error), "lighten those links, or give another model"
-        ) from None
+        more = _more_rotors(model, vehicle)
+        what = f"is of another vehicle: {more}" if more else str(error)
+        remedy = (
+            "give a model of this one" if more else "lighten those links, or give another model"
+        )
+        raise ExportError(model.path, what, remedy) from None
 
 
 def _inertial_edits(model: Model, base: Inertial) -> Iterator[Edit]:
@@ -292,12 +295,16 @@ def _notes(
     yield from tags.lost_in(asked)
 
 
+def _more_rotors(model: Model, vehicle: VehicleFile) -> str:
+    """Return that a model has more rotors than a vehicle, as a clause; empty if it does not."""
+    count, own = len(read_model(model.root, MOST_ROTORS).rotor_links()), len(vehicle.rotors)
+    return f"the model has {count} rotors, the vehicle {own}" if count > own else ""
+
+
 def _other_rotors(model: Model, vehicle: VehicleFile, base: Inertial) -> tuple[str, ...]:
     """Return how the model's rotors are others than the vehicle file's, a clause each."""
-    count = len(read_model(model.root, MOST_ROTORS).rotor_links())
-    clauses = []
-    if count > len(vehicle.rotors):
-        clauses.append(f"the model has {count} rotors, the vehicle {len(vehicle.rotors)}")
+    more = _more_rotors(model, vehicle)
+    clauses = [more] if more else []
     others = [body for link, body in inertials(model) if link is not model.base]
     centre = together([base, *others]).pose.position
     offset = np.array(tags.center_of_mass(vehicle) or (0.0, 0.0, 0.0))

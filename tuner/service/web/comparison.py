@@ -139,7 +139,7 @@ def flight_pairs(a: RunResult, b: RunResult) -> list[FlightPair]:
 
 
 WIDTH, HEIGHT = 640.0, 270.0
-LEFT, RIGHT, TOP, BOTTOM = 92.0, 12.0, 28.0, 46.0
+LEFT, RIGHT, TOP, BOTTOM = 116.0, 12.0, 28.0, 46.0
 MOST_POINTS = 600
 """Points of a curve: more would not be seen."""
 
