@@ -21,6 +21,8 @@ AT_REST = 1e-5
 """Reference motion below this, in m or m/s, is a reference at rest."""
 PAUSE = 1.0
 """Set-points that pause for longer, in s, begin another mission."""
+LONGEST_PAUSE = 10.0
+"""A pose that pauses for longer, in s, as where a clock was set, ends a mission."""
 SHORTEST_LANDING = 0.2
 """A flight that leaves the air for less, in s, only seems to: a bounce at landing takes longer."""
 SHORTEST = 2.0
@@ -102,8 +104,22 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
                 flown = max(up, start)
                 begin = _first_motion(series, flown, min(end, down))
                 begins_with = "the reference's motion" if begin > flown else "flight"
-            missions.append(Mission(begin, min(end, down, last), begins_with))
+            mission = Mission(begin, min(end, down, last), begins_with)
+            missions += _pieces(mission, series["position"].time)
     return tuple(m for m in missions if m.end - m.start >= SHORTEST)
+
+
+def _pieces(mission: Mission, pose: Array) -> list[Mission]:
+    """Return a mission without the pauses of its pose, in which nobody knows what flew."""
+    inside = pose[(pose >= mission.start) & (pose <= mission.end)]
+    pieces = stretches(inside, np.ones(len(inside), np.bool_), bridged=LONGEST_PAUSE)
+    if len(pieces) < 2:
+        return [mission]
+    first, *later = pieces
+    return [
+        replace(mission, end=first[1]),
+        *(replace(mission, start=a, end=b, begins_with="flight") for a, b in later),
+    ]
 
 
 def _first_motion(series: Mapping[str, Series], start: float, end: float) -> float:
