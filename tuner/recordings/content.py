@@ -36,6 +36,7 @@ from tuner.recordings.topics import (
 )
 from tuner.recordings.unit_detection import (
     ATTITUDES,
+    FEWEST_SAMPLES,
     NAMES,
     Stamped,
     is_too_slow,
@@ -255,7 +256,8 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     if signals.no_pose is not None:
         raise signals.no_pose
     topics = signals.topics
-    series, shifted = align_pose(signals.series, topics)
+    series, none = _tachometers(signals.series, topics)
+    series, shifted = align_pose(series, topics)
     series, turned = correct_frames(series, topics)
     cut, stale = without_stale(series)
     missions = _choose_missions(cut, sidecar)
@@ -266,7 +268,7 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     denied = contradiction(series, missions)
     if denied is not None:  # which says what the doubts of frames are about
         turned = (*(note for note in turned if note.code not in DOUBTS), denied)
-    notes = (*signals.notes, *shifted, *turned, *stale, *_note_missing_tachometers(series, topics))
+    notes = (*signals.notes, *shifted, *turned, *stale, *none)
     read = vars(signals) | {"series": series, "notes": notes}
     return Content(**read, missions=missions)
 
@@ -302,18 +304,29 @@ def _clean(raw: Mapping[str, Raw]) -> tuple[dict[str, Series], int, list[Note]]:
     return series, epoch, [*units, *notes.values()]
 
 
-def _note_missing_tachometers(
+def _tachometers(
     series: Mapping[str, Series], topics: Mapping[str, str]
-) -> list[Note]:
-    """Note which rotors have no tachometer."""
-    if "rotor_speed" not in series:
-        return []
-    missing = np.flatnonzero(np.isnan(series["rotor_speed"].values).all(axis=0))
+) -> tuple[dict[str, Series], tuple[Note, ...]]:
+    """Return signals without rotor speeds that are none, and a note on rotors without tachometer.
+
+    Those are none that never change while others do, or that are all 0.
+    """
+    others, speeds = dict(series), series.get("rotor_speed")
+    if speeds is None:
+        return others, ()
+    low, high = np.fmin.reduce(speeds.values, axis=0), np.fmax.reduce(speeds.values, axis=0)
+    still = (low == high) & (np.isfinite(speeds.values).sum(axis=0) >= FEWEST_SAMPLES)
+    dead = still & ((high == 0.0) | (low < high).any())
+    values = np.where(dead, np.nan, speeds.values)
+    known = np.isfinite(values).any(axis=1)
+    others["rotor_speed"] = Series(speeds.time[known], values[known])
+    if not known.any():
+        del others["rotor_speed"]
+    missing = np.flatnonzero(np.isnan(values).all(axis=0))
     if len(missing) == 0:
-        return []
-    rotors = tuple(str(rotor) for rotor in missing)
-    topic = topics["rotor_speed"]
-    return [Note(NoteCode.NO_TACHOMETER, "info", topic, count=len(rotors), names=rotors)]
+        return others, ()
+    rotors, topic = tuple(str(rotor) for rotor in missing), topics["rotor_speed"]
+    return others, (Note(NoteCode.NO_TACHOMETER, "info", topic, len(rotors), names=rotors),)
 
 
 def _choose_missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:

@@ -10,7 +10,7 @@ frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +39,13 @@ from tuner.recordings.unit_detection import (
     to_enu_flu,
 )
 
-DOUBTS = (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED, NoteCode.VELOCITY_DOUBTED)
+DOUBTS = (
+    NoteCode.ATTITUDE_DOUBTED,
+    NoteCode.BODY_RATE_DOUBTED,
+    NoteCode.VELOCITY_DOUBTED,
+    NoteCode.AXIS_DOUBTED,
+    NoteCode.AXES_TURNED,
+)
 """Notes of what fits no reading."""
 LEAST_ACCELERATION = 0.3
 LEAST_TURN_RATE = 0.1
@@ -114,6 +120,9 @@ def correct_frames(
         apply("body_rate", *_judge_rate(fixed, clock))
     if "velocity" in fixed:
         apply("velocity", *_judge_velocity(fixed, clock))
+    for signal, of in _CHANGES.items():
+        if signal in fixed and not any(note.code in _DOUBTED[signal] for note in notes):
+            notes += [replace(n, topic=topics.get(signal, signal)) for n in of(fixed, clock)]
     if {"rate_setpoint", "body_rate"} <= set(fixed):
         apply("rate_setpoint", _judge_setpoint(fixed, clock), None)
     return fixed, tuple(notes)
@@ -202,6 +211,87 @@ def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
         return best, None
     doubt = Note(NoteCode.BODY_RATE_DOUBTED, numbers={"left": here})
     return None, doubt if here > 0.9 else None
+
+
+LEAST_TIMES = {"body_rate": 0.93, "velocity": 0.8}
+"""How many times what the pose says a measured signal is at least, or its inverse at most: a gyro's
+scale is known to a few percent, what estimates speed smooths it."""
+LARGELY_ALIKE, CLEARLY_ALIKE = 0.7, 0.97
+"""Correlation from which on the sign, or the ratio of sizes, of two signals is no noise."""
+LEAST_TURN, LEAST_SECOND = 0.1, 0.05
+"""rad by which axes may be turned against others, as a marker body was defined; and the least size
+of the second largest motion beside the largest, without which that is not seen."""
+
+
+def _rate_doubts(series: Mapping[str, Series], clock: Array) -> Iterator[Note]:
+    turning, gyro = _body_rates(series, clock)
+    doubts = list(_axis_doubts(turning, gyro, ("body_rate", "attitude"), LEAST_TURN_RATE))
+    angle = _angle_between(turning, gyro)
+    if all(note.numbers["times"] > 0 for note in doubts) and angle > LEAST_TURN:
+        numbers = {"degrees": float(np.degrees(angle))}
+        doubts = [Note(NoteCode.AXES_TURNED, "warning", numbers=numbers)]
+    yield from doubts
+
+
+def _axis_doubts(
+    motion: Array, recorded: Array, names: tuple[str, str], least_motion: float
+) -> Iterator[Note]:
+    """Yield the axes along which a recorded signal is the pose's change with another sign or size.
+
+    Parameters
+    ----------
+    motion, recorded
+        (n, 3) each, which should be alike.
+    names
+        The signal, and whose change it is.
+    """
+    known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
+    least = LEAST_TIMES[names[0]]
+    for axis, name in enumerate("xyz"):
+        a, b = (values[known, axis : axis + 1] for values in (motion, recorded))
+        if not known.any() or min(rms(a), rms(b)) < least_motion:
+            continue
+        alike, times = correlation(a, b), rms(b) / rms(a)
+        of_another_size = alike > CLEARLY_ALIKE and not least < times < 1.0 / least
+        if alike < -LARGELY_ALIKE or of_another_size:
+            numbers = {"times": float(np.copysign(times, alike))}
+            signal, other = names
+            yield Note(
+                NoteCode.AXIS_DOUBTED, "warning", numbers=numbers, names=(signal, name, other)
+            )
+
+
+def _angle_between(motion: Array, recorded: Array) -> float:
+    """Return by which angle, in rad, the axes of two signals are turned; 0 where that is unsure.
+
+    The rotation is that of least squares (Kabsch 1976).
+    """
+    known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
+    a, b = motion[known], recorded[known]
+    if len(a) < 2 or min(rms(a), rms(b)) < CLEAR_TURN_RATE:
+        return 0.0
+    left, sizes, right = np.linalg.svd(b.T @ a)
+    if sizes[1] < LEAST_SECOND * sizes[0]:
+        return 0.0
+    turned = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    before, behind = _residual_share(a, b), _residual_share(a, b @ turned)
+    if behind > 0.5 * before:
+        return 0.0
+    return float(np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0)))
+
+
+_CHANGES: Mapping[str, Callable[[Mapping[str, Series], Array], Iterable[Note]]] = {
+    "body_rate": _rate_doubts,
+    "velocity": lambda s, clock: _axis_doubts(
+        *_velocities(s, clock), ("velocity", "position"), LEAST_SPEED
+    ),
+}
+"""Signal that is the pose's change -> what is doubted of it along single axes."""
+_DOUBTED = {
+    "body_rate": (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED),
+    "velocity": (NoteCode.VELOCITY_DOUBTED, NoteCode.UNIT_DOUBTED),
+}
+"""Signal -> notes that say more of it."""
 
 
 def _judge_setpoint(series: Mapping[str, Series], clock: Array) -> Reading | None:

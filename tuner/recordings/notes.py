@@ -170,6 +170,17 @@ class NoteCode(Worded):
         "velocity_doubted",
         "the velocity is not the position's change (agreement {agreement:.2f})",
     )
+    AXIS_DOUBTED = (
+        "axis_doubted",  # names: the signal, its axis, whose change it is
+        "{first} along {second} is {times:.2f} times the change of {third}: check axes, unit, time",
+    )
+    AXES_TURNED = (
+        "axes_turned",
+        (
+            "the attitude's body axes are turned by {degrees:.0f} degrees against the gyro's: "
+            "check how its markers were defined"
+        ),
+    )
     CONTRADICTED = (
         "contradicted",  # names: the signal, the signal that denies it
         (
@@ -295,6 +306,7 @@ def reason_in_words(note: Note) -> str:
         topic=note.topic,
         first=first,
         second=second,
+        third=alike,
         all=", ".join(note.names),
         more=", ..." if note.count > len(note.names) else "",
         others=", ".join(note.names[1:]),

@@ -7,7 +7,19 @@ import pytest
 from tuner.recordings.notes import PASSED_OVER, Note, NoteCode, note_in_words
 
 NUMBERS = dict.fromkeys(
-    ["seconds", "longest", "lower", "upper", "agreement", "upright", "left", "number", "drift"], 0.5
+    [
+        "seconds",
+        "longest",
+        "lower",
+        "upper",
+        "agreement",
+        "upright",
+        "left",
+        "number",
+        "drift",
+        "degrees",
+    ],
+    0.5,
 ) | {"times": 39.4, "median": 1225.0}
 
 

@@ -422,3 +422,67 @@ def test_the_unit_of_a_gyro_without_a_pose(factor: float, outcome: str, tmp_path
     scale = 1.0 if outcome == "si" else np.radians(1.0)
     expected = scale * factor * 0.3
     assert np.abs(flight.series["body_rate"].values).max() == pytest.approx(expected, rel=0.01)
+
+
+def _turned(degrees: float) -> str:
+    """Return the flight as CSV, of a marker body that was defined with another heading."""
+    half = np.radians(degrees) / 2
+    w, x, y, z = (ways.flown()[f"q{axis}"] for axis in "wxyz")
+    turned = {
+        "qw": w * np.cos(half) - z * np.sin(half),
+        "qx": x * np.cos(half) + y * np.sin(half),
+        "qy": y * np.cos(half) - x * np.sin(half),
+        "qz": z * np.cos(half) + w * np.sin(half),
+    }
+    return ways.text(dict(ways.flown()) | turned)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (lambda: ways.changed({}), set()),
+        (lambda: ways.changed({"q": lambda q: 0.99 * q}), set()),
+        (lambda: ways.changed({"wy": lambda w: -w}), {("body_rate", "y", -1.0)}),
+        (lambda: ways.changed({"wx": lambda w: 1.1 * w}), {("body_rate", "x", 1.1)}),
+        (
+            lambda: ways.changed({"time": lambda t: 1.1 * t}),
+            {("body_rate", axis, 1.1) for axis in "xyz"},
+        ),
+        (
+            lambda: ways.changed({"vx": lambda v: 0.5 * v, "vy": lambda v: 0.5 * v}),
+            {("velocity", axis, 0.5) for axis in "xy"},
+        ),
+    ],
+)
+def test_single_axes_that_deny_the_pose_are_named(content, said: set, tmp_path: Path) -> None:
+    notes = [n for n in read(tmp_path, content()).notes if n.code is NoteCode.AXIS_DOUBTED]
+    assert {(*n.names[:2], round(n.numbers["times"], 1)) for n in notes} == said
+    assert all(note.kind == "warning" for note in notes)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 45.0])
+def test_a_marker_body_of_another_heading_is_named(degrees: float, tmp_path: Path) -> None:
+    notes = [n for n in read(tmp_path, _turned(degrees)).notes if n.code is NoteCode.AXES_TURNED]
+    assert [n.numbers["degrees"] for n in notes] == (
+        [pytest.approx(degrees, abs=1.0)] if degrees else []
+    )
+
+
+@pytest.mark.parametrize("value", [0.0, 500.0])
+def test_a_rotor_speed_that_never_changes_is_none(value: float, tmp_path: Path) -> None:
+    flight = read(tmp_path, ways.changed({"rotor_speed_3": lambda n: 0 * n + value}))
+    assert np.isnan(flight.series["rotor_speed"].values[:, 2]).all()
+    (note,) = [n for n in flight.notes if n.code is NoteCode.NO_TACHOMETER]
+    assert note.names == ("2",)
+    if not value:
+        assert not read(tmp_path, ways.changed({"rotor_speed": lambda n: 0 * n})).has("rotor_speed")
+
+
+@pytest.mark.parametrize("step", [-3600.0, 3600.0])
+def test_a_clock_that_is_set_in_flight_parts_it(step: float, tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    path.write_text(ways.changed({"time": lambda t: np.where(t > 7.0, t + step, t)}))
+    recordings, _ = read_usable(settle(Options([str(path)], vehicle=str(ways.VEHICLE))))
+    assert [recording.flight.duration for recording in recordings] == [
+        pytest.approx(7.0, abs=0.1)
+    ] * 2
