@@ -105,10 +105,10 @@ def test_concurrent_runs_agree(bag: Path) -> None:
     )
     runs = [
         subprocess.Popen([sys.executable, "-c", code, str(bag)], stdout=subprocess.PIPE, text=True)
-        for _ in range(4)
+        for _ in range(2)
     ]
     outputs = {run.communicate()[0] for run in runs}
-    assert [run.returncode for run in runs] == [0, 0, 0, 0]
+    assert [run.returncode for run in runs] == [0, 0]
     assert len(outputs) == 1
     names = [file.name for file in (own_folder() / "flights").iterdir()]
     assert len(names) == 1
