@@ -130,9 +130,8 @@ def correct_frames(
 
 def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     q = on_clock(series, "attitude", clock)
-    position = smooth(on_clock(series, "position", clock), 0.2)
-    push = smooth(derivative(smooth(derivative(position), 0.2)), 0.2)
-    pull = push + np.array([0.0, 0.0, GRAVITY])
+    pull = _pull(series, clock)
+    push = pull - np.array([0.0, 0.0, GRAVITY])
     gyro = on_clock(series, "body_rate", clock) if "body_rate" in series else None
     force = on_clock(series, "acceleration", clock) if "acceleration" in series else None
     turns = [smooth(rate) for rate in (body_rate_of(q), gyro) if rate is not None]
@@ -213,9 +212,9 @@ def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
     return None, doubt if here > 0.9 else None
 
 
-LEAST_TIMES = {"body_rate": 0.93, "velocity": 0.8}
+LEAST_TIMES = {"body_rate": 0.93, "velocity": 0.8, "acceleration": 0.7}
 """How many times what the pose says a measured signal is at least, or its inverse at most: a gyro's
-scale is known to a few percent, what estimates speed smooths it."""
+scale is known to a few percent, what estimates speed smooths it, a second derivative is noise."""
 LARGELY_ALIKE, CLEARLY_ALIKE = 0.7, 0.97
 """Correlation from which on the sign, or the ratio of sizes, of two signals is no noise."""
 LEAST_TURN, LEAST_SECOND = 0.1, 0.05
@@ -231,6 +230,32 @@ def _rate_doubts(series: Mapping[str, Series], clock: Array) -> Iterator[Note]:
         numbers = {"degrees": float(np.degrees(angle))}
         doubts = [Note(NoteCode.AXES_TURNED, "warning", numbers=numbers)]
     yield from doubts
+
+
+def _force_doubts(series: Mapping[str, Series], clock: Array) -> Iterator[Note]:
+    """Yield the axes of the world, or else of the body, along which forces deny the motion.
+
+    Those of a height that is upside down, and of an accelerometer of its own axes.
+    """
+    q, pull = on_clock(series, "attitude", clock), _pull(series, clock)
+    force = on_clock(series, "acceleration", clock)
+    names = ("acceleration", "position")
+    doubts = tuple(_axis_doubts(pull, _as_smooth(rotate(q, force)), names, LEAST_ACCELERATION))
+    if not doubts:
+        own = rotate(q * np.array([1.0, -1.0, -1.0, -1.0]), pull)
+        doubts = tuple(_axis_doubts(own, _as_smooth(force), names, LEAST_ACCELERATION))
+    yield from doubts
+
+
+def _pull(series: Mapping[str, Series], clock: Array) -> Array:
+    """Return the motion's specific force in world axes, (n, 3) m/s^2."""
+    position = smooth(on_clock(series, "position", clock), 0.2)
+    push = smooth(derivative(smooth(derivative(position), 0.2)), 0.2)
+    return np.asarray(push + np.array([0.0, 0.0, GRAVITY]))
+
+
+def _as_smooth(force: Array) -> Array:
+    return smooth(smooth(smooth(force, 0.2), 0.2), 0.2)
 
 
 def _axis_doubts(
@@ -285,11 +310,13 @@ _CHANGES: Mapping[str, Callable[[Mapping[str, Series], Array], Iterable[Note]]] 
     "velocity": lambda s, clock: _axis_doubts(
         *_velocities(s, clock), ("velocity", "position"), LEAST_SPEED
     ),
+    "acceleration": _force_doubts,
 }
-"""Signal that is the pose's change -> what is doubted of it along single axes."""
+"""Signal that is a change of the pose -> what is doubted of it along single axes."""
 _DOUBTED = {
     "body_rate": (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED),
     "velocity": (NoteCode.VELOCITY_DOUBTED, NoteCode.UNIT_DOUBTED),
+    "acceleration": (NoteCode.ATTITUDE_DOUBTED, NoteCode.UNIT_DOUBTED),
 }
 """Signal -> notes that say more of it."""
 

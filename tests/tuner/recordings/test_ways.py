@@ -452,6 +452,11 @@ def _turned(degrees: float) -> str:
             lambda: ways.changed({"vx": lambda v: 0.5 * v, "vy": lambda v: 0.5 * v}),
             {("velocity", axis, 0.5) for axis in "xy"},
         ),
+        (
+            lambda: ways.changed({"z": lambda z: -z, "vz": lambda v: -v}),
+            {("acceleration", "z", -1.0)},
+        ),
+        (lambda: ways.changed({"ay": lambda a: -a}), {("acceleration", "y", -0.7)}),
     ],
 )
 def test_single_axes_that_deny_the_pose_are_named(content, said: set, tmp_path: Path) -> None:
