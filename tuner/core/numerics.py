@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri  # scipy.stats takes a quarter of a second to import
 
 Array = NDArray[np.float64]
 
-Z95 = float(ndtri(0.975))
-"""Standard deviations of a normal distribution that a 95 % interval reaches to either side."""
+Z95 = 1.959963984540054
+"""Standard deviations of a normal distribution that a 95 % interval reaches to either side: its
+quantile at 0.975. (`scipy.special` takes a third of the time in which `tune inspect` answers.)"""
 ROBUST = 1.4826
 """Standard deviations of a normal distribution in its median absolute deviation."""
 ROUNDING = 1e-12

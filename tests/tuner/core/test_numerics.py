@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import ndtri
 
 from tuner.core.numerics import (
+    Z95,
     Inverse,
     errors_of,
     huber_weights,
@@ -21,6 +23,10 @@ from tuner.core.numerics import (
 
 SIZES = st.integers(1, 8)
 SEEDS = st.integers(0, 2**32 - 1)
+
+
+def test_an_interval_holds_95_percent() -> None:
+    assert float(ndtri(0.975)) == Z95
 
 
 def information(
