@@ -151,6 +151,12 @@ class FisherInformation:
             return self
         return replace(self, pull=np.where(where, self.pull - self.slope, self.pull))
 
+    @property
+    def settled(self) -> FisherInformation:
+        """The same where the loss is least, to first order: what a fit from there would see."""
+        step = -(self.inverse.matrix @ self.slope)
+        return replace(self, score=self.score + self.blocks @ step, pull=None, nuisance_pull=None)
+
     def about(self, indices: NDArray[np.intp]) -> FisherInformation:
         """Return the information about some coefficients while the others are fixed."""
         square = np.ix_(indices, indices)

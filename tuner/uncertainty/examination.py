@@ -133,15 +133,22 @@ def examine(
         moves = np.array([in_doubt.get(name, 0.0) for name in objective.space.names])
         apart = np.array([gains.get(name, 0.0) for name in objective.space.names]) * reference
         information = replace(information, in_doubt=np.hypot(moves, apart))
-    searched = set(full_problem.fitted) - set(fitted.held.values()) if at_minimum else set[str]()
+    searched = set(full_problem.fitted) - set(fitted.held.values())
     information = information.resting(at_rest(objective.space, point, searched))
     information = replace(information, astray=astray)
+
+    def known(*others: str) -> Uncertainty:
+        return _uncertainty_of(
+            full_problem,
+            information,
+            (*full_problem.fitted, *others),
+            names,
+            at_minimum=at_minimum,
+        )
+
     return Examination(
-        uncertainty=_uncertainty_of(full_problem, information, full_problem.fitted, names),
-        freed={
-            name: _uncertainty_of(full_problem, information, (*full_problem.fitted, name), names)
-            for name in full_problem.fixed
-        },
+        uncertainty=known(),
+        freed={name: known(name) for name in full_problem.fixed},
         bias=_bias(full_problem, information, reference),
         sensitivity=LocalSensitivity.joined(sensitivities),
         residuals=tuple(residuals),
@@ -156,10 +163,15 @@ def _uncertainty_of(
     information: FisherInformation,
     names: tuple[str, ...],
     flights: Sequence[str],
+    *,
+    at_minimum: bool,
 ) -> Uncertainty:
     space, indices = full_problem.subspace(names)
     vector = np.asarray(full_problem.point.coefficients)[indices]
-    return uncertainty_at(space, vector, information.about(indices), flights)
+    information = information.about(indices)
+    if not at_minimum:  # flights that agree with each other and not with the vehicle agree
+        information = information.settled
+    return uncertainty_at(space, vector, information, flights)
 
 
 def _bias(full_problem: FullProblem, information: FisherInformation, reference: Array) -> Array:

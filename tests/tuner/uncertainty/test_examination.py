@@ -82,6 +82,21 @@ def test_flights_that_the_fitted_vehicle_does_not_fly_say_nothing(
     assert not flights_refute(looked_at)
 
 
+def test_flights_that_agree_on_another_vehicle_do_not_disagree(
+    objective: Objective, examination: Examination
+) -> None:
+    """Where nothing was fitted, each flight wants the same step, which tells of no scatter."""
+    values = objective.space.numbers(making.truth(objective).coefficients)
+    known = examination.uncertainty.estimates["motor_constant"]
+    values["motor_constant"] += 10.0 * known.std_error
+    off = objective.start(objective.space.vector_of(values))
+    looked_at = examine(making.fitted_of(objective, off), at_minimum=False).uncertainty
+    for name, estimate in looked_at.estimates.items():
+        there = examination.uncertainty.estimates[name]
+        assert estimate.parts.residuals == pytest.approx(there.parts.residuals, rel=0.3)
+        assert not estimate.parts.search
+
+
 @pytest.mark.parametrize(
     ("astray", "crashed", "refuted"),
     [
