@@ -256,7 +256,8 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     if signals.no_pose is not None:
         raise signals.no_pose
     topics = signals.topics
-    series, none = _tachometers(signals.series, topics)
+    series, dead = _with_live_commands(signals.series, topics)
+    series, none = _tachometers(series, topics)
     series, shifted = align_pose(series, topics)
     series, turned = correct_frames(series, topics)
     cut, stale = without_stale(series)
@@ -268,7 +269,7 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     denied = contradiction(series, missions)
     if denied is not None:  # which says what the doubts of frames are about
         turned = (*(note for note in turned if note.code not in DOUBTS), denied)
-    notes = (*signals.notes, *shifted, *turned, *stale, *none)
+    notes = (*signals.notes, *shifted, *turned, *stale, *dead, *none)
     read = vars(signals) | {"series": series, "notes": notes}
     return Content(**read, missions=missions)
 
@@ -302,6 +303,29 @@ def _clean(raw: Mapping[str, Raw]) -> tuple[dict[str, Series], int, list[Note]]:
         if len(time):
             series[signal] = Series(time, values)
     return series, epoch, [*units, *notes.values()]
+
+
+LEAST_CHANGE = 0.05
+"""Of the commands of a flight: less may be a hover, in whole microseconds."""
+
+
+def _with_live_commands(
+    series: Mapping[str, Series], topics: Mapping[str, str]
+) -> tuple[dict[str, Series], tuple[Note, ...]]:
+    """Return signals without commands that never change for one rotor while they do for others."""
+    others = dict(series)
+    if "command" not in others:
+        return others, ()
+    values = others["command"].values
+    change = np.fmax.reduce(values, axis=0) - np.fmin.reduce(values, axis=0)
+    dead = np.flatnonzero(change == 0.0)
+    if len(dead) == 0 or len(values) < FEWEST_SAMPLES or not (change > LEAST_CHANGE).any():
+        return others, ()
+    del others["command"]
+    rotors = tuple(str(rotor) for rotor in dead)
+    return others, (
+        Note(NoteCode.COMMAND_DEAD, "warning", topics["command"], len(rotors), names=rotors),
+    )
 
 
 def _tachometers(

@@ -113,6 +113,10 @@ class NoteCode(Worded):
         "signal_unknown",
         "{first} is unknown for {seconds:.2f} s, {longest:.2f} s at a time",
     )
+    COMMAND_DEAD = (
+        "command_dead",  # names: the rotors
+        "the commands of rotors {all} never change while the others do: not read",
+    )
     NO_TACHOMETER = "no_tachometer", "rotors {all} have no tachometer"  # names: the rotors
     FRAME_TURNED = (
         "frame_turned",  # names: the signal, the frame that it is in

@@ -491,3 +491,12 @@ def test_a_clock_that_is_set_in_flight_parts_it(step: float, tmp_path: Path) -> 
     assert [recording.flight.duration for recording in recordings] == [
         pytest.approx(7.0, abs=0.1)
     ] * 2
+
+
+def test_commands_of_a_rotor_that_never_change_are_not_believed(tmp_path: Path) -> None:
+    flight = read(tmp_path, ways.changed({"command_3": lambda u: 0 * u}))
+    assert not flight.has("command")
+    (note,) = [n for n in flight.notes if n.code is NoteCode.COMMAND_DEAD]
+    assert (note.kind, note.names) == ("warning", ("2",))
+    hover = read(tmp_path, ways.changed({"command": lambda u: 0 * u + 0.5}))
+    assert hover.has("command")
