@@ -9,14 +9,14 @@ import numpy as np
 
 from sim_jax.control.gains import Filters, MixerSettings
 from sim_jax.environment import Air
-from sim_jax.geometry import Vec3
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import ActuatorInlet
 from sim_jax.rigid_body import Motion, acceleration, angular_acceleration
 from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
 from sim_jax.terms.total import total_wrench
-from sim_jax.vehicle import Vehicle
+from sim_jax.vehicle import PerRotor, Vehicle
 from tests.golden_check.coefficients import GOLDEN_GRAVITY, golden_vehicle
 from tests.golden_check.controllers import golden_controller
 from tests.golden_check.runge_kutta import step_rk4
@@ -48,24 +48,36 @@ def wrench(table: Table) -> list[Deviation]:
 
 
 def _wrench(table: Table) -> list[Deviation]:
-    vehicle = _vehicle(table)
-    attitude, body_rate = table.quaternion("q"), table.vector("w")
     velocity = table.vector("v")
-    motion = Motion(Vec3.zeros(velocity.x), velocity, attitude, body_rate)
-    acting = total_wrench(vehicle, motion, table.four("Om"), Air.around(vehicle, motion))
-    fall = acceleration(vehicle.body, attitude, acting.force, gravity=GOLDEN_GRAVITY)
-    now = jnp.zeros(len(table))
-    turning = jax.jvp(
-        lambda time: attitude.advanced(attitude, body_rate, time), (now,), (jnp.ones_like(now),)
-    )[1]
-    rolling = angular_acceleration(vehicle.body, body_rate, acting.moment)
+    motion = Motion(Vec3.zeros(velocity.x), velocity, table.quaternion("q"), table.vector("w"))
+    force, moment, fall, turning, rolling = _moved(_vehicle(table), motion, table.four("Om"))
     return [
-        deviation("force", attitude.to_world(acting.force), table.vector("F"), WRENCH),
-        deviation("moment", attitude.to_world(acting.moment), table.vector("tau"), WRENCH),
+        deviation("force", force, table.vector("F"), WRENCH),
+        deviation("moment", moment, table.vector("tau"), WRENCH),
         deviation("acceleration", fall, table.vector("dv"), WRENCH),
         deviation("attitude derivative", turning, table.quaternion("dq"), WRENCH),
         deviation("angular acceleration", rolling, table.vector("dw"), WRENCH),
     ]
+
+
+@eqx.filter_jit
+def _moved(
+    vehicle: Vehicle, motion: Motion, speeds: PerRotor
+) -> tuple[Vec3, Vec3, Vec3, Quaternion, Vec3]:
+    """Return force and moment, world axes, and the derivatives of velocity, attitude and rate."""
+    attitude, body_rate = motion.attitude, motion.body_rate
+    acting = total_wrench(vehicle, motion, speeds, Air.around(vehicle, motion))
+    now = jnp.zeros_like(body_rate.x)
+    turning = jax.jvp(
+        lambda time: attitude.advanced(attitude, body_rate, time), (now,), (jnp.ones_like(now),)
+    )[1]
+    return (
+        attitude.to_world(acting.force),
+        attitude.to_world(acting.moment),
+        acceleration(vehicle.body, attitude, acting.force, gravity=GOLDEN_GRAVITY),
+        turning,
+        angular_acceleration(vehicle.body, body_rate, acting.moment),
+    )
 
 
 def open_loop(table: Table) -> list[Deviation]:
