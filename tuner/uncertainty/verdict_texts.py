@@ -12,6 +12,8 @@ from tuner.vehicle import scale_group
 
 MOST = 100.0
 """Of a logarithm's interval, more than any prior leaves."""
+HARDLY = math.log(10.0)
+"""Of a logarithm's interval, from which no percentage is said of it."""
 NEGLIGIBLE = 0.01
 """Share of the largest part of an error below which another is not worth a word."""
 
@@ -45,7 +47,7 @@ def reason_in_words(reason: Reason) -> str:
             f"{reason.noise_inflation:.1f} times"
         )
     if reason.bound is not None:
-        phrase += f"; the fit ended at its {reason.bound} bound"
+        phrase += f"; it lies at its {reason.bound} bound"
     if reason.given_held is not None:
         phrase += f"; fitted with {reason.given_held} held at its initial value"
     return phrase
@@ -106,8 +108,8 @@ def _main_clause(reason: Reason) -> str:
         f"The interval is that of {prior}",
         ReasonCode.NO_INFORMATION: "the flights hold no information about it; "
         f"the interval is that of {prior}",
-        ReasonCode.WIDE_INTERVAL: f"the flights alone determine it only to ±{_half_width(reason)}; "
-        f"the interval leans on {prior}",
+        ReasonCode.WIDE_INTERVAL: f"the flights alone {_told(reason)}; the interval leans "
+        f"on {prior}",
         ReasonCode.REFUTED: "the fitted vehicle does not fly what was recorded, so that its "
         f"flights say nothing about it; the interval is no narrower than that of {prior}",
         ReasonCode.PRIOR_DOMINATES: f"{reason.prior_share or 0.0:.0%} of the information about it "
@@ -129,6 +131,13 @@ def _half_width(reason: Reason) -> str:
     if half is None:
         return ""
     return quantity(half if unit is not None else math.expm1(min(half, MOST)), unit)
+
+
+def _told(reason: Reason) -> str:
+    """Return how closely flights alone determine it; of a logarithm, not beyond `HARDLY`."""
+    if reason.unit is None and (reason.half_width or 0.0) > HARDLY:
+        return "hardly tell it from ten times as much"
+    return f"determine it only to ±{_half_width(reason)}"
 
 
 def _source(reason: Reason) -> str:

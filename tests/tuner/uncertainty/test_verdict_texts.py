@@ -36,7 +36,7 @@ def test_an_interval_with_everything_that_bears_on_it() -> None:
     assert judgement_in_words(Verdict.WEAKLY_KNOWN, reason) == (
         "weakly known: ±1.2 % (95 %), mostly from body rate, circle above all; hard to distinguish "
         "from estimate_latency (correlation +0.95); residuals are not white noise, which widens "
-        "the interval 5.0 times; the fit ended at its lower bound"
+        "the interval 5.0 times; it lies at its lower bound"
     )
 
 
@@ -62,6 +62,8 @@ def test_what_the_prior_determines() -> None:
     assert reason_in_words(reason) == (
         "the flights alone determine it only to ±381 %; the interval leans on the default prior"
     )
+    reason = Reason(code=ReasonCode.WIDE_INTERVAL, half_width=15.0, prior_given=False)
+    assert reason_in_words(reason).startswith("the flights alone hardly tell it from ten times as")
     reason = Reason(code=ReasonCode.PRIOR_DOMINATES, prior_share=0.7, prior_given=True)
     assert reason_in_words(reason) == "70% of the information about it is that of the given prior"
     reason = Reason(code=ReasonCode.NO_INFORMATION, prior_given=False)
