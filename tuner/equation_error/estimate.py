@@ -16,6 +16,7 @@ from tuner.equation_error.regression import (
     Regression,
     convolved,
     minimised,
+    misled,
     regress,
     summing,
 )
@@ -29,6 +30,10 @@ GAINS = ("torque_gain_x", "torque_gain_y", "torque_gain_z")
 NOISE_KNOWN = 0.25
 """Share of what the noise of rotor speeds makes of a coefficient by which that may be wrong: a
 guess, for noise that is not white or not as large as samples say."""
+POWER = "thrust_exponent"
+"""Forces tell it, and in them what air does to all rotors of a vehicle that flies faster the faster
+they turn passes for it. Moments are of differences among rotors: that these follow it as well is
+not known."""
 AHEAD = 0.3
 """s over which `GAINS` are fitted to predict: between those at which predictions are compared."""
 HORIZONS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
@@ -109,12 +114,18 @@ def estimate(
     found = regress(made, np.where(out, begin, full.point), free=free, near=True)
     again = partial(regress, begin=found.point, free=free, near=True)
     others = [(1.0, again(made, memory=times * MEMORY)) for times in (0.5, 2.0)]
-    if made.noisy:
-        others.append((NOISE_KNOWN, again(quiet)))
+    as_read = again(quiet) if made.noisy else found
+    others.append((NOISE_KNOWN, as_read))
     if commands:
         others.append((1.0, again(replace(made, commands=commands[1]))))
+    of_power, by_squares = free & (names == POWER), as_read
+    if of_power.any():
+        of_squares = np.where(of_power, begin, as_read.point)
+        by_squares = regress(quiet, of_squares, free=free & ~of_power, near=True)
     errors = np.sqrt(
         np.diag(found.covariance)
+        + misled(quiet, found, free=free, memory=MEMORY) ** 2
+        + np.where(of_power, 0.0, by_squares.point - as_read.point) ** 2
         + np.where(free, full.point - found.point, 0.0) ** 2
         + sum((share * (other.point - found.point)) ** 2 for share, other in others)
     )

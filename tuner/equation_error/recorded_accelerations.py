@@ -23,8 +23,9 @@ from tuner.vehicle.model import Model
 Mask = NDArray[np.bool_]
 
 FASTEST = 100.0
-"""Hz of the steps at most: gyro and tachometers are averaged over each, which takes off noise. A
-loop answers what disturbs it later than that by most of a rotor's lag."""
+"""Hz of the steps at most: gyro and tachometers are averaged over as long, which takes off noise,
+and vibrations that a step would otherwise fold down to what it tells. A loop answers what disturbs
+it later than that by most of a rotor's lag."""
 GAP = 2.5
 """Gaps between samples beyond which a signal is unknown."""
 FEWEST = 100
@@ -50,9 +51,12 @@ class Steps:
         (N, 4) rad/s and rad/s².
     accelerations
         (N, 6) specific force in m/s² and angular acceleration in rad/s², body axes, over the step;
-        NaN where something was not recorded.
+        NaN where something was not recorded. Where a gyro is averaged, that is the change of means
+        about a step's ends, each as long as a step.
     weights
-        (m + 1,) of the rotor's samples in a step's mean.
+        (2, m) of a rotor's samples about mid-step, in its mean and, in 1/s, in its acceleration.
+    inside
+        How many of them are a step.
     noise
         rad/s, standard deviation of the white noise of a rotor's samples.
     """
@@ -64,6 +68,7 @@ class Steps:
     rotor_acceleration: Array
     accelerations: Array
     weights: Array
+    inside: int
     noise: float
 
     @property
@@ -72,7 +77,7 @@ class Steps:
         return np.asarray(np.isfinite(self.accelerations).all(axis=1))
 
 
-def steps_of(flight: Flight, *, input_late: float = 0.0) -> Steps | None:
+def steps_of(flight: Flight, *, input_late: float = 0.0, averaged: bool = False) -> Steps | None:
     """Return what a flight with rotor speeds and body rates says; None where it says too little.
 
     Parameters
@@ -81,6 +86,8 @@ def steps_of(flight: Flight, *, input_late: float = 0.0) -> Steps | None:
         With a pose.
     input_late
         s by which rotor speeds are stamped later than the state.
+    averaged
+        Whether to take means of a gyro that has several samples a step: of tachometers, too.
     """
     rotors = flight.series.get("rotor_speed")
     if rotors is None:
@@ -89,10 +96,12 @@ def steps_of(flight: Flight, *, input_late: float = 0.0) -> Steps | None:
     if known.sum() < FEWEST:
         return None
     rotors = Series(rotors.time[known] - input_late, rotors.values[known])
-    return steps_with(flight, rotors, noise=_noise(rotors))
+    return steps_with(flight, rotors, noise=_noise(rotors), averaged=averaged)
 
 
-def steps_with(flight: Flight, rotors: Series, *, noise: float) -> Steps | None:
+def steps_with(
+    flight: Flight, rotors: Series, *, noise: float, averaged: bool = False
+) -> Steps | None:
     """Return the same with rotor speeds on the clock of the state, of so much white noise."""
     series = flight.series
     if not {"position", "attitude", "body_rate"} <= set(series):
@@ -101,7 +110,8 @@ def steps_with(flight: Flight, rotors: Series, *, noise: float) -> Steps | None:
     if not np.isfinite(gyro.values).all():
         return None
     rate = min(FASTEST, gyro.rate, rotors.rate)
-    inside = max(1, round(rotors.rate / rate))
+    inside, readings = (max(1, round(series.rate / rate)) for series in (rotors, gyro))
+    averaged = averaged and readings > 1
     begin = max(0.0, gyro.time[0], rotors.time[0])
     end = min(flight.duration, gyro.time[-1], rotors.time[-1])
     count = int((end - begin) * rate)
@@ -109,14 +119,18 @@ def steps_with(flight: Flight, rotors: Series, *, noise: float) -> Steps | None:
         return None
     edges = begin + np.arange(count + 1) / rate
     middle = 0.5 * (edges[1:] + edges[:-1])
-    weights = np.ones(inside + 1) / inside
-    weights[[0, -1]] *= 0.5
+    weights = np.stack([_means(inside), np.zeros(inside + 1)])
+    weights[1, [0, -1]] = -rate, rate
+    about = _means(readings) if averaged else np.ones(1)
+    if averaged:
+        weights = np.stack([np.convolve(row, _means(inside)) for row in weights])
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import, seldom needed)
 
     state, velocity = states_at(series, middle), _velocity(series, edges)
     turned = Rotation.from_quat(state.attitude, scalar_first=True)
     pull = np.diff(velocity, axis=0) * rate + np.array([0.0, 0.0, GRAVITY])
-    turning = np.diff(_read(gyro, edges), axis=0) * rate
+    rates = _weighed(gyro, edges, about[None], 1.0 / (rate * readings))[0]
+    turning = np.diff(rates, axis=0) * rate
     accelerations = np.hstack([turned.inv().apply(pull), turning])
     accelerations[~np.isfinite(state.body_rate).all(axis=1)] = np.nan
     part = Steps(
@@ -132,6 +146,7 @@ def steps_with(flight: Flight, rotors: Series, *, noise: float) -> Steps | None:
         rotor_acceleration=np.zeros((count, 4)),
         accelerations=accelerations,
         weights=weights,
+        inside=inside,
         noise=noise,
     )
     part = with_rotors(part, rotors)
@@ -140,17 +155,14 @@ def steps_with(flight: Flight, rotors: Series, *, noise: float) -> Steps | None:
 
 def with_rotors(part: Steps, rotors: Series) -> Steps:
     """Return the steps with other rotor speeds; where these are unknown, so is the step."""
-    inside = len(part.weights) - 1
-    fine = part.time[:, None] + (np.arange(inside + 1) / inside - 0.5) * part.step
-    speeds = _read(rotors, fine.ravel()).reshape(*fine.shape, 4)
-    mean = np.einsum("nir,i->nr", speeds, part.weights)
+    mean, change = _weighed(rotors, part.time, part.weights, part.step / part.inside)
     there = np.isfinite(mean)
     known, usual = there.all(axis=1, keepdims=True), np.nanmean(mean) if there.any() else 0.0
     return replace(
         part,
         # where it is unknown, one that some rotor might have: derivatives by none are not finite
         rotor_speed=np.where(there, mean, usual),
-        rotor_acceleration=np.nan_to_num((speeds[:, -1] - speeds[:, 0]) / part.step),
+        rotor_acceleration=np.nan_to_num(change),
         accelerations=np.where(known, part.accelerations, np.nan),
     )
 
@@ -193,15 +205,20 @@ def read_commands(
 
 
 def steps_fed(
-    inlet: InletName, model: Model, flights: Sequence[tuple[Flight, float]], rate: float
+    inlet: InletName,
+    model: Model,
+    flights: Sequence[tuple[Flight, float]],
+    rate: float,
+    *,
+    averaged: bool = False,
 ) -> tuple[tuple[Steps, ...], tuple[Commands, ...]] | None:
     """Return the steps of flights that enter by an inlet, and as `read_commands` what drives them.
 
     None where neither rotor speeds nor commands are fed in, or a flight says too little. Parameters
-    are those of `read_commands`.
+    are those of `read_commands` and `steps_of`.
     """
     if inlet == "rotor_speed":
-        parts = [steps_of(flight, input_late=late) for flight, late in flights]
+        parts = [steps_of(flight, input_late=late, averaged=averaged) for flight, late in flights]
         known = tuple(part for part in parts if part is not None)
         return (known, ()) if len(known) == len(parts) else None
     return read_commands(model, flights, rate) if inlet == "actuator" else None
@@ -227,6 +244,24 @@ def _held(flight: Flight, recorded: Series, rate: float, every: int) -> Series:
 def rows_of(vector: Vec3) -> Array:
     """Return a vector's components on the host (N, 3)."""
     return np.stack([np.asarray(vector.x), np.asarray(vector.y), np.asarray(vector.z)], axis=1)
+
+
+def _means(count: int) -> Array:
+    """Return the weights (count + 1,) of samples, so many a step, in their mean over one."""
+    weights = np.ones(count + 1) / count
+    weights[[0, -1]] *= 0.5
+    return weights
+
+
+def _weighed(series: Series, times: Array, weights: Array, spacing: float) -> Array:
+    """Return sums (r, n, k) of a signal about some times, by rows of weights (r, m) so far apart.
+
+    NaN in gaps.
+    """
+    size = weights.shape[1]
+    fine = times[:, None] + (np.arange(size) - 0.5 * (size - 1)) * spacing
+    values = _read(series, fine.ravel()).reshape(*fine.shape, -1)
+    return np.asarray(np.einsum("nik,ri->rnk", values, weights))
 
 
 def _read(series: Series, times: Array) -> Array:

@@ -1,6 +1,6 @@
 """Coefficients that meet recorded accelerations best, and what a regression has to know for it.
 
-Three things spoil a plain regression of accelerations on what recorded rotors make:
+Four things spoil a plain regression of accelerations on what recorded rotors make:
 
 - What disturbs a vehicle is not white, and the loop's rotors answer it: their torque then seems to
   do little, for what it does it takes back. An answer comes after what it answers. So where errors
@@ -11,13 +11,17 @@ Three things spoil a plain regression of accelerations on what recorded rotors m
 - Rotor speeds are noisy, and noise in a regressor shrinks what stands before it. How the noise of
   tachometers moves products of regressors is taken off them (Fuller, Measurement Error Models,
   1987, 2.2).
+- A loop knows more of what disturbs its vehicle than a noisy log tells, and an answer to what
+  earlier errors do not predict is a part of what is new. Then that goes with what rotors did some
+  steps before, too, as it does where the model lacks a lag (residual test; Ljung, 16.6). As far as
+  this would lead, the regression may have been led (`misled`).
 - What the flights do not tell stays where it was believed to be: each coordinate has its prior.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -208,6 +212,33 @@ def _taken(information: Array, noise: Array, free: Mask) -> Array:
     return taken
 
 
+def misled(made: ModelAccelerations, found: Regression, *, free: Mask, memory: float) -> Array:
+    """Return how far (K,) what no model of noise predicts may have led a regression.
+
+    The root mean square, over the steps of its memory, of the changes that it would make if new
+    errors went with what moves them now as they go with what moved them so many steps before. They
+    would not at all if the model were right and the log told all that the loop knows.
+    """
+    slopes: dict[int, Array] = {}
+    for one in made.at(found.point):
+        for axis, kernel in enumerate(whitening(one, memory)):
+            table = np.column_stack([one.left[:, axis], one.columns[:, axis]])
+            rows = convolved(table, one.steps.known, kernel)
+            if not len(rows):
+                continue
+            rows /= spread(rows[:, 0])
+            errors, columns = rows[:, 0] * huber_weights(rows[:, 0], ROBUST), rows[:, 1:]
+            for lag in range(1, len(kernel)):
+                slope = errors[lag:] @ columns[: len(columns) - lag]
+                slopes[lag] = slopes.get(lag, 0.0) + slope
+    prior = np.zeros_like(found.sums.pull)
+    changes = [
+        replace(found.sums, slope=slope[None], pull=prior).solved(free, slice(None))
+        for slope in slopes.values()
+    ]
+    return np.sqrt(np.mean(np.square(changes), axis=0)) if changes else prior
+
+
 def filtered_sums(
     one: Linear, kernels: Sequence[Array], parts: int
 ) -> tuple[Array, Array, Array, Array, Array]:
@@ -286,14 +317,11 @@ def whitening_filter(errors: Array, known: Mask, order: int) -> Array:
 def _noise_gain(kernel: Array, steps: Steps) -> Array:
     """Return the covariance (2, 2) of what is filtered over the variance of a rotor's sample.
 
-    Of the mean of the rotor's samples in a step, and of the acceleration between its ends.
+    Of the mean of the rotor's samples in a step, and of their acceleration.
     """
-    inside = len(steps.weights) - 1
-    each = np.zeros(inside * (len(kernel) - 1) + 1)
-    each[::inside] = kernel
-    change = np.zeros(inside + 1)
-    change[[0, -1]] = 1.0 / steps.step, -1.0 / steps.step
-    made = np.stack([np.convolve(each, samples) for samples in (steps.weights, change)])
+    each = np.zeros(steps.inside * (len(kernel) - 1) + 1)
+    each[:: steps.inside] = kernel
+    made = np.stack([np.convolve(each, samples[::-1]) for samples in steps.weights])
     return np.asarray(made @ made.T)
 
 

@@ -49,7 +49,7 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
         return job, ()
     fitted = [(r.flight, r.input_late) for r in job.recordings if not r.holdout]
     rate = float(job.objective.schedule.rate_control_rate)
-    steps = steps_fed(job.inlets[0], job.objective.model, fitted, rate)
+    steps = steps_fed(job.inlets[0], job.objective.model, fitted, rate, averaged=True)
     if steps is None:
         return job, ()
     candidates = dict(candidate_groups(job))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,13 +12,22 @@ from benchmarks import fast_flights
 from tuner.config import Options, settle
 from tuner.config.job import Search
 from tuner.equation_error.estimate import GAINS
+from tuner.equation_error.model_accelerations import Linear
 from tuner.equation_error.recorded_accelerations import (
     read_commands,
     steps_fed,
     steps_of,
     without_gaps_of,
 )
-from tuner.equation_error.regression import MEMORY, regress
+from tuner.equation_error.regression import (
+    MEMORY,
+    NormalEquations,
+    Regression,
+    filtered_sums,
+    misled,
+    regress,
+    whitening,
+)
 from tuner.job.accelerations import with_accelerations
 from tuner.recordings.flight import Series
 from tuner.search.inlet_choice import predicts_turning, regressors
@@ -145,6 +155,42 @@ def test_rotor_speeds_that_ripple_without_noise_leave_inertia(racer, flown):
     found = with_accelerations(job_of(settings, smooth))[0].accelerations
     for name in (*TILTING, "inertia_zz", "motor_constant"):
         assert abs(np.log(found.values[name] / vehicle.values[name])) < 0.15, name
+
+
+@pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
+def test_vibrations_beyond_the_rate_of_steps_make_no_vehicle_heavy(flown):
+    """A gyro read once a step would show them as a slow turning: 1.5 times the inertia."""
+    racer, settings, recordings = flown
+
+    def shaken(recording):
+        series = recording.flight.series
+        gyro = series["body_rate"]
+        values = gyro.values + 0.3 * np.sin(2.0 * np.pi * 195.0 * gyro.time)[:, None]
+        series = {**series, "body_rate": Series(gyro.time, values)}
+        return replace(recording, flight=replace(recording.flight, series=series))
+
+    job = job_of(settings, [shaken(recording) for recording in recordings])
+    found = with_accelerations(job)[0].accelerations
+    for name in TILTING:
+        assert abs(np.log(found.values[name] / racer.values[name])) < 0.1, name
+
+
+@pytest.mark.parametrize("lags", [0.0, 0.2])
+def test_what_comes_a_step_late_is_in_the_errors(lags):
+    random, size = np.random.default_rng(0), 4000
+    moves, left, columns = random.normal(size=size), np.zeros((size, 6)), np.zeros((size, 6, 1))
+    left[:, 0] = lags * np.roll(moves, 1) + 0.5 * random.normal(size=size)
+    columns[:, 0, 0] = moves
+    steps = SimpleNamespace(step=0.01, known=np.ones(size, bool), noise=0.0)
+    one, memory = Linear(steps, left, columns, np.zeros(0), np.zeros(0)), 0.05
+    sums = filtered_sums(one, whitening(one, memory), 1)[:3]
+    found = Regression(
+        np.zeros(1), NormalEquations(*sums, np.array([1e-6]), np.zeros(1)), np.zeros((1, 1))
+    )
+    made = SimpleNamespace(at=lambda _: (one,))
+    (error,) = misled(made, found, free=np.ones(1, bool), memory=memory)
+    chance = 0.5 / np.sqrt(size)
+    assert error == pytest.approx(np.hypot(lags / np.sqrt(5.0), chance), abs=chance)
 
 
 @pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
