@@ -34,6 +34,9 @@ AXES = ("roll", "pitch", "yaw")
 PARTS = ("P", "I", "late")
 SMALLEST = {"P": 0.02, "I": 0.1, "late": 5e-4}
 """Change of a gain as a share of it, and s, below which nothing is found."""
+FOLLOWED = 0.5
+"""Slope of a flight's torque over that simulated from which this is an instrument: a loop near its
+edge swings, and no simulation keeps its phase."""
 APART = 1e-6
 """Inverse condition from which columns are told apart."""
 
@@ -115,18 +118,24 @@ def _of_axis(
     """Return the parts of one axis; none where its flights do not tell them apart."""
     real = [_regression(signals, axis) for signals in recorded]
     made = [_regression(signals, axis) for signals in simulated]
-    own = np.sum([z.T @ z for z, _ in made], axis=0)
-    both = list(zip(made, real, strict=True))
-    total = np.sum([z.T @ x for (z, _), (x, _) in both], axis=0)
-    if min(map(_condition, (own, total))) < APART:
+    both = [
+        ((z, of_file), (x, torque), signals.step)
+        for (z, of_file), (x, torque), signals in zip(made, real, recorded, strict=True)
+        if of_file @ torque > FOLLOWED * (of_file @ of_file)
+    ]
+    own = np.sum([z.T @ z for (z, _), _, _ in both], axis=0)
+    total = np.sum([z.T @ x for (z, _), (x, _), _ in both], axis=0)
+    if not both or min(map(_condition, (own, total))) < APART:
         return {}
-    of_file = np.linalg.solve(own, np.sum([z.T @ torque for z, torque in made], axis=0))
-    gains = np.linalg.solve(total, np.sum([z.T @ torque for (z, _), (_, torque) in both], axis=0))
+    of_file = np.linalg.solve(own, np.sum([z.T @ torque for (z, torque), _, _ in both], axis=0))
+    gains = np.linalg.solve(
+        total, np.sum([z.T @ torque for (z, _), (_, torque), _ in both], axis=0)
+    )
     scores, square = [], np.zeros((3, 3))
-    for (z, _), (x, torque), signals in zip(made, real, recorded, strict=True):
+    for (z, _), (x, torque), step in both:
         left = torque - x @ gains
-        square += _square_of_sum(z, left, max(1, round(MEMORY / signals.step)))
-        many = max(round(len(left) * signals.step / STRETCH), 1)
+        square += _square_of_sum(z, left, max(1, round(MEMORY / step)))
+        many = max(round(len(left) * step / STRETCH), 1)
         scores += [z[rows].T @ left[rows] for rows in np.array_split(np.arange(len(left)), many)]
     inverse = np.linalg.inv(total)
     late, of_filters = gains[2] / gains[0], of_file[2] / of_file[0]

@@ -74,6 +74,20 @@ def test_what_a_gyro_reads_at_rest_is_not_what_the_loop_integrated():
     assert max(answer.sd for answer in found if answer.part == "I") < 0.05
 
 
+def test_a_flight_that_swings_in_another_phase_tells_nothing():
+    random = np.random.default_rng(0)
+    real, made = flight(random, gusts=0.2, noise=0.01), flight(random)
+    swinging = swing(real, 0.0), swing(real, 0.5 * np.pi)
+    assert answers([real, swinging[0]], [made, swinging[1]]) == answers([real], [made])
+
+
+def swing(signals: Signals, phase: float) -> Signals:
+    """Return a flight that does nothing but swing at 5 Hz."""
+    time = np.arange(len(signals.rate)) / RATE
+    rate = np.sin(10.0 * np.pi * time + phase)[:, None].repeat(3, 1)
+    return Signals(signals.step, -rate, rate, -P_GAIN * rate)
+
+
 def test_one_step_of_a_set_point_tells_nothing():
     """However exactly it seems to: what filters make of it is no gain."""
     random, time = np.random.default_rng(0), np.arange(2000) / RATE
