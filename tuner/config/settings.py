@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import glob
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -180,6 +181,8 @@ def _holdout(
     for word in options.holdout:
         if is_among(word, names):
             holdout.append(word)
+        elif meant := sorted(fnmatch.filter(names, word)):  # before files that happen to lie here
+            holdout += meant
         elif exists(Path(word)) or glob.has_magic(word):
             for path in find_flights([word]):
                 holdout.append(path.stem)

@@ -209,3 +209,14 @@ def test_a_vehicle_of_six_rotors_is_refused_before_anything_is_read(lab):
     six = vehicle.model_copy(update={"rotors": (*vehicle.rotors, *vehicle.rotors[:2])})
     with pytest.raises(ConfigError, match="has 6 rotors, and only four are simulated and read"):
         settle(Options([str(lab / "a.bag")], vehicle=six))
+
+
+def test_a_pattern_of_flights_to_hold_out_means_the_flights_before_files_that_lie_here(
+    lab, monkeypatch
+):
+    monkeypatch.chdir(lab)
+    for name in ("b_notes.txt", "c_notes.txt"):
+        (lab / name).touch()
+    settled = settle(Options(["*.bag"], holdout=["[bc]*"]))
+    assert settled.job.holdout == ("b", "c")
+    assert [flight.name for flight in settled.flights] == ["a.bag", "b.bag", "c.bag"]
