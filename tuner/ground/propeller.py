@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.core.errors import RecordingError
+from tuner.core.errors import ConfigError, RecordingError
+from tuner.core.files import read_bytes
 from tuner.core.numerics import Array
 from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.ground.plan import Propeller
@@ -50,13 +51,11 @@ def read_static_table(path: Path) -> Array:
         The file cannot be read or holds no such rows.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise RecordingError(path, "is larger than 1 MB", "give the propeller's static table")
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError as error:
-        raise RecordingError(path, f"cannot be read ({error.strerror})", "check the path") from None
+        text = read_bytes(path, most=MAX_BYTES, remedy="give the propeller's static table")
+    except ConfigError as error:
+        raise RecordingError(path, error.what, error.remedy) from None
     rows = []
-    for line in lines:
+    for line in text.decode(errors="replace").splitlines():
         try:
             numbers = [float(word) for word in line.replace(",", " ").split()]
         except ValueError:

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import (
@@ -182,7 +183,7 @@ def _definitions(path: Path) -> tuple[Formats, dict[str, float]]:
 
 def parameters_of(path: Path) -> dict[str, float]:
     """Return the parameters at the beginning of a PX4 log; none of what is no such log."""
-    with contextlib.suppress(OSError, RecordingError):
+    with contextlib.suppress(RecordingError), readable(path):
         return _definitions(path)[1]
     return {}
 

@@ -25,6 +25,8 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from tests.tuner.recordings import fuzz, making
 from tuner.core.errors import InputError
+from tuner.ground.propeller import read_static_table
+from tuner.ground.rig_data import open_table
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause, NoteCode
@@ -40,6 +42,7 @@ from tuner.recordings.ros.container import (
 )
 from tuner.recordings.ros.messages import Definitions, missing_fields
 from tuner.recordings.ros.recording import unpacked_block
+from tuner.recordings.ulog import parameters_of
 
 
 @contextmanager
@@ -267,3 +270,16 @@ def test_table_whose_stamps_are_days_apart(tmp_path: Path) -> None:
         flight = load_flight(path, cache=False)
     assert flight.duration == pytest.approx(5.0, abs=0.02)
     assert [note for note in flight.notes if note.code is NoteCode.FAR_IN_TIME]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes there")
+def test_pipes_beside_recordings_are_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    assert parameters_of(pipe) == {}
+    with pytest.raises(InputError, match="cannot be read as a message definition"):
+        Definitions(pipe, {}, (pipe,)).fields(f"{tmp_path.name}/msg/pipe")
+    with pytest.raises(InputError, match=r"cannot be read \(it is no file\)"):
+        read_static_table(pipe)
+    with pytest.raises(InputError, match="is no file"):
+        open_table(pipe)

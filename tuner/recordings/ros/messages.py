@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
-from tuner.core.errors import InputError, RecordingError
+from tuner.core.errors import ConfigError, InputError, RecordingError
+from tuner.core.files import read_bytes
 from tuner.recordings.recording import Usual, reason_of
 
 #: Fields of a message type in their order: name and rosbags' description of what it holds.
@@ -134,8 +135,8 @@ def _type_of(path: Path) -> str:
 
 def _read(path: Path) -> MessageDefinition:
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        text = read_bytes(path, most=LONGEST, remedy="").decode()
+    except (ConfigError, UnicodeDecodeError):
         raise RecordingError(
             path, "cannot be read as a message definition", "name a .msg file"
         ) from None
