@@ -20,11 +20,16 @@ LASTS = 0.08
 """s that the racer's hidden torques last."""
 
 
+@pytest.fixture(scope="module")
+def flights():
+    racer = fast_flights.drawn(4)
+    return racer, fast_flights.fly(racer, seed=4, seconds=7.0)
+
+
 @pytest.fixture(scope="module", params=["rotor_speed", "command"])
-def flown(request, tmp_path_factory):
+def flown(request, flights, tmp_path_factory):
     """The racer as it is, its recordings and what observes it."""
-    folder, racer = tmp_path_factory.mktemp("fast"), fast_flights.drawn(4)
-    signals = fast_flights.fly(racer, seed=4, seconds=7.0)
+    folder, (racer, signals) = tmp_path_factory.mktemp("fast"), flights
     paths = fast_flights.write(racer, signals, folder, seed=4, fed=request.param)
     settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
     recordings, _ = read_usable(settings)
