@@ -589,3 +589,20 @@ def test_document_types_are_refused():
     bomb = '<!DOCTYPE a [<!ENTITY b "b"><!ENTITY c "&b;&b;">]><a>&c;</a>'
     with pytest.raises(ExportError, match="document type"):
         parse(bomb, PATH)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{{ 'x' * 10**10 }}", "cannot be rendered without variables"),
+        ("{{ 'x' * 10**8 }}", "it comes to more than 10 MB"),
+        (
+            "{% for i in range(99999) %}{% for j in range(99999) %}{% endfor %}{% endfor %}",
+            "too long",
+        ),
+    ],
+)
+def test_a_template_without_end_is_refused(text, said, tmp_path, monkeypatch):
+    monkeypatch.setattr("tuner.exporters.sdf.spans.LONGEST_RENDERING", 3.0)
+    with pytest.raises(ExportError, match=said):
+        rendered(text, tmp_path / "model.sdf.jinja")

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import math
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -222,19 +224,48 @@ def rendered(text: str, path: Path) -> str:
     Raises
     ------
     ExportError
-        It cannot be rendered so.
+        It cannot be rendered so, or takes more than `LONGEST_RENDERING`.
     """
     if not (_EXPRESSION.search(text) or _STATEMENT.search(text)):
         return text
-    from jinja2 import TemplateError  # noqa: PLC0415
-    from jinja2.sandbox import SandboxedEnvironment  # noqa: PLC0415
-
     try:
-        return SandboxedEnvironment(keep_trailing_newline=True).from_string(text).render()
-    except (TemplateError, TypeError, ValueError, ArithmeticError) as error:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", _RENDER],
+            input=text.encode(),
+            capture_output=True,
+            timeout=LONGEST_RENDERING,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise ExportError(path, "takes too long to render", "is it a model?") from None
+    if done.returncode:
+        last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2] or "out of memory"
         raise ExportError(
-            path, f"cannot be rendered without variables ({error})", "give it defaults"
-        ) from None
+            path, f"cannot be rendered without variables ({last[:200]})", "give it defaults"
+        )
+    return done.stdout.decode()
+
+
+LONGEST_RENDERING = 20.0
+"""s; a model takes a tenth of one."""
+_RENDER = """
+import sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))
+except (ImportError, ValueError, OSError):
+    pass  # a system without such limits
+from jinja2.sandbox import SandboxedEnvironment
+text = sys.stdin.buffer.read().decode()
+try:
+    text = SandboxedEnvironment(keep_trailing_newline=True).from_string(text).render()
+except Exception as error:
+    sys.exit(str(error) or type(error).__name__)
+if len(text) > 10_000_000:
+    sys.exit("it comes to more than 10 MB")
+sys.stdout.buffer.write(text.encode())
+"""
+"""A program of its own, for a template may loop, or multiply its text, without end."""
 
 
 MERGED = "merged__"
