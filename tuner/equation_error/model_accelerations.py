@@ -106,12 +106,13 @@ class ModelAccelerations:
             part.accelerations - values for part, (values, _) in zip(flights, made, strict=True)
         ]
         columns = [of_flight.copy() for _, of_flight in made]
+        here = self._model(point) if self.commands else self.model
         for number, which in enumerate(by if self.commands else ()):
             parameter = self.parameters[which]
             if moves_rotors(parameter.name):
                 step = MOTOR_STEP * (parameter.usual or 1.0)
                 beside = self._with_rotors(point + step * np.eye(len(point))[which])
-                ends = _made(self._model(point), (), np.zeros(0), beside, by[:0])
+                ends = _made(here, (), np.zeros(0), beside, by[:0])
                 for flight, (part, (modelled, _)) in enumerate(zip(beside, ends, strict=True)):
                     change = left[flight] - (part.accelerations - modelled)
                     columns[flight][:, :, number] = change / step
