@@ -117,25 +117,22 @@ def _of_axis(
 ) -> dict[str, _Part]:
     """Return the parts of one axis; none where its flights do not tell them apart."""
     real = [_regression(signals, axis) for signals in recorded]
-    made = [_regression(signals, axis) for signals in simulated]
-    both = [
-        ((z, of_file), (x, torque), signals.step)
-        for (z, of_file), (x, torque), signals in zip(made, real, recorded, strict=True)
-        if of_file @ torque > FOLLOWED * (of_file @ of_file)
+    made = [
+        _followed(_regression(signals, axis), torque)
+        for signals, (_, torque) in zip(simulated, real, strict=True)
     ]
-    own = np.sum([z.T @ z for (z, _), _, _ in both], axis=0)
-    total = np.sum([z.T @ x for (z, _), (x, _), _ in both], axis=0)
-    if not both or min(map(_condition, (own, total))) < APART:
+    own = np.sum([z.T @ z for z, _ in made], axis=0)
+    both = list(zip(made, real, strict=True))
+    total = np.sum([z.T @ x for (z, _), (x, _) in both], axis=0)
+    if not own.any() or min(map(_condition, (own, total))) < APART:
         return {}
-    of_file = np.linalg.solve(own, np.sum([z.T @ torque for (z, torque), _, _ in both], axis=0))
-    gains = np.linalg.solve(
-        total, np.sum([z.T @ torque for (z, _), (_, torque), _ in both], axis=0)
-    )
+    of_file = np.linalg.solve(own, np.sum([z.T @ torque for z, torque in made], axis=0))
+    gains = np.linalg.solve(total, np.sum([z.T @ torque for (z, _), (_, torque) in both], axis=0))
     scores, square = [], np.zeros((3, 3))
-    for (z, _), (x, torque), step in both:
+    for (z, _), (x, torque), signals in zip(made, real, recorded, strict=True):
         left = torque - x @ gains
-        square += _square_of_sum(z, left, max(1, round(MEMORY / step)))
-        many = max(round(len(left) * step / STRETCH), 1)
+        square += _square_of_sum(z, left, max(1, round(MEMORY / signals.step)))
+        many = max(round(len(left) * signals.step / STRETCH), 1)
         scores += [z[rows].T @ left[rows] for rows in np.array_split(np.arange(len(left)), many)]
     inverse = np.linalg.inv(total)
     late, of_filters = gains[2] / gains[0], of_file[2] / of_file[0]
@@ -150,6 +147,13 @@ def _of_axis(
         sd = float(np.sqrt(max(weights @ square @ weights, 0.0)))
         parts[name] = _Part(float(value), neutral, sd, np.array(scores) @ weights)
     return parts
+
+
+def _followed(made: tuple[Array, Array], torque: Array) -> tuple[Array, Array]:
+    """Return a simulated flight's columns and torque, zero where none was recorded like them."""
+    columns, of_file = made
+    follows = float(of_file @ torque > FOLLOWED * (of_file @ of_file))
+    return follows * columns, follows * of_file
 
 
 def _square_of_sum(instruments: Array, left: Array, memory: int) -> Array:

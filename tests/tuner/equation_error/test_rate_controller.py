@@ -79,6 +79,10 @@ def test_a_flight_that_swings_in_another_phase_tells_nothing():
     real, made = flight(random, gusts=0.2, noise=0.01), flight(random)
     swinging = swing(real, 0.0), swing(real, 0.5 * np.pi)
     assert answers([real, swinging[0]], [made, swinging[1]]) == answers([real], [made])
+    swinging[1].torque[:, 1] = swinging[0].torque[:, 1]  # pitch alone is followed
+    others = answers([real, swinging[0]], [made, swinging[1]])
+    assert {answer.axis for answer in others} == set(AXES)
+    assert answers([swinging[0]], [swing(real, 0.5 * np.pi)]) == ()
 
 
 def swing(signals: Signals, phase: float) -> Signals:
