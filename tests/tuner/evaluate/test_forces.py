@@ -90,7 +90,8 @@ def test_forces_go_into_a_table_of_their_own(circle, tmp_path):
     for name in ("c.csv", "f.txt"):
         with pytest.raises(InputError, match="csv of their own"):
             write_flights([circle], tmp_path / "c.csv", forces=tmp_path / name)
+    (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be written"):
-        write_flights([circle], tmp_path / "c.csv", forces=tmp_path / "no" / "f.csv")
-    assert not list(tmp_path.iterdir())
+        write_flights([circle], tmp_path / "c.csv", forces=tmp_path / "file" / "f.csv")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
     assert math.isclose(circle.time[-1], 4.0)
