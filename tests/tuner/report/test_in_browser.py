@@ -93,45 +93,6 @@ def test_the_contents_stay_and_open_what_is_folded(browser: Browser, report: Pat
         assert opened.page.locator("nav").evaluate("n => n.getBoundingClientRect().top") >= 0
 
 
-def test_charts_of_one_flight_share_their_time(browser: Browser, report: Path) -> None:
-    with reading(browser, report) as opened:
-        opened.wait_until_drawn()
-        draw_everything(opened)
-        opened.page.locator("[data-chart=swing_position]").scroll_into_view_if_needed()
-        panel = opened.page.locator("[data-chart=swing_position] .plot > svg .overlay").first
-        box = panel.bounding_box()
-        assert box is not None
-        opened.page.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 20)
-        opened.page.mouse.down()
-        opened.page.mouse.move(box["x"] + 0.4 * box["width"], box["y"] + 20, steps=4)
-        opened.page.mouse.up()
-        assert seconds(opened, "swing_position")[-1] < 3.0
-        assert seconds(opened, "swing_attitude") == seconds(opened, "swing_position")
-        assert seconds(opened, "swing_error") == seconds(opened, "swing_position")
-        assert seconds(opened, "spin_error")[-1] > 5.0
-        opened.page.locator("[data-chart=swing_error] .overlay").first.dblclick()
-        assert seconds(opened, "swing_position") == seconds(opened, "spin_error")
-
-
-def seconds(opened: Reading, chart: str) -> list[float]:
-    """Return what a figure's time axis is labelled with."""
-    ticks = opened.page.locator(f"[data-chart={chart}] [aria-label='x-axis tick label'] text")
-    return [float(text) for text in ticks.all_text_contents()]
-
-
-def test_a_name_in_the_legend_hides_its_curve(browser: Browser, report: Path) -> None:
-    with reading(browser, report) as opened:
-        opened.wait_until_drawn()
-        draw_everything(opened)
-        curves = opened.page.locator("[data-chart=swing_error] [aria-label=line] path")
-        name = opened.page.locator("[data-chart=swing_error] .legend button", has_text="initial")
-        assert curves.count() == 4
-        name.click()
-        assert curves.count() == 2
-        name.click()
-        assert curves.count() == 4
-
-
 def test_the_page_asks_the_network_for_nothing(desktop: Reading) -> None:
     assert {address.partition(":")[0] for address in desktop.requests} <= {"file", "data"}
 
@@ -175,6 +136,41 @@ def test_the_keyboard_reaches_what_can_be_operated(desktop: Reading) -> None:
         desktop.page.keyboard.press("Tab")
         reached.add(desktop.page.evaluate("document.activeElement.localName"))
     assert {"a", "summary", "button"} <= reached
+
+
+def test_charts_of_one_flight_share_their_time(desktop: Reading) -> None:
+    draw_everything(desktop)
+    desktop.page.locator("[data-chart=swing_position]").scroll_into_view_if_needed()
+    panel = desktop.page.locator("[data-chart=swing_position] .plot > svg .overlay").first
+    box = panel.bounding_box()
+    assert box is not None
+    desktop.page.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 20)
+    desktop.page.mouse.down()
+    desktop.page.mouse.move(box["x"] + 0.4 * box["width"], box["y"] + 20, steps=4)
+    desktop.page.mouse.up()
+    assert seconds(desktop, "swing_position")[-1] < 3.0
+    assert seconds(desktop, "swing_attitude") == seconds(desktop, "swing_position")
+    assert seconds(desktop, "swing_error") == seconds(desktop, "swing_position")
+    assert seconds(desktop, "spin_error")[-1] > 5.0
+    desktop.page.locator("[data-chart=swing_error] .overlay").first.dblclick()
+    assert seconds(desktop, "swing_position") == seconds(desktop, "spin_error")
+
+
+def seconds(opened: Reading, chart: str) -> list[float]:
+    """Return what a figure's time axis is labelled with."""
+    ticks = opened.page.locator(f"[data-chart={chart}] [aria-label='x-axis tick label'] text")
+    return [float(text) for text in ticks.all_text_contents()]
+
+
+def test_a_name_in_the_legend_hides_its_curve(desktop: Reading) -> None:
+    draw_everything(desktop)
+    curves = desktop.page.locator("[data-chart=swing_error] [aria-label=line] path")
+    name = desktop.page.locator("[data-chart=swing_error] .legend button", has_text="initial")
+    assert curves.count() == 4
+    name.click()
+    assert curves.count() == 2
+    name.click()
+    assert curves.count() == 4
 
 
 def test_a_figure_can_be_saved(desktop: Reading) -> None:
