@@ -262,7 +262,7 @@ def test_a_saturated_moment_tells_the_resistance_where_rotor_speeds_were_recorde
 
 def test_a_voltmeter_that_is_read_again_scatters_a_curve_as_other_readings_do():
     curves, again, random = [], [], np.random.default_rng(2)
-    for seed in range(20):
+    for seed in range(12):
         known, _ = loaded(seed)
         (curve,), (other,) = voltages_of([known]), voltages_of(read_again([known], random))
         curves.append(curve.volts)
