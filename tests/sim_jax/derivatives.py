@@ -53,13 +53,23 @@ class Differences:
         np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
         return forward
 
-    def hold(self, *point: Any, kink: bool = False, tolerance: float = 1e-6) -> None:
-        """Hold the derivatives at a point against differences, to a share of their size."""
+    def hold(
+        self,
+        *point: Any,
+        kink: bool = False,
+        tolerance: float = 1e-6,
+        along: slice = slice(None),
+    ) -> None:
+        """Hold derivatives, all or those ``along`` some numbers of a point, against differences.
+
+        They agree to a share of their size.
+        """
         start, slope = raveled(point), self.jacobian(*point)
         steps = SMALL * np.maximum(np.abs(start), 1.0)
+        moves, steps, slope = np.diag(steps)[along], steps[along], slope[:, along]
         here = self.of(start)[0]
-        above = np.stack([self.of(start + move)[0] - here for move in np.diag(steps)], axis=-1)
-        below = np.stack([here - self.of(start - move)[0] for move in np.diag(steps)], axis=-1)
+        above = np.stack([self.of(start + move)[0] - here for move in moves], axis=-1)
+        below = np.stack([here - self.of(start - move)[0] for move in moves], axis=-1)
         above, below = above / steps, below / steps
         size = tolerance * np.maximum(1.0, np.abs(slope))
         if kink:
