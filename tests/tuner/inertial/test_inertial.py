@@ -13,6 +13,7 @@ from tuner.core.shipped import configs_folder
 from tuner.evaluate.closed_loop import fly, simulate
 from tuner.findings.findings import Code, one_line
 from tuner.ground.bench_json import Combination, joint_prior
+from tuner.inertial.measurement import measure_inertial
 from tuner.inertial.prediction import rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.bench import least_noticed, vehicle_of
@@ -46,6 +47,14 @@ def flown(updated):
 def simulation(flown):
     shape = TrajectorySettings(name="lemniscate", radius=1.0, omega=1.0, speed_scale=4.0)
     return next(iter(simulate(flown, ControllerFile(), shape, duration=14.0, rate=400.0)))
+
+
+@pytest.fixture(scope="module")
+def measured(simulation, flown, tmp_path_factory):
+    """What the flight says: of tests about what is made of it."""
+    path = log_file(simulation, tmp_path_factory.mktemp("measured") / "log00")
+    ((flight,), _) = without_pose(settings_for(path, flown))
+    return measure_inertial(flight, flown)
 
 
 def log_file(simulation, path, *, order=ORDER, noise=1.0):
@@ -198,10 +207,11 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
     assert Code.RATE_WORSE not in codes
 
 
-def test_a_fit_that_foretells_worse_says_so(simulation, flown, tmp_path, monkeypatch):
+def test_a_fit_that_foretells_worse_says_so(simulation, flown, measured, tmp_path, monkeypatch):
     settings = settings_for(log_file(simulation, tmp_path / "log00"), flown)
     wrong = with_values(flown, {"inertia_xx": 2.0 * values_of(flown)["inertia_xx"]})
     monkeypatch.setattr("tuner.job.without_pose.vehicle_of", lambda *_: wrong)
+    monkeypatch.setattr("tuner.job.without_pose.measure_inertial", lambda *_: measured)
     fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
     (worse,) = [f for f in fitted.result.findings if f.code is Code.RATE_WORSE]
     assert worse.level == "warning"
@@ -209,11 +219,12 @@ def test_a_fit_that_foretells_worse_says_so(simulation, flown, tmp_path, monkeyp
 
 
 def test_a_moment_that_commands_do_not_say_adds_up_until_holding_is_better(
-    simulation, flown, tmp_path, monkeypatch
+    simulation, flown, measured, tmp_path, monkeypatch
 ):
     wrong = with_values(flown, {"torque_trim_x": 5.0 * values_of(flown)["inertia_xx"]})
     settings = settings_for(log_file(simulation, tmp_path / "log00"), wrong)
     monkeypatch.setattr("tuner.job.without_pose.vehicle_of", lambda *_: wrong)
+    monkeypatch.setattr("tuner.job.without_pose.measure_inertial", lambda *_: measured)
     ((flight,), _) = without_pose(settings)
     fitted = fit_without_pose(settings, [flight], out=tmp_path / "run")
     (held,) = [f for f in fitted.result.findings if f.code is Code.RATE_NOT_PREDICTED]
@@ -223,12 +234,15 @@ def test_a_moment_that_commands_do_not_say_adds_up_until_holding_is_better(
 
 
 @pytest.mark.slow
-def test_a_heavier_vehicle_scales_thrust_and_inertia_alike(simulation, flown, tmp_path):
+def test_a_heavier_vehicle_scales_thrust_and_inertia_alike(
+    simulation, flown, measured, tmp_path, monkeypatch
+):
     path = log_file(simulation, tmp_path / "log00")
-    settings = settings_for(path, flown)
-    light = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "light")
     settings = settings_for(path, flown.replace(mass=2.0 * flown.mass))
     heavy = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "heavy")
+    settings = settings_for(path, flown)
+    monkeypatch.setattr("tuner.job.without_pose.measure_inertial", lambda *_: measured)
+    light = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "light")
     for name in ("motor_constant", "inertia_xx", "inertia_yy"):
         pair = [run.result.coefficients[name].best for run in (light, heavy)]
         assert pair[1] / pair[0] == pytest.approx(2.0, rel=1e-6), name
