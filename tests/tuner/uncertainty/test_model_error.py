@@ -228,7 +228,7 @@ def test_commands_stand_in_for_tachometers():
 
 
 def test_what_a_logger_filters_sample_by_sample_is_half_a_period_off():
-    objective = problem({"tachometer_lag": 0.008}, free=FREE[:-1])
+    objective = problem({"tachometer_lag": 0.008})
     measured, flights = flown(objective, 0)
     objective = replace(objective, segments=replace(objective.segments, measured=measured))
     objective, point = with_terms(
@@ -245,8 +245,7 @@ def test_what_a_logger_filters_sample_by_sample_is_half_a_period_off():
 
 def test_rotors_whose_speed_nothing_tells_are_known_as_well_as_their_limit():
     """Twice as fast, with a quarter of the motor constant and twice the limit, flies alike."""
-    # as many free coefficients as the other tests: a program belongs to their number
-    truth = problem({}, free=(*FREE[1:], "zero_position_armed"))
+    truth = problem({}, free=(*FREE, "zero_position_armed"))
     fastest = np.asarray(flown(truth, 0)[0]["rotor_speed"].values).max()
     limited = eqx.tree_at(
         lambda m: m.vehicle.motor.max_rotor_velocity, truth.model, jnp.asarray(0.97 * fastest)
