@@ -107,6 +107,39 @@ def test_errors_hold_what_another_memory_moves(flown, begun, monkeypatch, times)
 
 
 @pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
+def test_errors_hold_how_far_a_regression_was_misled(flown, begun, monkeypatch):
+    _, settings, recordings = flown
+
+    def half(made, found, **given):
+        assert misled(made, found, **given).shape == found.point.shape
+        return np.full_like(found.point, 0.5)
+
+    monkeypatch.setattr("tuner.equation_error.estimate.misled", half)
+    found = with_accelerations(job_of(settings, recordings))[0].accelerations
+    for name in TILTING:
+        assert found.errors[name] > 0.4 > begun[1].accelerations.errors[name] + 0.1
+
+
+@pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
+def test_errors_of_others_hold_what_the_power_of_thrust_moves(flown, monkeypatch):
+    """Another coefficient in its place, which every flight tells."""
+    _, settings, recordings = flown
+    free_in = []
+
+    def moved(made, begin, *, free, **given):
+        free_in.append(free.sum())
+        without = len(free_in) > 2 and free_in[-1] < free_in[1]
+        found = regress(made, begin, free=free, **given)
+        return replace(found, point=found.point + (0.5 if without else 0.0))
+
+    monkeypatch.setattr("tuner.equation_error.estimate.POWER", "motor_constant")
+    monkeypatch.setattr("tuner.equation_error.estimate.regress", moved)
+    errors = with_accelerations(job_of(settings, recordings))[0].accelerations.errors
+    assert all(errors[name] > 0.4 for name in TILTING)
+    assert errors["motor_constant"] < 0.1
+
+
+@pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
 def test_noise_that_is_said_to_be_more_than_there_is_leaves_a_minimum(flown, monkeypatch):
     """No more than half of what a direction holds is taken off for it."""
     _, settings, recordings = flown
