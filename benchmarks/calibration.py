@@ -234,7 +234,7 @@ def fitted(objective: Objective) -> Fitted:
         stages,
         beginning(objective, begin[None]),
         free=Free(np.ones(len(space), bool), free_offsets(reference_job())),
-        undecided=(),
+        undecided={},
         on_progress=lambda _: None,
     )
     point = point_of(progress.points, 0)

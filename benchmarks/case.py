@@ -53,9 +53,9 @@ def _vec(x: float, y: float, z: float) -> Vec3:
 
 
 def _vehicle() -> Vehicle:
-    rotors = tuple(
-        Rotor(_vec(x * ARM, y * ARM, 0.0), spin)
-        for x, y, spin in ((1.0, -1.0, 1), (-1.0, 1.0, 1), (1.0, 1.0, -1), (-1.0, -1.0, -1))
+    rotors = (
+        *(Rotor(_vec(x * ARM, -x * ARM, 0.0), 1) for x in (1.0, -1.0)),
+        *(Rotor(_vec(x * ARM, x * ARM, 0.0), -1) for x in (1.0, -1.0)),
     )
     number = jnp.asarray
     return Vehicle(

@@ -130,7 +130,8 @@ def section(draws: Sequence[Draw]) -> Section:
         noise = [(followed[name].parts.noise or 0.0) / true for followed in kept]
         half = [np.diff(followed[name].ci95)[0] / 2.0 / true for followed in kept]
         held = sum(followed[name].ci95[0] <= true <= followed[name].ci95[1] for followed in kept)
-        shares = np.std(plain, ddof=1), np.std(run, ddof=1), np.median(noise), np.median(half)
+        spreads = np.std(plain, ddof=1), np.std(run, ddof=1), np.median(noise), np.median(half)
+        shares = [float(spread) for spread in spreads]
         rows.append(
             [
                 name,

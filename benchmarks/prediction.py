@@ -161,5 +161,5 @@ def options_of(folder: Path) -> Options:
     if config is None and job is not None:
         config = str(ROOT / "configs" / "jobs" / f"{job}.yaml")
     held_out = HELD_OUT.get(folder.name, tuple(path.stem for path in files[-2:]))
-    given = {} if own.exists() or len(files) < 4 else {"holdout": list(held_out)}
-    return Options([str(path) for path in files], config=config, **given)
+    names = None if own.exists() or len(files) < 4 else list(held_out)
+    return Options([str(path) for path in files], config=config, holdout=names)

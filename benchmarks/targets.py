@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from tuner.core.runtime import configure
 from tuner.core.shipped import EXPORT_TARGETS
+from tuner.evaluate.records import AxesRmse
 from tuner.exporters.effective import kept_effective, pose_rmse, refly
 from tuner.exporters.target import target_of, write
 from tuner.report.result_texts import rmse_in_words
@@ -24,7 +26,7 @@ def main(folder: str) -> None:
     run = read_run(folder)
     spinning = {f.name for f in run.result.flights if "spin" in f.name}
 
-    def over_flights(flown: dict) -> str:
+    def over_flights(flown: Mapping[str, AxesRmse]) -> str:
         rmse = pose_rmse(axes for name, axes in flown.items() if name not in spinning)
         return rmse_in_words(rmse)
 
