@@ -141,7 +141,11 @@ def _rest(result: RunResult) -> list[str]:
     """Return a line on what was fixed and one on the terms."""
     from tuner.report.result_texts import nearly_kept
 
-    fixed = [f"{n} {row.best:.4g}" for n, row in result.coefficients.items() if not row.fitted]
+    fixed = [
+        f"{name} {row.best:.4g} {row.unit}".rstrip()
+        for name, row in result.coefficients.items()
+        if not row.fitted
+    ]
     lines = [f"Fixed: {listed_within(fixed, WIDTH - 8)}."] if fixed else []
     if rows := result.selection:
         kept = [row.group for row in rows if row.kept]

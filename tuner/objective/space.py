@@ -26,6 +26,9 @@ LEAST_SLOPE = 1e-150
 """Whose inverse has a square that is a number."""
 OFF_BOUND = 0.05
 """A start on a bound is moved inside by this share of the range."""
+CUTOFF = "gyro_cutoff"
+INSIDE_HALF = 0.99
+"""Share of half the rate loop's rate that a filter of the gyro may reach."""
 
 
 class Space:
@@ -207,9 +210,6 @@ def space_of(
     return Space(parameters, fixed, joint_prior, size)
 
 
-CUTOFF = "gyro_cutoff"
-
-
 def _with_filter_bounded(
     job: JobFile, controller: ControllerFile, values: Mapping[str, float]
 ) -> JobFile:
@@ -229,10 +229,6 @@ def _with_filter_bounded(
         return job
     changed = given.replace(upper=INSIDE_HALF * half)
     return job.replace(coefficients={**job.coefficients, CUTOFF: changed})
-
-
-INSIDE_HALF = 0.99
-"""Share of half the rate loop's rate that a filter of the gyro may reach."""
 
 
 def _free_names(job: JobFile, bypassed: Collection[str], freed: Collection[str]) -> tuple[str, ...]:

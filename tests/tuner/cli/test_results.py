@@ -1,5 +1,7 @@
 """A finished job on a terminal: thirty lines of a hundred columns, and all of it if asked."""
 
+import re
+
 import pytest
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
@@ -34,7 +36,7 @@ def test_a_finished_job_says_what_the_issue_lists(folder, capsys):
     assert "→" in held
     assert held.split()[-1] in ("matched", "better", "unchanged")
     assert "Terms: fuselage_drag of 2 kept." in text
-    assert "Fixed: mass " in text
+    assert re.search(r"^Fixed: mass [0-9.]+ kg, ", text, re.MULTILINE)
     assert f"Written to {folder} in 42 s" in text
     assert lines[-1].startswith("Next: ")
 
