@@ -170,6 +170,13 @@ def test_a_crash_or_another_rmse_when_flown_again_is_refused(make_run):
             exported(make_run(), refly=refly)
 
 
+def test_a_flight_that_crashed_in_the_run_is_no_better_though_it_flies_again(make_run):
+    run = make_run(flights={"held": {"rmse_best": CRASHED}})
+    again = as_the_run_says(run, run.vehicle) | {"held": rmse(0.001)}
+    gates = check(run, run.vehicle, lambda *_: again)
+    assert [objection for gate in gates for objection in gate.objections] == ["held crashes"]
+
+
 def test_a_coefficient_that_the_run_held_may_lie_on_its_bound(make_run):
     held = {"fitted": True, "identifiable": False, "lower": 0.0, "upper": 0.04}
     run = make_run(coefficients={"actuator_latency": held})

@@ -125,9 +125,7 @@ def test_what_doubts_the_numbers_comes_before_what_does_not():
     assert [warning.link for warning in said] == ["d", "e", "rate_gain", "c", "a"]
 
 
-def test_the_flight_to_hold_out_is_the_one_that_tells_least_and_never_the_only_one(
-    result, tmp_path
-):
+def test_the_flight_to_hold_out_tells_least_and_is_neither_odd_nor_the_only_one(result, tmp_path):
     unchecked = with_held(result, split="fit")
     told = unchecked.coefficients["motor_constant"]
     reason = told.reason.model_copy(update={"flight": "checks"})
@@ -135,6 +133,10 @@ def test_the_flight_to_hold_out_is_the_one_that_tells_least_and_never_the_only_o
     unchecked = unchecked.model_copy(update={"coefficients": rows})
     other = unchecked.flights[0].name
     assert next_step(unchecked, outcome(unchecked), tmp_path)[1] == f"tune ... --holdout {other}"
+    odd = Finding(Code.FLIGHT_UNMATCHED, "warning", other, {"position": 20.0})
+    unmatched = noticing(unchecked, odd)
+    step = next_step(unmatched, outcome(unmatched), tmp_path)
+    assert step[1] == "tune ... --holdout checks"
     alone = unchecked.model_copy(update={"flights": unchecked.flights[:1]})
     assert next_step(alone, outcome(alone), tmp_path)[0].startswith("Record a second flight")
 
