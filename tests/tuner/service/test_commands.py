@@ -50,8 +50,12 @@ def test_a_job_is_submitted_listed_watched_fetched_and_cancelled(client, table, 
     assert "[bold]first" in capsys.readouterr().out
     assert main(["jobs", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["jobs"][0]["id"] == job
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/checkpoint.npz").touch()
+    (tmp_path / "run/profiles.json").write_text("{}")
     assert main(["fetch", job, "--out", str(tmp_path / "run")]) == 0
     assert "motor_constant" in capsys.readouterr().out
+    assert not (tmp_path / "run/profiles.json").exists()
     slow = submit(client, upload(client, table.read_bytes()), namespace="slow")
     assert main(["fetch", slow, "--out", str(tmp_path / "none")]) == 2
     assert main(["cancel", slow]) == 0

@@ -321,6 +321,12 @@ def test_a_gain_that_is_far_off_is_told_beside_the_fit(factor):
     assert found.numbers["roll"] == pytest.approx(factor, abs=0.05)
 
 
+def test_odd_flights_say_nothing_of_the_controller_or_the_model(monkeypatch):
+    fitted, flights = flown_with_p(1.06)
+    monkeypatch.setattr("tuner.uncertainty.model_error.odd_flights", frozenset)
+    assert lack_of(fitted, flights) is None
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.06])
 def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
     """Flights of a P that is not the file's, whose set-points and commands were recorded."""
