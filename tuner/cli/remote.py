@@ -13,7 +13,7 @@ from tuner.cli.options import EACH, Quiet
 from tuner.options import FitOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from tuner.client.client import Client
     from tuner.job.listener import Listener
@@ -149,7 +149,9 @@ def jobs(
         return
     rows = [
         (
-            *(_plain(job[key]) for key in ("id", "state", "vehicle", "name")),
+            _plain(job["id"]),
+            _standing(job),
+            *(_plain(job[key]) for key in ("vehicle", "name")),
             _plain(job["submitted"][:16].replace("T", " ")),
             "" if job["rmse"] is None else f"{1000 * job['rmse']:.2f}",
             _plain(job["error"] or (job["stage"] if job["state"] == "running" else "") or ""),
@@ -162,6 +164,11 @@ def jobs(
     screen.print(rich_table(Table(columns, rows, words=words)))
     if page["next"]:
         screen.print(f"more with --after {page['next']}")
+
+
+def _standing(job: Mapping[str, Any]) -> str:
+    """Return a job's state, and of one that is done whether its result can be used."""
+    return _plain(", ".join(filter(None, (job["state"], job.get("usability")))))
 
 
 def _plain(word: str) -> str:
@@ -185,9 +192,10 @@ def watch(
     with client_of(server, token) as client:
         with listening(quiet=quiet, verbose=True) as listener:
             show(client.follow(job), listener)
-        ended_well(client.job(job))
+        done = client.job(job)
+        ended_well(done)
     if not quiet:
-        print(f"Job {job} is done; its result comes with: tune fetch {job}")
+        print(f"Job {job} is {_standing(done)}; its result comes with: tune fetch {job}")
 
 
 def fetch(

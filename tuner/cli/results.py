@@ -62,7 +62,7 @@ def _summary(contents: Contents, result: RunResult, seconds: float | None) -> li
     from tuner.report.outcome import flights_table, next_step, outcome
 
     folder, exports = contents.folder, contents.exports
-    found = outcome(result, contents.bench)
+    found = outcome(result, contents.bench, exports)
     lines: list[Text | Table] = [
         Text(
             shorten(f"{found.usability.capitalize()}. {found.what}", WIDTH),

@@ -42,9 +42,11 @@ NOT_FLOWN = frozenset(
 """Warnings of vehicles and controllers that did not fly, on which a simulation may fail."""
 OTHER_INPUTS = NOT_FLOWN | {Code.MASS_NOT_GIVEN, Code.SAME_RECORDING, Code.LIFTS_OTHERWISE}
 """Warnings that what was given is not what flew: all numbers follow from that."""
+CONFLICTS = OTHER_INPUTS | {Code.GROUND_CONFLICT, Code.BENCH_CONFLICT}
+"""Warnings that inputs or measurements contradict what flew: the next step is to settle them."""
 CAUSES = OTHER_INPUTS | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS, Code.INLET_CHOSEN}
 """Warnings that say why others arise."""
-DOUBTS = OTHER_INPUTS | frozenset(
+DOUBTS = CONFLICTS | frozenset(
     {
         Code.MODEL_UNMATCHED,
         Code.FLIGHT_UNMATCHED,
@@ -53,8 +55,6 @@ DOUBTS = OTHER_INPUTS | frozenset(
         Code.LAW_LACKING,
         Code.CONTROLLER_ANSWERS,
         Code.HOLDING_BETTER,
-        Code.GROUND_CONFLICT,
-        Code.BENCH_CONFLICT,
         Code.TURNING_UNEXPLAINED,
         Code.TURNING_REGRESSED,
         Code.TURNING_NOT_PREDICTED,
@@ -131,14 +131,18 @@ class Outcome:
         return LOOKS[self.usability]
 
 
-def outcome(result: RunResult, bench: BenchRecord | None = None) -> Outcome:
-    """Return whether a fit can be used, for what, and why."""
+def outcome(
+    result: RunResult, bench: BenchRecord | None = None, exports: Sequence[ExportRecord] = ()
+) -> Outcome:
+    """Return whether a fit can be used, for what, and why; with care where no export passed."""
     flights = sorted(
         (_flight_outcome(flight, result) for flight in result.flights),
         key=lambda flight: not flight.held_out,
     )
     checks = [flight for flight in flights if flight.held_out] or flights
     usability = _usability(result, checks, flights)
+    if usability is Usability.USABLE and _why_refused(exports):
+        usability = Usability.WITH_CARE
     return Outcome(
         usability,
         _what(result) if bench is None else bench_in_words(bench),
@@ -178,9 +182,11 @@ def next_step(
         What was asked for; where all were refused, why comes first.
     """
     name = shlex.quote(str(folder))
-    doubts = [warning for warning in warnings_of(result.findings) if warning.small]
-    if found.usability is Usability.UNUSABLE:
-        return doubts[0].small if doubts else "Look at its flights.", f"tune report {name} --open"
+    unusable = found.usability is Usability.UNUSABLE
+    doubted = [f for f in by_weight(result.findings) if unusable or f.code in CONFLICTS]
+    remedies = [words for finding in doubted if (words := remedy(finding))]
+    if unusable or remedies:
+        return remedies[0] if remedies else "Look at its flights.", f"tune report {name} --open"
     if found.flights and not any(flight.held_out for flight in found.flights):
         if len(found.flights) == 1:
             return "Record a second flight, and hold it out.", "tune ... --holdout FLIGHT"
@@ -192,11 +198,15 @@ def next_step(
         return words, f"tune ... --holdout {shlex.quote(flight)}"
     if not found.flights:
         return "Fit flights from it.", f"tune --flights FLIGHT... --bench {name}"
-    refused = [one.refused for one in exports if one.refused]
-    if refused and len(refused) == len(exports):
-        why = refused[0].partition(": ")[2].partition("; ")[0]
+    if why := _why_refused(exports):
         return as_sentence(why), f"tune report {name} --open"
     return "Put it into your model.", f"tune export {name} --format sdf --into model.sdf"
+
+
+def _why_refused(exports: Sequence[ExportRecord]) -> str:
+    """Return why all exports were refused; empty where one was written, or none asked for."""
+    refused = [one.refused for one in exports]
+    return refused[0].partition(": ")[2].partition("; ")[0] if all(refused) and refused else ""
 
 
 def of_examination(knowledge: Knowledge) -> str:

@@ -117,7 +117,7 @@ def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
         (files("tuner.report") / "assets" / name).read_text("utf-8") for name in LIBRARIES
     )
     run = contents.run
-    found = None if run is None else outcome(run.result, contents.bench)
+    found = None if run is None else outcome(run.result, contents.bench, contents.exports)
     return environment.get_template("page.html.jinja").render(
         about=contents.about,
         outcome=found,

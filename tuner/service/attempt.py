@@ -18,7 +18,8 @@ from typing import IO, Any
 
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import digest_of, inside
-from tuner.result import CHECKPOINTS, RunResult
+from tuner.report.outcome import outcome
+from tuner.result import CHECKPOINTS, ExportRecords, RunResult
 from tuner.service.errors import full_disk
 from tuner.service.queue import Claim, Outcome
 from tuner.service.request import FLIGHTS, CheckedRequest
@@ -223,9 +224,11 @@ def _outcome(last: Mapping[str, Any], folder: Path, store: ContentStore) -> Outc
         error = f"internal error ({last['error']}); please report it"
         return Outcome(State.FAILED, error=error, exit_status=1)
     result = RunResult.read(folder / RESULT)
+    exports = ExportRecords.read_if_any(folder / RESULT) or ExportRecords()
     return Outcome(
         State.DONE,
         exit_status=0,
+        usability=outcome(result, exports=tuple(exports.exports.values())).usability,
         files=_stored(folder / RESULT, store),
         points=[
             {

@@ -57,6 +57,8 @@ class Outcome:
 
     Attributes
     ----------
+    usability
+        Whether the result can be used.
     files, points
         Rows of a result, without their job.
     """
@@ -64,6 +66,7 @@ class Outcome:
     state: State
     error: str | None = None
     exit_status: int | None = None
+    usability: str | None = None
     files: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
     points: Sequence[Mapping[str, Any]] = field(default_factory=tuple)
 
@@ -132,6 +135,7 @@ class Queue:
                 "state": outcome.state,
                 "error": outcome.error,
                 "exit_status": outcome.exit_status,
+                "usability": outcome.usability,
                 "ended": time.time(),
                 "seconds_left": 0.0 if outcome.state == State.DONE else None,
                 **UNCLAIMED,

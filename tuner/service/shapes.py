@@ -8,6 +8,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
+from tuner.report.outcome import Usability
 from tuner.service.tables import EventRow, FileRow, JobRow, State
 from tuner.service.words import over_http
 
@@ -67,7 +68,10 @@ class Accepted(BaseModel):
 
 
 class JobAnswer(BaseModel):
-    """A job; ``rmse`` in m, times as ISO 8601, ``exit_status`` as of the local command."""
+    """A job; ``rmse`` in m, times as ISO 8601, ``exit_status`` as of the local command.
+
+    ``usability`` says whether the result of a job that is done can be used.
+    """
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -84,6 +88,7 @@ class JobAnswer(BaseModel):
     ended: Moment | None
     error: Annotated[str | None, AfterValidator(lambda text: text and over_http(text))]
     exit_status: int | None
+    usability: Usability | None
     files: Annotated[
         list[str],
         BeforeValidator(lambda files: [f.name if isinstance(f, FileRow) else f for f in files]),

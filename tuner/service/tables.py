@@ -72,6 +72,8 @@ class JobRow(Base):
         Of the search; m, s.
     error, exit_status
         Why it failed, and what the local command would have returned; 0 where it is done.
+    usability
+        Of its result, a word of `tuner.report.outcome.Usability`; None before it is done.
     deaths
         Attempts whose process died.
     checkpoint
@@ -106,6 +108,7 @@ class JobRow(Base):
     flown: Mapped[float | None]
     error: Mapped[str | None] = mapped_column(Text)
     exit_status: Mapped[int | None]
+    usability: Mapped[str | None] = mapped_column(String(20))
     deaths: Mapped[int] = mapped_column(default=0)
     checkpoint: Mapped[dict[str, str] | None] = mapped_column(JSON, deferred=True)
     claim: Mapped[str | None] = mapped_column(String(32))

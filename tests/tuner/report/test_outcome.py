@@ -6,7 +6,7 @@ import pytest
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.evaluate.records import AxesRmse
-from tuner.findings.findings import Code, Finding
+from tuner.findings.findings import Code, Finding, remedy
 from tuner.report.outcome import (
     Usability,
     counted,
@@ -108,6 +108,17 @@ def test_where_every_export_was_refused_the_next_step_is_why(result, tmp_path):
     assert words == "Its numbers are not fit to export: mass 2 is its lower bound."
     assert command.startswith("tune report")
     assert next_step(result, outcome(result), tmp_path, (refused, written))[0].startswith("Put")
+    assert outcome(result, exports=(refused,)).usability is Usability.WITH_CARE
+    assert outcome(result, exports=(refused, written)).usability is Usability.USABLE
+
+
+def test_a_conflict_of_measurements_is_settled_before_anything_is_exported(result, tmp_path):
+    numbers = {"deviation": 9.0, "ground": 1.4e-5, "flights": 1.2e-5, "mass": 1.9}
+    conflict = Finding(Code.GROUND_CONFLICT, "warning", "motor_constant", numbers, ("N s²/rad²",))
+    contradicted = noticing(result, conflict)
+    words, command = next_step(contradicted, outcome(contradicted), tmp_path)
+    assert words == remedy(conflict)
+    assert command.startswith("tune report")
 
 
 def test_what_doubts_the_numbers_comes_before_what_does_not():

@@ -14,6 +14,7 @@ import threading
 import time
 from pathlib import Path
 
+CRASHED = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"))
 AXES = {"x": 0.1, "y": 0.1, "z": 0.1, "roll": 1.0, "pitch": 1.0, "yaw": 1.0}
 
 FIXED = {
@@ -116,7 +117,7 @@ def fit(assignment):
                 "duration": 1.0,
                 "time_offset": 0.0,
                 "rmse_initial": AXES,
-                "rmse_best": AXES,
+                "rmse_best": CRASHED if wish == "crash" else AXES,
             }
             for name in assignment["flights"]
         ],

@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from tests.tuner.service.conftest import ended, submit, upload
+from tuner.cli import remote
 from tuner.report.outcome import outcome
 from tuner.result import RunResult
 from tuner.service import attempt, http, jobs, queue
@@ -66,6 +67,22 @@ def test_a_job_goes_from_the_recording_to_its_files(client, recording):
         )
     content = client.get(job["links"]["files"]["result.json"]).json()
     assert RunResult.model_validate(content).coefficients["motor_constant"].best == 1e-7
+
+
+@pytest.mark.parametrize(
+    ("wish", "usability", "look"),
+    [("none", "usable with care", "weak"), ("crash", "not usable", "not")],
+)
+def test_lists_say_whether_a_result_can_be_used(
+    *, client, recording, capsys, wish, usability, look
+):
+    job = ended(client, submit(client, recording, namespace=wish))
+    assert job["usability"] == usability
+    badge = f'<span class="badge {look}">done, {usability}</span>'
+    for place in ("/", "/jobs", f"/jobs/{job['id']}"):
+        assert badge in client.get(place).text
+    remote.watch(job["id"], server=str(client.base_url))
+    assert f"is done, {usability}; its result comes with" in capsys.readouterr().out
 
 
 def test_every_file_is_served_where_it_reaches_nothing(client, recording):

@@ -25,7 +25,7 @@ from tuner.core.validation import config_error
 from tuner.core.yaml_document import document_of
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
-from tuner.report.outcome import flights_table, outcome, warnings_of
+from tuner.report.outcome import LOOKS, flights_table, outcome, warnings_of
 from tuner.report.section import figures
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
@@ -78,7 +78,7 @@ def environment() -> Environment:
         "damage": lambda raw: damage_sentence(TypeAdapter(Damage).validate_python(raw)),
     }
     made.filters |= filters
-    made.globals |= {"states": STATES, "visitor": VISITOR.get}
+    made.globals |= {"states": STATES, "looks": LOOKS, "visitor": VISITOR.get}
     return made
 
 
@@ -317,7 +317,8 @@ def show_job(service: Served, row: OfJob) -> Response:
     with suppress(InputError):  # the report, if it is there, says what it can
         if row.state == State.DONE:
             result = comparison.result_of(service.store, row)
-            found = outcome(result)
+            exports = comparison.exports_of(service.store, row)
+            found = outcome(result, exports=exports)
             box = {
                 "outcome": found,
                 "flights": flights_table(found.checks),
@@ -325,7 +326,7 @@ def show_job(service: Served, row: OfJob) -> Response:
                     replace(warning, text=on_the_web(warning.text), small=on_the_web(warning.small))
                     for warning in warnings_of(result.findings)
                 ],
-                "exports": comparison.exports_of(service.store, row),
+                "exports": exports,
             }
     return render("job.html.jinja", others=others, **box, **_live(service, row))
 
