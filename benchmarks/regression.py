@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from tuner.core.numerics import Array
 from tuner.evaluate.prediction import Predictions, errors_of
 from tuner.recordings.flight import Flight
-from tuner.recordings.states import States, filtered, states_at
+from tuner.recordings.states import States, local_parabolas, states_at
 
 MEMORY = 4
 """Samples of the inputs that are regressors."""
@@ -96,5 +96,5 @@ def features(turned: Rotation, velocity: Array, rate: Array, inputs: Array) -> A
 
 def inputs_at(flight: Flight, signal: str, time: Array) -> Array:
     """Return the input's last samples (n, MEMORY k) before some times."""
-    table = [filtered(flight.series[signal], time - k / flight.rate) for k in range(MEMORY)]
+    table = [local_parabolas(flight.series[signal], time - k / flight.rate) for k in range(MEMORY)]
     return np.hstack(table)

@@ -17,7 +17,7 @@ from tuner.objective.inlets import MISSED, linear_interpolation, zero_order_hold
 from tuner.objective.noise import white_noise
 from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.recordings.flight import Flight, Series
-from tuner.recordings.states import filtered, states_at
+from tuner.recordings.states import local_parabolas, states_at
 from tuner.vehicle.model import Model
 
 Mask = NDArray[np.bool_]
@@ -276,8 +276,8 @@ def _read(series: Series, times: Array) -> Array:
 def _velocity(series: Mapping[str, Series], edges: Array) -> Array:
     """Return the velocity (n, 3) m/s at some times, world."""
     if "velocity" in series and np.isfinite(series["velocity"].values).all():
-        return filtered(series["velocity"], edges)
-    return filtered(series["position"], edges, derivative=1)
+        return local_parabolas(series["velocity"], edges)
+    return local_parabolas(series["position"], edges, derivative=1)
 
 
 def _noise(rotors: Series) -> float:

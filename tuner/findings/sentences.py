@@ -10,7 +10,14 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from tuner.core.phrases import as_sentence, listed, percent
-from tuner.recordings.notes import Cause, Damage, Note, NoteCode, damage_sentence, note_in_words
+from tuner.recordings.notes import (
+    Cause,
+    Damage,
+    Note,
+    NoteCode,
+    damage_sentence,
+    note_in_words,
+)
 
 if TYPE_CHECKING:
     from tuner.findings.findings import Finding

@@ -22,7 +22,7 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import Z95, Array, robust_sd
 from tuner.ground.measurement import Curve
 from tuner.recordings.content import Content, ReadOptions, read_content
-from tuner.recordings.recording import ROWS, Clock, Request, TabularRecording
+from tuner.recordings.recording import TABLE_TOPIC, Clock, Request, TabularRecording
 
 OUTLIER = 3.0
 """Standard deviations (robust) beyond which a tachometer's sample is dropped (thesis 6.3.2)."""
@@ -271,8 +271,8 @@ def read_columns(
     if not any(name in table.columns for name in TIMES):
         raise RecordingError(path, "has no column time", "add it, in s")
     clocks = tuple(Clock(field=name, unit="s") for name in TIMES)
-    contents = table.read({ROWS: Request(tuple(chosen.values()), clocks)})
-    rows = contents.samples[ROWS]
+    contents = table.read({TABLE_TOPIC: Request(tuple(chosen.values()), clocks)})
+    rows = contents.samples[TABLE_TOPIC]
     if len(rows.receive) < FEWEST:
         what = f"holds {len(rows.receive)} samples with a time"
         raise RecordingError(path, what, "record the whole experiment")

@@ -9,10 +9,10 @@ from tuner.config import Options, Settings, settle
 from tuner.core.errors import InputError
 from tuner.core.phrases import listed
 from tuner.findings.findings import Code, sentence
-from tuner.recordings.cache import cached, digest, recalled, source_version
+from tuner.recordings.cache import cache_file, digest, load_or_compute, source_version
 from tuner.recordings.inspection import Inspection
 from tuner.recordings.topics import read_sidecar
-from tuner.recordings.ulog import Advice, advice_of, parameters_of, settings_in_words
+from tuner.recordings.ulog import LoggingAdvice, logger_settings, logging_advice, parameters_of
 from tuner.vehicle import COEFFICIENTS
 
 
@@ -44,7 +44,7 @@ class Verdict:
     why: tuple[str, ...] = ()
     not_shown: tuple[str, ...] = ()
     gains: tuple[str, ...] = ()
-    logging: tuple[Advice, ...] = ()
+    logging: tuple[LoggingAdvice, ...] = ()
     settings: str = ""
 
 
@@ -66,14 +66,14 @@ def verdict_of(
     options = Options([str(path)], topics=topics, namespace=namespace, vehicle=vehicle)
     decided = _decided(path, settle(options, fits=False))
     parameters = parameters_of(path)
-    logging: tuple[Advice, ...] = ()
+    logging: tuple[LoggingAdvice, ...] = ()
     if inspection.format == "ulog" and inspection.duration > 0:
         rates = {
             topic.name: topic.rate or topic.count / inspection.duration
             for topic in inspection.topics
         }
-        logging = advice_of(rates)
-    words = settings_in_words(logging, parameters)
+        logging = logging_advice(rates)
+    words = logger_settings(logging, parameters)
     return replace(decided, logging=logging, settings=words)
 
 
@@ -84,7 +84,9 @@ def _decided(path: Path, settings: Settings) -> Verdict:
     maps = [digest(file) for file in (job.topics,) if file is not None and file.exists()]
     key = (digest(path), path.name, source_version(), *map(repr, (*inputs, *maps)))
 
-    found = recalled(Verdict, cached("verdict", *key), lambda: _simulatable(path, settings))
+    found = load_or_compute(
+        Verdict, cache_file("verdict", *key), lambda: _simulatable(path, settings)
+    )
     return replace(found, path=str(path))
 
 

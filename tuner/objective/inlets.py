@@ -31,7 +31,7 @@ from sim_jax.schedule import Schedule
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
 from tuner.recordings.flight import SIGNALS, Flight, Series
-from tuner.recordings.interpolation import body_rate_from, without_gaps
+from tuner.recordings.interpolation import body_rate_from, with_gaps_filled
 from tuner.vehicle import COEFFICIENTS, term_groups
 from tuner.vehicle.coefficient import LoopPart
 
@@ -185,7 +185,7 @@ class RecordedInlet(ABC):
         moves = rate is None or sparse(flights, signal, rate)
         read = linear_interpolation if moves else zero_order_hold
         table = np.stack(
-            [read(without_gaps(flight.series[signal]), clock) for flight in flights], axis=-1
+            [read(with_gaps_filled(flight.series[signal]), clock) for flight in flights], axis=-1
         )
         return [np.asarray(table[:, column]) for column in range(table.shape[1])]
 

@@ -31,7 +31,7 @@ from tuner.objective.inlets import INLETS, inlet_of
 from tuner.objective.noise import repeats
 from tuner.objective.windows import Window, windows_of
 from tuner.recordings.flight import Flight, Series
-from tuner.recordings.states import position_error
+from tuner.recordings.states import initial_position_error
 from tuner.vehicle import recording_offsets
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
@@ -155,7 +155,7 @@ def segments_of(
     if bool(np.any(inlet.spins)):
         rate = np.where(inlet.spins, inlet.yaw_rate, 0.0)
         known = noise.get("position", 0.0)  # where no position is compared, none is corrected
-        begun = [position_error(flight.series, known) for flight in flights]
+        begun = [initial_position_error(flight.series, known) for flight in flights]
         freed = freedom_of_spin(np.asarray(rate), schedule.rate_control_rate, np.array(begun))
     return Segments(
         inlet=inlet,

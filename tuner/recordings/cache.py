@@ -25,12 +25,12 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 #: Files above this, in bytes, are not read again only to learn that they are unchanged.
-LARGE = 256 << 20
+MAX_HASHED_BYTES = 256 << 20
 #: Together the cached files take no more than this; the longest unused go first.
-ROOM = 2 << 30
+MAX_CACHE_BYTES = 2 << 30
 
 
-def own_folder() -> Path:
+def cache_root() -> Path:
     """Return the folder of the cache: ``TUNE_CACHE_DIR``, or the user's own for this program."""
     named = os.environ.get("TUNE_CACHE_DIR")
     return Path(named) if named else cache_folder()
@@ -48,11 +48,11 @@ def digest(path: Path) -> str:
         inside = path.rglob("*") if path.is_dir() else [path]
         files = sorted(file for file in inside if file.is_file() or file == path)
         about = [(str(file), file.stat()) for file in files]
-        if sum(stat.st_size for _, stat in about) <= LARGE:
+        if sum(stat.st_size for _, stat in about) <= MAX_HASHED_BYTES:
             return _digest(path, files)
         # Name, size and time of change stand for the content of what takes seconds to read.
         parts = [(n, s.st_size, s.st_mtime_ns, s.st_ino) for n, s in about]
-        known = cached("digest", json.dumps(parts))
+        known = cache_file("digest", json.dumps(parts))
         if (known_digest := load(known)) is not None and len(known_digest) == 64:
             return known_digest.decode()
         fresh = _digest(path, files)
@@ -86,10 +86,10 @@ def source_version(folder: str = "") -> str:
     return _digest(package.parent, sorted(source))
 
 
-def cached(kind: str, *key: str) -> Path:
+def cache_file(kind: str, *key: str) -> Path:
     """Return the file in which something with this key is kept."""
     parts = source_version("recordings"), kind, *key
-    return own_folder() / kind / hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
+    return cache_root() / kind / hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
 
 
 def load(path: Path) -> bytes | None:
@@ -102,7 +102,7 @@ def load(path: Path) -> bytes | None:
     return content
 
 
-def recalled(kind: type[T], path: Path, find: Callable[[], T]) -> T:
+def load_or_compute(kind: type[T], path: Path, compute: Callable[[], T]) -> T:
     """Return a dataclass that a file of the cache holds, or find it and keep it there.
 
     Parameters
@@ -113,9 +113,9 @@ def recalled(kind: type[T], path: Path, find: Callable[[], T]) -> T:
     if (content := load(path)) is not None:
         with contextlib.suppress(ValidationError):
             return TypeAdapter(kind).validate_json(content)
-    found = find()
-    store(path, json.dumps(asdict(found)).encode())  # type: ignore[call-overload]
-    return found
+    computed = compute()
+    store(path, json.dumps(asdict(computed)).encode())  # type: ignore[call-overload]
+    return computed
 
 
 def store(path: Path, content: bytes) -> None:
@@ -124,21 +124,21 @@ def store(path: Path, content: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as unfinished:
             unfinished.write_bytes(content)
-        _make_room()
+        _remove_oldest()
     except (OSError, OutputError) as err:
         logger.info("nothing is cached in %s: %s", path.parent, err)
 
 
-def _make_room() -> None:
+def _remove_oldest() -> None:
     files = []
-    for file in own_folder().rglob("*"):
+    for file in cache_root().rglob("*"):
         with contextlib.suppress(OSError):
             if file.is_file():
                 stat = file.stat()
                 files.append((stat.st_mtime, stat.st_size, file))
     total = sum(size for _, size, _ in files)
     for _, size, file in sorted(files, key=lambda entry: entry[0]):
-        if total <= ROOM:
+        if total <= MAX_CACHE_BYTES:
             break
         file.unlink(missing_ok=True)
         total -= size

@@ -16,43 +16,43 @@ import numpy as np
 from tuner.core.numerics import Array
 from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import (
-    RATE,
+    RATE_HZ,
     body_rate_of,
     correlation,
+    middle_clock,
     on_clock,
     rms,
     smooth,
-    stretch,
 )
 from tuner.recordings.notes import Kind, Note, NoteCode
 from tuner.recordings.recording import Nanoseconds, Samples
 
-SECOND = 1_000_000_000
+NS_PER_SECOND = 1_000_000_000
 #: A stamp that leaves its neighbours by more than this, while its arrival does not, has jumped.
-LEAST_JUMP = SECOND // 10
+MIN_CLOCK_JUMP_NS = NS_PER_SECOND // 10
 #: Topics whose stamps differ by more than this from the others' are on a clock of their own.
-LEAST_CLOCK_OFFSET = SECOND // 2
+MIN_CLOCK_OFFSET_NS = NS_PER_SECOND // 2
 #: A stamp this part of a period off its tick still belongs to that tick.
-ON_TICK = 0.2
+MAX_TICK_DEVIATION = 0.2
 #: No clock drifts faster, in s/s: such stamps have another rate.
-FASTEST_DRIFT = 0.01
+MAX_CLOCK_DRIFT = 0.01
 #: A smaller offset, in s, is left to the fit, which has a time offset and latencies to find.
-LEAST_OFFSET = 0.02
+MIN_POSE_OFFSET_S = 0.02
 #: Seconds within which an offset is looked for.
-LARGEST_OFFSET = 0.6
+MAX_POSE_OFFSET_S = 0.6
 #: How much less unlike the signals must be at the offset than without it.
-UNLIKENESS_RATIO = 0.8
+MAX_MISMATCH_RATIO = 0.8
 #: Turning below this, in rad/s, or a correlation below that is no evidence.
-LEAST_TURN_RATE = 0.1
-LEAST_CORRELATION = 0.6
+MIN_TURN_RATE = 0.1
+MIN_CORRELATION = 0.6
 #: Seconds over which both are averaged against noise.
-AVERAGING_WINDOW = 0.1
+AVERAGING_WINDOW_S = 0.1
 
 
 def message_times(
     samples: Mapping[str, Samples],
     receive_only: Collection[str] = (),
-    unhurried: Collection[str] = (),
+    slow_topics: Collection[str] = (),
 ) -> tuple[dict[str, Nanoseconds], tuple[Note, ...]]:
     """Return the times of every topic's messages, all on one clock.
 
@@ -65,40 +65,42 @@ def message_times(
     ----------
     receive_only
         Topics whose stamps are not to be used.
-    unhurried
+    slow_topics
         Topics for which the time of recording is as good as a stamp.
     """
     notes: list[Note] = []
-    unset: list[str] = []
+    unset_topics: list[str] = []
     times: dict[str, Nanoseconds] = {}
     offsets: dict[str, int] = {}
-    for topic, of in samples.items():
-        if of.stamp is None or topic in receive_only or not len(of.stamp):
+    for topic, messages in samples.items():
+        if messages.stamp is None or topic in receive_only or not len(messages.stamp):
             continue
-        passed, went_on = (np.ptp(np.quantile(t, (0.1, 0.9))) for t in (of.receive, of.stamp))
-        if passed > SECOND and went_on < passed / 2:
-            unset.append(topic)
+        receive_span, stamp_span = (
+            np.ptp(np.quantile(t, (0.1, 0.9))) for t in (messages.receive, messages.stamp)
+        )
+        if receive_span > NS_PER_SECOND and stamp_span < receive_span / 2:
+            unset_topics.append(topic)
             continue
-        stamp, repaired = _repair_stamps(topic, of.stamp, of.receive)
+        stamp, repaired = _repair_stamps(topic, messages.stamp, messages.receive)
         notes.extend(repaired)
         times[topic] = stamp
-        offsets[topic] = int(np.median(stamp - of.receive))
+        offsets[topic] = int(np.median(stamp - messages.receive))
     common = int(np.median(list(offsets.values()))) if offsets else 0
     for topic, offset in offsets.items():
-        if abs(offset - common) > LEAST_CLOCK_OFFSET:
+        if abs(offset - common) > MIN_CLOCK_OFFSET_NS:
             times[topic] = times[topic] - (offset - common)
-            off = {"seconds": (offset - common) / SECOND}
+            shift = {"seconds": (offset - common) / NS_PER_SECOND}
             count = len(times[topic])
-            notes.append(Note(NoteCode.OTHER_CLOCK, topic=topic, count=count, numbers=off))
-    for topic, of in samples.items():
+            notes.append(Note(NoteCode.OTHER_CLOCK, topic=topic, count=count, numbers=shift))
+    for topic, messages in samples.items():
         if topic not in times:
             # Where all stamps count from a start-up, arrivals are moved to count from there too.
-            times[topic] = of.receive + (common if abs(common) > SECOND else 0)
-            if topic in unset:
-                notes.append(Note(NoteCode.STAMPS_UNSET, topic=topic, count=len(of.receive)))
+            times[topic] = messages.receive + (common if abs(common) > NS_PER_SECOND else 0)
+            if topic in unset_topics:
+                notes.append(Note(NoteCode.STAMPS_UNSET, topic=topic, count=len(messages.receive)))
             elif topic not in receive_only:
-                kind: Kind = "info" if topic in unhurried else "warning"
-                notes.append(Note(NoteCode.NO_HEADER, kind, topic, len(of.receive)))
+                kind: Kind = "info" if topic in slow_topics else "warning"
+                notes.append(Note(NoteCode.NO_HEADER, kind, topic, len(messages.receive)))
     return times, tuple(notes)
 
 
@@ -112,7 +114,9 @@ def _repair_stamps(
     usual = int(np.median(step))
     extra = step - arrival
     # A recorder that stalls delays arrivals while stamps go on as usual: that is no jump.
-    jumped = np.flatnonzero((np.abs(extra) > LEAST_JUMP) & (np.abs(step - usual) > LEAST_JUMP))
+    jumped = np.flatnonzero(
+        (np.abs(extra) > MIN_CLOCK_JUMP_NS) & (np.abs(step - usual) > MIN_CLOCK_JUMP_NS)
+    )
     if len(jumped) == 0:
         return stamp, []
     fixed = stamp.copy()
@@ -123,7 +127,7 @@ def _repair_stamps(
     while i < len(jumped):
         here = int(jumped[i])
         back = int(jumped[i + 1]) if i + 1 < len(jumped) else -1
-        if back - here in (1, 2, 3) and abs(int(extra[here] + extra[back])) < LEAST_JUMP:
+        if back - here in (1, 2, 3) and abs(int(extra[here] + extra[back])) < MIN_CLOCK_JUMP_NS:
             rows = np.arange(here + 1, back + 1)
             fixed[rows] = receive[rows] + (stamp[here] - receive[here])
             wrong += len(rows)
@@ -146,7 +150,7 @@ def _repair_stamps(
         longest = max(range(len(parts)), key=lambda k: parts[k][1] - parts[k][0])
         for (a, b), offset in zip(parts, level, strict=True):
             fixed[a:b] -= offset - level[longest]
-        largest = max(abs(offset - level[longest]) for offset in level) / SECOND
+        largest = max(abs(offset - level[longest]) for offset in level) / NS_PER_SECOND
         jump = {"seconds": largest}
         notes.append(Note(NoteCode.CLOCK_JUMPED, topic=topic, count=len(steps), numbers=jump))
     return fixed, notes
@@ -186,7 +190,7 @@ class Grid:
         phase = (time - self.origin) * self.rate
         on_drifting = phase * (1 - self.drift)
         tick = np.rint(on_drifting)
-        if np.quantile(np.abs(on_drifting - tick), 0.99) > ON_TICK:
+        if np.quantile(np.abs(on_drifting - tick), 0.99) > MAX_TICK_DEVIATION:
             return time
         snapped = self.origin + tick / self.rate
         return snapped if np.all(np.diff(snapped) > 0) else time
@@ -202,10 +206,10 @@ def fit_grid(time: Array, rate: float) -> Grid | None:
     if len(time) < 20:
         return None
     period = np.median(np.diff(time))
-    if period * rate < 1 - ON_TICK:  # published more often than the wanted clock ticks
+    if period * rate < 1 - MAX_TICK_DEVIATION:  # published more often than the wanted clock ticks
         rate *= max(1, round(1 / (period * rate)))
     stride = round(period * rate)
-    if stride < 1 or abs(period * rate - stride) > ON_TICK:
+    if stride < 1 or abs(period * rate - stride) > MAX_TICK_DEVIATION:
         return None
     tick = np.cumsum(np.concatenate([[0], np.rint(np.diff(time) * rate)]))
     late = time - time[0] - tick / rate
@@ -213,14 +217,14 @@ def fit_grid(time: Array, rate: float) -> Grid | None:
     middle = np.array([np.median(tick[block]) for block in blocks]) / rate
     low = np.array([np.quantile(late[block], 0.1) for block in blocks])
     drift = float(np.polyfit(middle, low, 1)[0]) if len(blocks) > 2 else 0.0
-    if abs(drift) > FASTEST_DRIFT:
+    if abs(drift) > MAX_CLOCK_DRIFT:
         return None
     if abs(drift) * (time[-1] - time[0]) < 1e-3:
         drift = 0.0
     steady = late - drift * tick / rate
     origin = float(np.quantile(steady, 0.01))
     spread = float(np.quantile(steady - origin, 0.95))
-    if spread > ON_TICK / rate:
+    if spread > MAX_TICK_DEVIATION / rate:
         return None
     return Grid(float(time[0]) + origin, rate, drift, spread)
 
@@ -243,16 +247,16 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
     """
     if "attitude" not in series or "body_rate" not in series:
         return None
-    clock = stretch(series)
-    if len(clock) < 3 * LARGEST_OFFSET * RATE:
+    clock = middle_clock(series)
+    if len(clock) < 3 * MAX_POSE_OFFSET_S * RATE_HZ:
         return None
-    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)), AVERAGING_WINDOW)
-    gyro = smooth(on_clock(series, "body_rate", clock), AVERAGING_WINDOW)
-    if rms(gyro) < LEAST_TURN_RATE:
+    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)), AVERAGING_WINDOW_S)
+    gyro = smooth(on_clock(series, "body_rate", clock), AVERAGING_WINDOW_S)
+    if rms(gyro) < MIN_TURN_RATE:
         return None
     # The best whole lag first, then a parabola through the three highest points.
-    most = round(LARGEST_OFFSET * RATE)
-    lags = np.arange(-most, most + 1)
+    max_lag = round(MAX_POSE_OFFSET_S * RATE_HZ)
+    lags = np.arange(-max_lag, max_lag + 1)
     count = len(clock)
     score = np.array(
         [  # of the attitude moved back by a lag
@@ -263,17 +267,17 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
         ]
     )
     best = int(np.argmax(score))
-    unlike = 1 - score
+    mismatch = 1 - score
     if (
-        score[best] < LEAST_CORRELATION
+        score[best] < MIN_CORRELATION
         or best in (0, len(lags) - 1)
-        or unlike[best] > UNLIKENESS_RATIO * unlike[most]
+        or mismatch[best] > MAX_MISMATCH_RATIO * mismatch[max_lag]
     ):
-        return 0.0 if score[most] > LEAST_CORRELATION else None
+        return 0.0 if score[max_lag] > MIN_CORRELATION else None
     left, peak, right = score[best - 1 : best + 2]
-    bend = left - 2 * peak + right
-    fine = 0.5 * (left - right) / bend if bend < 0 else 0.0
-    return float((lags[best] + fine) / RATE)
+    curvature = left - 2 * peak + right
+    fine = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
+    return float((lags[best] + fine) / RATE_HZ)
 
 
 def align_pose(
@@ -293,7 +297,7 @@ def align_pose(
     offset = pose_offset(series)
     if offset is None:
         return aligned, ()
-    if abs(offset) < LEAST_OFFSET:
+    if abs(offset) < MIN_POSE_OFFSET_S:
         return aligned, (Note(NoteCode.POSE_ON_TIME, "info", topic, numbers={"seconds": offset}),)
     for signal, samples in series.items():
         if topics.get(signal) == topic:

@@ -11,20 +11,20 @@ import numpy as np
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.numerics import Array
 from tuner.recordings.clocks import align_pose, message_times
-from tuner.recordings.defects import clean, stays_while_tilting, without_stale
+from tuner.recordings.defects import clean, is_position_frozen, without_stale_end
 from tuner.recordings.flight import SIGNALS, Series
 from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.frames import DOUBTS, contradiction, correct_frames
-from tuner.recordings.missions import Mission, find_missions, manoeuvres
+from tuner.recordings.missions import Mission, find_missions, split_into_manoeuvres
 from tuner.recordings.notes import Damage, Note, NoteCode
-from tuner.recordings.recording import Clock, Contents, Nanoseconds, Recording, Request, Samples
+from tuner.recordings.recording import Clock, Nanoseconds, ReadResult, Recording, Request, Samples
 from tuner.recordings.sources import (
     Place,
     choose_map,
     locate,
     pose_error,
-    unread,
-    with_guesses,
+    unread_columns,
+    with_columns_by_name,
 )
 from tuner.recordings.topics import (
     Sidecar,
@@ -36,9 +36,9 @@ from tuner.recordings.topics import (
 )
 from tuner.recordings.unit_detection import (
     ATTITUDES,
-    FEWEST_SAMPLES,
-    NAMES,
-    Stamped,
+    MIN_SAMPLES,
+    UNIT_PHRASES,
+    RawSeries,
     is_too_slow,
     quaternion_of,
     scales_of,
@@ -72,7 +72,7 @@ class ReadOptions:
 
     Attributes
     ----------
-    given
+    topic_map
         The topic map that the user or, failing that, the side-car names; None takes the shipped map
         that finds most signals.
     namespace
@@ -82,7 +82,7 @@ class ReadOptions:
     """
 
     path: Path
-    given: TopicMap | None = None
+    topic_map: TopicMap | None = None
     sidecar: Sidecar = field(default_factory=Sidecar)
     namespace: str = ""
     rate: float = 100.0
@@ -163,7 +163,7 @@ def read_signals(options: ReadOptions) -> Signals:
     RecordingError
         The file cannot be read.
     """
-    path, given, sidecar = options.path, options.given, options.sidecar
+    path, given, sidecar = options.path, options.topic_map, options.sidecar
     recording = open_recording(path, given.messages if given is not None else ())
     maps = [given] if given is not None else list(shipped_maps(recording.format))
     candidates = [topic_map.under(options.namespace) for topic_map in maps]
@@ -177,9 +177,9 @@ def read_signals(options: ReadOptions) -> Signals:
     chosen = choose_map(recording, candidates)
     taken: tuple[Note, ...] = ()
     if given is None:
-        chosen, taken = with_guesses(recording, chosen)
+        chosen, taken = with_columns_by_name(recording, chosen)
     places, passed_over = locate(recording, chosen, strict=given is not None)
-    no_pose = pose_error(recording, chosen, places, given=given is not None)
+    no_pose = pose_error(recording, chosen, places, by_user=given is not None)
     raw, contents, noticed = extract(recording, places, chosen.time)
     of_map = None if given is None else given.motor_order
     of_log = motor_order_of(recording.parameters)
@@ -188,13 +188,13 @@ def read_signals(options: ReadOptions) -> Signals:
         Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),
         *taken,
         *passed_over,
-        *unread(recording, chosen, places),
+        *unread_columns(recording, chosen, places),
         *_notes_of_places(places),
         *contents.notes,
         *noticed,
     ]
     if is_tabular(recording.format) and not any(clock.unit for clock in chosen.time):
-        raw, quicker = _with_shorter_times(raw)
+        raw, quicker = _with_times_in_us(raw)
         notes += quicker
     if order is not None and set(PER_MOTOR) & set(raw):
         columns = columns_of(order)
@@ -206,7 +206,7 @@ def read_signals(options: ReadOptions) -> Signals:
     topics = {signal: data.topic for signal, data in raw.items()}
     damage = tuple(part.later(_stamp_delay(raw, contents, epoch)) for part in contents.damage)
     notes += dropped
-    if no_pose is None and stays_while_tilting(series):
+    if no_pose is None and is_position_frozen(series):
         del series["position"]
         what = "its position never changes along x and y, though the vehicle tilts"
         no_pose = RecordingError(path, what, "record where it is")
@@ -231,7 +231,7 @@ def _notes_of_places(places: Mapping[str, Place]) -> list[Note]:
     return notes
 
 
-def _stamp_delay(raw: Mapping[str, Raw], contents: Contents, epoch: int) -> float:
+def _stamp_delay(raw: Mapping[str, RawSignal], contents: ReadResult, epoch: int) -> float:
     """Return the s from the recorder's clock to that of the stamps since some nanoseconds."""
     first = "position" if "position" in raw else min(raw, default=None)
     if first is None:
@@ -256,11 +256,11 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     if signals.no_pose is not None:
         raise signals.no_pose
     topics = signals.topics
-    series, dead = _with_live_commands(signals.series, topics)
-    series, none = _tachometers(series, topics)
+    series, dead = _without_dead_commands(signals.series, topics)
+    series, none = _without_dead_tachometers(series, topics)
     series, shifted = align_pose(series, topics)
     series, turned = correct_frames(series, topics)
-    cut, stale = without_stale(series)
+    cut, stale = without_stale_end(series)
     missions = _choose_missions(cut, sidecar)
     if stale and not missions:  # read for inspection; a fit leaves such a flight out
         missions = _choose_missions(series, sidecar)
@@ -274,20 +274,22 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     return Content(**read, missions=missions)
 
 
-def _with_shorter_times(raw: dict[str, Raw]) -> tuple[dict[str, Raw], list[Note]]:
+def _with_times_in_us(
+    raw: dict[str, RawSignal],
+) -> tuple[dict[str, RawSignal], list[Note]]:
     """Return signals with times a thousandth as long, where gravity says that they are."""
-    if not is_too_slow({name: data.stamped(0) for name, data in raw.items()}):
+    if not is_too_slow({name: data.in_seconds(0) for name, data in raw.items()}):
         return raw, []
     quick = {name: replace(data, time=data.time // 1000) for name, data in raw.items()}
     return quick, [Note(NoteCode.TIME_READ, count=len(next(iter(raw.values())).time))]
 
 
-def _clean(raw: Mapping[str, Raw]) -> tuple[dict[str, Series], int, list[Note]]:
+def _clean(raw: Mapping[str, RawSignal]) -> tuple[dict[str, Series], int, list[Note]]:
     first = [raw["position"]] if "position" in raw else list(raw.values())
     epoch = min((int(data.time.min()) for data in first), default=0)
     series, units = {}, list[Note]()
     notes: dict[tuple[object, ...], Note] = {}
-    recorded = {signal: data.stamped(epoch) for signal, data in raw.items()}
+    recorded = {signal: data.in_seconds(epoch) for signal, data in raw.items()}
     scales = scales_of(recorded)
     for signal, data in raw.items():
         seconds, measured = recorded[signal].time, recorded[signal].values
@@ -305,11 +307,11 @@ def _clean(raw: Mapping[str, Raw]) -> tuple[dict[str, Series], int, list[Note]]:
     return series, epoch, [*units, *notes.values()]
 
 
-LEAST_CHANGE = 0.05
+MIN_COMMAND_RANGE = 0.05
 """Of the commands of a flight: less may be a hover, in whole microseconds."""
 
 
-def _with_live_commands(
+def _without_dead_commands(
     series: Mapping[str, Series], topics: Mapping[str, str]
 ) -> tuple[dict[str, Series], tuple[Note, ...]]:
     """Return signals without commands that never change for one rotor while they do for others."""
@@ -319,7 +321,7 @@ def _with_live_commands(
     values = others["command"].values
     change = np.fmax.reduce(values, axis=0) - np.fmin.reduce(values, axis=0)
     dead = np.flatnonzero(change == 0.0)
-    if len(dead) == 0 or len(values) < FEWEST_SAMPLES or not (change > LEAST_CHANGE).any():
+    if len(dead) == 0 or len(values) < MIN_SAMPLES or not (change > MIN_COMMAND_RANGE).any():
         return others, ()
     del others["command"]
     rotors = tuple(str(rotor) for rotor in dead)
@@ -328,7 +330,7 @@ def _with_live_commands(
     )
 
 
-def _tachometers(
+def _without_dead_tachometers(
     series: Mapping[str, Series], topics: Mapping[str, str]
 ) -> tuple[dict[str, Series], tuple[Note, ...]]:
     """Return signals without rotor speeds that are none, and a note on rotors without tachometer.
@@ -339,7 +341,7 @@ def _tachometers(
     if speeds is None:
         return others, ()
     low, high = np.fmin.reduce(speeds.values, axis=0), np.fmax.reduce(speeds.values, axis=0)
-    still = (low == high) & (np.isfinite(speeds.values).sum(axis=0) >= FEWEST_SAMPLES)
+    still = (low == high) & (np.isfinite(speeds.values).sum(axis=0) >= MIN_SAMPLES)
     dead = still & ((high == 0.0) | (low < high).any())
     values = np.where(dead, np.nan, speeds.values)
     known = np.isfinite(values).any(axis=1)
@@ -354,7 +356,7 @@ def _tachometers(
 
 
 def _choose_missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:
-    missions = manoeuvres(series, find_missions(series))
+    missions = split_into_manoeuvres(series, find_missions(series))
     if sidecar.missions is not None:
         numbers = sidecar.missions
         missions = tuple(
@@ -371,7 +373,7 @@ def _choose_missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mi
 
 
 @dataclass(frozen=True)
-class Raw:
+class RawSignal:
     """One signal as recorded, in SI units and the axes of a `Flight`.
 
     Attributes
@@ -386,14 +388,14 @@ class Raw:
     time: Nanoseconds
     values: Array
 
-    def stamped(self, epoch: int) -> Stamped:
+    def in_seconds(self, epoch: int) -> RawSeries:
         """Return the samples with their times in s since some ns."""
-        return Stamped(np.asarray((self.time - epoch) * 1e-9, dtype=np.float64), self.values)
+        return RawSeries(np.asarray((self.time - epoch) * 1e-9, dtype=np.float64), self.values)
 
 
 def extract(
     recording: Recording, places: Mapping[str, Place], clocks: tuple[Clock, ...] = ()
-) -> tuple[dict[str, Raw], Contents, tuple[Note, ...]]:
+) -> tuple[dict[str, RawSignal], ReadResult, tuple[Note, ...]]:
     """Read every located signal.
 
     Returns
@@ -411,9 +413,9 @@ def extract(
     )
     receive_only = {p.topic for p in places.values() if p.source.stamp == "receive"}
     kinds = {t: {s for s, place in places.items() if place.topic == t} for t in wanted}
-    unhurried = {topic for topic, held in kinds.items() if held <= SLOW_SIGNALS}
-    times, notes = message_times(contents.samples, receive_only, unhurried)
-    signals: dict[str, Raw] = {}
+    slow_topics = {topic for topic, held in kinds.items() if held <= SLOW_SIGNALS}
+    times, notes = message_times(contents.samples, receive_only, slow_topics)
+    signals: dict[str, RawSignal] = {}
     inferred: list[Note] = []
     for signal in sorted(places, key=lambda name: name in ATTITUDES):  # which positions may tell
         place = places[signal]
@@ -422,23 +424,23 @@ def extract(
             continue
         time = times[place.topic]
         values = np.column_stack([samples.fields[name] for name in place.fields])
-        raw = Raw(place.topic, time, values)
-        unit = _unit(recording, signal, place, raw, signals.get("position"))
+        raw = RawSignal(place.topic, time, values)
+        unit = _recorded_unit(recording, signal, place, raw, signals.get("position"))
         if unit and unit != place.unit:
-            count, names = len(time), (signal, NAMES[unit])
+            count, names = len(time), (signal, UNIT_PHRASES[unit])
             inferred.append(Note(NoteCode.UNIT_READ, "warning", place.topic, count, names=names))
-        values = _values(samples, signal, place, to_si(values, unit or "si"))
+        values = _in_flight_axes(samples, signal, place, to_si(values, unit or "si"))
         if is_tabular(recording.format):  # a row without the signal is no sample of it
             there = np.isfinite(values).any(axis=1)
             time, values = time[there], values[there]
         if len(time):
-            signals[signal] = Raw(place.topic, time, values)
+            signals[signal] = RawSignal(place.topic, time, values)
     ordered = {signal: signals[signal] for signal in places if signal in signals}
     return ordered, contents, (*notes, *inferred)
 
 
-def _unit(
-    recording: Recording, signal: str, place: Place, recorded: Raw, position: Raw | None
+def _recorded_unit(
+    recording: Recording, signal: str, place: Place, recorded: RawSignal, position: RawSignal | None
 ) -> str:
     """Return the unit of recorded numbers: the map's, or else the one in which they make sense.
 
@@ -449,12 +451,12 @@ def _unit(
     if signal not in ATTITUDES or place.source.quaternion != "rpy":
         return unit_by_range(signal, recorded.values, place.unit)
     epoch = int(recorded.time[0])
-    where = None if position is None else position.stamped(epoch)
-    must = signal == "attitude" and position is not None  # else no flight is made of it
-    return unit_of_angles(recording.path, recorded.stamped(epoch), where, must=must)
+    where = None if position is None else position.in_seconds(epoch)
+    required = signal == "attitude" and position is not None  # else no flight is made of it
+    return unit_of_angles(recording.path, recorded.in_seconds(epoch), where, required=required)
 
 
-def _values(samples: Samples, signal: str, place: Place, values: Array) -> Array:
+def _in_flight_axes(samples: Samples, signal: str, place: Place, values: Array) -> Array:
     """Return (n, k) values in the columns and axes of a `Flight`."""
     columns, _, _ = SIGNALS[signal]
     if place.source.quaternion == "rpy" and signal in ATTITUDES:

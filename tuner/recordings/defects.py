@@ -41,25 +41,25 @@ RANGES: Mapping[str, tuple[float, float]] = {
 }
 """Signals that cannot leave a range; a value beyond it is a corrupt sample."""
 
-WRONG_UNIT_SHARE = 0.5
+MAX_BEYOND_SHARE = 0.5
 """Share of samples out of range above which a signal is in another unit rather than corrupt."""
 
-COARSE_SHARE = 0.5
+MAX_EQUAL_STAMP_SHARE = 0.5
 """Share of stamps on which samples differ, above which stamps are too coarse for a flight."""
 
-LONGEST_RECORDING = 43_200.0
+MAX_RECORDING_S = 43_200.0
 """No recording lasts longer, in s, to either side of its middle."""
 OUTLIER_THRESHOLD = 6.0
 """Multiples of how far samples stick out nearby that make an outlier."""
-LONGEST_EXCURSION = 1.0
+MAX_EXCURSION_S = 1.0
 """Seconds after which a pose that jumped away is not expected back."""
-SHORTEST_STALE = 1.0
+MIN_STALE_S = 1.0
 """s for which a signal must not have changed."""
-LEAST_MOTION = 0.05
+MIN_MOTION_M = 0.05
 """m by which the vehicle must have moved meanwhile."""
-LEAST_TURN_RATE = 0.2
+MIN_TURN_RATE = 0.2
 """rad/s of its gyro, root mean square, that show the same."""
-LEAST_TILT = 0.05
+MIN_TILT_RAD = 0.05
 """rad, root mean square, of a vehicle that must move."""
 MOTION_SIGNALS = ("attitude", "body_rate")
 """Signals that change whenever a vehicle moves."""
@@ -93,7 +93,7 @@ def clean(
     low, high = RANGES.get(signal, (-np.inf, np.inf))
     beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
     dropped = int(beyond.any(axis=1).sum())
-    if dropped > WRONG_UNIT_SHARE * int((values != 0).any(axis=1).sum()):  # 0 is 0 in each unit
+    if dropped > MAX_BEYOND_SHARE * int((values != 0).any(axis=1).sum()):  # 0 is 0 in each unit
         median = float(np.nanmedian(values))
         note(dropped, NoteCode.UNIT_UNKNOWN, "warning", lower=low, upper=high, median=median)
         beyond |= True  # what is left would be held for all of it
@@ -116,19 +116,19 @@ def clean(
     order = np.argsort(time, kind="stable")
     time, values = time[order], values[order]
     apart = (
-        np.abs(time - np.median(time)) > LONGEST_RECORDING
+        np.abs(time - np.median(time)) > MAX_RECORDING_S
         if len(time)
         else np.zeros(0, dtype=np.bool_)
     )
     note(int(apart.sum()), NoteCode.FAR_IN_TIME)
     time, values = time[~apart], values[~apart]
     time, values, doubles, unlike = _merge_equal_times(time, values)
-    if signal != "rotor_speed" and unlike > COARSE_SHARE * len(time):
+    if signal != "rotor_speed" and unlike > MAX_EQUAL_STAMP_SHARE * len(time):
         step = float(np.median(np.diff(time)))
         note(doubles, NoteCode.STAMPS_COARSE, "warning", seconds=step)
     else:
         note(doubles, NoteCode.STAMPED_TWICE)
-    note(0 if signal == "lap" else _missing(time), NoteCode.SAMPLES_MISSING)
+    note(0 if signal == "lap" else _count_missing(time), NoteCode.SAMPLES_MISSING)
 
     if signal == "attitude":
         time, values, odd = _unit_quaternions(time, values)
@@ -145,16 +145,16 @@ def _without_outliers(
     """Drop what cannot be true, and note it."""
     limits = LIMITS[signal]
     if signal in ("position", "attitude"):
-        stuck = repeated(time, values, limits)
+        stuck = is_repeated(time, values, limits)
         note(int(stuck.sum()), NoteCode.REPEATED)
-        away, lasting = excursions(time[~stuck], values[~stuck], limits)
+        away, lasting = find_excursions(time[~stuck], values[~stuck], limits)
         note(int(away.sum()), NoteCode.AWAY_AND_BACK)
         note(lasting, NoteCode.AWAY_FOR_GOOD, "warning")
         time, values = time[~stuck][~away], values[~stuck][~away]
     outlier = np.zeros(values.shape, dtype=np.bool_)
     for column in range(values.shape[1]):
         measured = np.flatnonzero(np.isfinite(values[:, column]))
-        outlier[measured, column] = outliers(time[measured], values[measured, column], limits)
+        outlier[measured, column] = is_outlier(time[measured], values[measured, column], limits)
     note(int(outlier.any(axis=1).sum()), NoteCode.OUTLIERS)
     if signal == "rotor_speed":
         values = np.where(outlier, np.nan, values)
@@ -164,7 +164,7 @@ def _without_outliers(
     return time[keep], values[keep]
 
 
-def _missing(time: Array) -> int:
+def _count_missing(time: Array) -> int:
     """Return how many samples a steady publisher lost; 0 where the rate is not steady."""
     if len(time) < 20:
         return 0
@@ -251,7 +251,7 @@ LIMITS: Mapping[str, Limits] = {
 acceleration; a rotor that turns at some 600 rad/s needs tens of ms for 30 up and back."""
 
 
-def outliers(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
+def is_outlier(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
     """Return which samples of a signal stick out on one side of all that surrounds them.
 
     A sample is compared with the medians of the three samples before and the three after it. Ramps
@@ -270,8 +270,8 @@ def outliers(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
     windows = np.lib.stride_tricks.sliding_window_view(
         np.pad(values, 3, mode="reflect", reflect_type="odd"), 7
     )
-    before = _middle(*windows[:, :3].T)
-    after = _middle(*windows[:, 4:].T)
+    before = _median_of_three(*windows[:, :3].T)
+    after = _median_of_three(*windows[:, 4:].T)
     low, high = np.minimum(before, after), np.maximum(before, after)
     excess = np.maximum(np.maximum(low - values, values - high), 0.0)
     rough = np.lib.stride_tricks.sliding_window_view(np.pad(excess, 12, mode="symmetric"), 25)
@@ -281,12 +281,12 @@ def outliers(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
     return np.asarray(excess > np.maximum(bound, OUTLIER_THRESHOLD * usual), dtype=np.bool_)
 
 
-def _middle(a: Array, b: Array, c: Array) -> Array:
+def _median_of_three(a: Array, b: Array, c: Array) -> Array:
     """Return the median of three, element by element."""
     return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))
 
 
-def repeated(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
+def is_repeated(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
     """Return which samples of (n, k) values repeat the one before although the vehicle moved on.
 
     Motion capture that loses its markers goes on sending the last pose. A vehicle at rest in a
@@ -305,13 +305,13 @@ def repeated(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
     return stuck
 
 
-def excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray[np.bool_], int]:
+def find_excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray[np.bool_], int]:
     """Return which samples of (n, k) values lie between a leap away and the leap back.
 
     Returns
     -------
     tuple
-        (n,) which samples, and how many leaps did not come back within `LONGEST_EXCURSION`.
+        (n,) which samples, and how many leaps did not come back within `MAX_EXCURSION_S`.
     """
     away = np.zeros(len(values), dtype=np.bool_)
     if len(values) < 12:
@@ -333,7 +333,7 @@ def excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray[np.b
             (
                 j
                 for j in range(i + 1, min(len(at), i + 40))
-                if time[at[j]] - time[at[i]] < LONGEST_EXCURSION
+                if time[at[j]] - time[at[i]] < MAX_EXCURSION_S
                 and np.linalg.norm(leap[at[i]] + leap[at[j]]) < 0.3 * size[at[i]] + limits.floor
             ),
             None,
@@ -347,7 +347,7 @@ def excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray[np.b
     return away, lasting
 
 
-def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list[Note]]:
+def without_stale_end(series: Mapping[str, Series]) -> tuple[dict[str, Series], list[Note]]:
     """Return the signals without what repeats itself at their end while the vehicle moves."""
     kept, notes = dict(series), []
     for name in MOTION_SIGNALS:
@@ -356,7 +356,7 @@ def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list
         time, values = series[name].time, series[name].values
         changes = np.flatnonzero((values[1:] != values[:-1]).any(axis=1))
         last = int(changes[-1]) + 1 if len(changes) else 0
-        if time[-1] - time[last] < SHORTEST_STALE or not _is_moving(series, name, time[last]):
+        if time[-1] - time[last] < MIN_STALE_S or not _is_moving(series, name, time[last]):
             continue
         if last:
             kept[name] = Series(time[: last + 1], values[: last + 1])
@@ -371,7 +371,7 @@ def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list
     return kept, notes
 
 
-def stays_while_tilting(series: Mapping[str, Series]) -> bool:
+def is_position_frozen(series: Mapping[str, Series]) -> bool:
     """Return whether a position that was recorded was never measured: a vehicle that tilts moves.
 
     An estimator without any position repeats its first for good.
@@ -379,26 +379,26 @@ def stays_while_tilting(series: Mapping[str, Series]) -> bool:
     if not {"position", "attitude"} <= set(series):
         return False
     still = np.ptp(series["position"].values[:, :2], axis=0).max() == 0.0
-    return bool(still and rms(upward(series["attitude"].values)[:, :2]) > LEAST_TILT)
+    return bool(still and rms(upward(series["attitude"].values)[:, :2]) > MIN_TILT_RAD)
 
 
 def _is_moving(series: Mapping[str, Series], stuck: str, since: float) -> bool:
     """Return whether the vehicle is seen to move, by its position or, if not stuck, its gyro."""
-    places = _known(series["position"], since)
-    if len(places) and np.ptp(places, axis=0).max() >= LEAST_MOTION:
+    places = _complete_rows(series["position"], since)
+    if len(places) and np.ptp(places, axis=0).max() >= MIN_MOTION_M:
         return True
     if stuck == "body_rate" or "body_rate" not in series:
         return False
-    rates = _known(series["body_rate"], since)
-    return len(rates) > 0 and bool(np.sqrt(np.mean(rates**2)) >= LEAST_TURN_RATE)
+    rates = _complete_rows(series["body_rate"], since)
+    return len(rates) > 0 and bool(np.sqrt(np.mean(rates**2)) >= MIN_TURN_RATE)
 
 
-def _known(samples: Series, since: float) -> Array:
+def _complete_rows(samples: Series, since: float) -> Array:
     """Return the samples (n, k) after a time all of whose columns are known."""
     return samples.values[(samples.time >= since) & np.isfinite(samples.values).all(axis=1)]
 
 
-def is_stale(series: Mapping[str, Series], notes: Sequence[Note]) -> bool:
+def has_stale_attitude(series: Mapping[str, Series], notes: Sequence[Note]) -> bool:
     """Return whether a recorded attitude repeats itself at its end while the vehicle moves."""
     last = series["attitude"].values[-2:]
     noted = any(n.code is NoteCode.STALE and "attitude" in n.names for n in notes)

@@ -17,12 +17,12 @@ from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
 from tuner.recordings.recording import Recording
 
-NO_TEXTS = (".bag", ".db3", ".mcap", ".ulg")
+BINARY_SUFFIXES = (".bag", ".db3", ".mcap", ".ulg")
 """Suffixes of recordings that no text has."""
 
 
 @dataclass(frozen=True)
-class Head:
+class FileStart:
     """What a recording shows before it is opened.
 
     Attributes
@@ -56,24 +56,24 @@ class Reader:
 
     format: str
     files: str
-    matches: Callable[[Head], bool]
+    matches: Callable[[FileStart], bool]
     open: Callable[[Path, tuple[Path, ...]], Recording]
     tabular: bool = False
 
 
-def _is_ros(head: Head) -> bool:
+def _is_ros(head: FileStart) -> bool:
     empty_bag = head.path.suffix == ".bag" and not head.start
     magic = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3")
     return head.path.is_dir() or head.start.startswith(magic) or empty_bag
 
 
-def _is_table(head: Head) -> bool:
+def _is_table(head: FileStart) -> bool:
     """Return whether a file is Parquet, or a text with cells that is not called a bag or a log."""
-    text = head.path.suffix.lower() not in NO_TEXTS and is_table(head.start)
+    text = head.path.suffix.lower() not in BINARY_SUFFIXES and is_table(head.start)
     return head.start.startswith(b"PAR1") or text
 
 
-def _in(module: str, name: str) -> Callable[[Path, tuple[Path, ...]], Recording]:
+def _lazy_reader(module: str, name: str) -> Callable[[Path, tuple[Path, ...]], Recording]:
     """Return what opens a recording with a reader of a module that is then imported."""
 
     def opened(path: Path, messages: tuple[Path, ...]) -> Recording:
@@ -89,28 +89,28 @@ READERS: tuple[Reader, ...] = (
         "ros",
         "ROS 1 .bag, ROS 2 folders, .db3 and .mcap",
         _is_ros,
-        _in("ros.recording", "RosRecording"),
+        _lazy_reader("ros.recording", "RosRecording"),
     ),
     Reader(
         "ulog",
         "PX4 .ulg",
         lambda head: head.start.startswith(b"ULog"),
-        _in("ulog", "ULogRecording"),
+        _lazy_reader("ulog", "ULogRecording"),
     ),
     Reader(
         "micro_sd",
         "Crazyflie micro-SD logs",  # a byte 0xBC alone is that of any text
         lambda head: head.start.startswith((b"\xbc\x01\x00", b"\xbc\x02\x00")),
-        _in("micro_sd", "MicroSdRecording"),
+        _lazy_reader("micro_sd", "MicroSdRecording"),
     ),
     Reader(
         "table",
         "MATLAB .mat",
         lambda head: head.start.startswith((b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")),
-        _in("matlab", "MatlabTable"),
+        _lazy_reader("matlab", "MatlabTable"),
         tabular=True,
     ),
-    Reader("table", ".csv and .parquet", _is_table, _in("table", "Table"), tabular=True),
+    Reader("table", ".csv and .parquet", _is_table, _lazy_reader("table", "Table"), tabular=True),
 )
 """The first that matches reads a recording."""
 
@@ -140,7 +140,7 @@ def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
         if not path.is_dir():
             with path.open("rb") as stream:
                 start = stream.read(4096)
-        head = Head(path, start)
+        head = FileStart(path, start)
         for reader in READERS:
             if reader.matches(head):
                 return reader.open(path, messages)
@@ -148,23 +148,23 @@ def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
         raise RecordingError(path, "is packed", "unpack it first")
     known = "; ".join(reader.files for reader in READERS)
     what = "is of no known format" if start else "is empty"
-    if path.suffix.lower() in NO_TEXTS and is_table(start):
+    if path.suffix.lower() in BINARY_SUFFIXES and is_table(start):
         what = f"is a text, and no {path.suffix}"
     raise RecordingError(path, what, f"known formats are {known}")
 
 
 #: A longer line, in bytes, is no row of a table.
-LONGEST_LINE = 1 << 20
-MOST_LINES = 1000
+MAX_LINE_BYTES = 1 << 20
+MAX_PREAMBLE_LINES = 1000
 #: Marks at the beginning of a text, and the encodings that they stand for.
-MARKS = {
+BOMS = {
     b"\xef\xbb\xbf": "utf-8-sig",
     b"\xff\xfe": "utf-16",
     b"\xfe\xff": "utf-16",
 }
-COMMENTS = ("#", "%", "//")
+COMMENT_MARKS = ("#", "%", "//")
 #: Bytes and lines within which a table's rows have begun.
-HEAD = 4 * LONGEST_LINE
+MAX_PREAMBLE_BYTES = 4 * MAX_LINE_BYTES
 _NUMBER = re.compile(r"^[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?$|^[+-]?(nan|inf(inity)?)$", re.I)
 _UNIT = re.compile(r"^[\[(]?[a-zA-Zµ°%0-9/^*.·\-²³ ]{0,12}[\])]?$")
 
@@ -195,7 +195,7 @@ class Layout:
 
 def encoding_of(start: bytes) -> str:
     """Return the codec of a text by how it begins: latin-1, which reads all, without a mark."""
-    return next((codec for mark, codec in MARKS.items() if start.startswith(mark)), "latin-1")
+    return next((codec for mark, codec in BOMS.items() if start.startswith(mark)), "latin-1")
 
 
 def text_of(start: bytes) -> str:
@@ -212,7 +212,7 @@ def is_table(start: bytes) -> bool:
         return False
     if not wide and not all(byte >= 32 or byte in b"\r\n\t" for byte in start):
         return False
-    lines = text.splitlines()[:MOST_LINES]
+    lines = text.splitlines()[:MAX_PREAMBLE_LINES]
     first = next((i for i, line in enumerate(lines) if not _is_comment(line)), 0)
     line = lines[first] if lines else ""
     behind = lines[first + 1] if first + 1 < len(lines) else line
@@ -229,9 +229,9 @@ def layout_of(path: Path) -> Layout:
         It has no line of column names.
     """
     with path.open("rb") as stream:
-        head = stream.read(HEAD)
+        head = stream.read(MAX_PREAMBLE_BYTES)
     encoding = encoding_of(head)
-    lines = text_of(head).splitlines()[:MOST_LINES]
+    lines = text_of(head).splitlines()[:MAX_PREAMBLE_LINES]
     place = next((i for i, line in enumerate(lines) if not _is_comment(line)), len(lines) - 1)
     separator = _separator(lines[place] if lines else "")
     names = place
@@ -257,12 +257,12 @@ def layout_of(path: Path) -> Layout:
     columns += [""] * (width == len(columns) + 1)  # every row ends with a separator
     rows = [row for row in lines[place : place + 20] if row]
     comma = separator != "," and any(re.search(r"\d,\d", row) for row in rows)
-    return Layout(encoding, separator, comma, _each_once(columns), units, place)
+    return Layout(encoding, separator, comma, _unique_names(columns), units, place)
 
 
 def _is_comment(line: str) -> bool:
     text = line.strip().lstrip("\ufeff")
-    return not text or (text.startswith(COMMENTS) and not text.startswith("%time"))
+    return not text or (text.startswith(COMMENT_MARKS) and not text.startswith("%time"))
 
 
 def _separator(line: str) -> str:
@@ -298,7 +298,7 @@ def _is_units(line: str, separator: str, count: int) -> bool:
     return any(cells) and all(_UNIT.match(cell) for cell in cells)
 
 
-def _each_once(columns: Sequence[str]) -> tuple[str, ...]:
+def _unique_names(columns: Sequence[str]) -> tuple[str, ...]:
     """Return names that differ: the empty ones by their place, repeated ones with a number."""
     seen: dict[str, int] = {}
     names = []

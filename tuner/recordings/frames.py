@@ -22,20 +22,20 @@ from tuner.recordings.interpolation import (
     body_rate_of,
     correlation,
     derivative,
+    middle_clock,
     on_clock,
     rms,
     rotate,
     smooth,
-    stretch,
     upward,
 )
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.unit_detection import (
     ATTITUDE_READINGS,
+    RawSeries,
     Reading,
-    Stamped,
-    pull_and_tilt,
+    force_and_tilt,
     to_enu_flu,
 )
 
@@ -47,15 +47,15 @@ DOUBTS = (
     NoteCode.AXES_TURNED,
 )
 """Notes of what fits no reading."""
-LEAST_ACCELERATION = 0.3
-LEAST_TURN_RATE = 0.1
-LEAST_SPEED = 0.2
+MIN_ACCELERATION = 0.3
+MIN_TURN_RATE = 0.1
+MIN_SPEED = 0.2
 """Motion below these, in m/s^2, rad/s and m/s, contradicts nothing."""
-OFF_CENTRE = 0.1
+MAX_MARKER_OFFSET_M = 0.1
 """m by which markers may sit off the centre of mass: what accelerates them as the vehicle turns
 does not tilt it."""
-GOOD_AGREEMENT = 0.6
-LEAST_GAIN = 0.3
+MIN_AGREEMENT = 0.6
+MIN_SCORE_GAIN = 0.3
 """Agreement that is believed without a look at alternatives, and how much better one must be."""
 READING_PENALTY = 0.05
 """What a further misreading must bring to be preferred."""
@@ -71,15 +71,15 @@ _RATES = (
     Reading("in degrees per second", lambda w: w * _DEGREES),
     Reading("in FRD axes and degrees", lambda w: to_enu_flu(w, "body_rate") * _DEGREES),
 )
-OPPOSED = -0.5
+OPPOSED_CORRELATION = -0.5
 """Correlation below which two signals that should be alike are opposites."""
-UNRELATED = 0.2
+UNRELATED_CORRELATION = 0.2
 """Correlation, of either sign, of signals that have nothing to do with each other."""
-LARGEST_RATIO = 3.0
+MAX_SIZE_RATIO = 3.0
 """Times that one of two unrelated signals may be larger: more of it would be noise."""
-LEAST_AUTOCORRELATION = 0.5
+MIN_AUTOCORRELATION = 0.5
 """Correlation of an acceleration with that a bin later, which noise of a position has not."""
-SHORTEST_MISSION = 5.0
+MIN_MISSION_S = 5.0
 """s that a mission has to last for any of it to be certain."""
 CLEAR_ACCELERATION, CLEAR_TURN_RATE, CLEAR_SPEED = 1.0, 0.3, 0.3
 """m/s^2, rad/s and m/s, root mean square, that are plenty."""
@@ -99,7 +99,7 @@ def correct_frames(
     notes: list[Note] = []
     if not {"position", "attitude"} <= set(series):
         return fixed, ()
-    clock = stretch(series)
+    clock = middle_clock(series)
     if len(clock) < 200:
         return fixed, ()
 
@@ -120,8 +120,8 @@ def correct_frames(
         apply("body_rate", *_judge_rate(fixed, clock))
     if "velocity" in fixed:
         apply("velocity", *_judge_velocity(fixed, clock))
-    for signal, of in _CHANGES.items():
-        if signal in fixed and not any(note.code in _DOUBTED[signal] for note in notes):
+    for signal, of in _AXIS_CHECKS.items():
+        if signal in fixed and not any(note.code in _GENERAL_DOUBTS[signal] for note in notes):
             notes += [replace(n, topic=topics.get(signal, signal)) for n in of(fixed, clock)]
     if {"rate_setpoint", "body_rate"} <= set(fixed):
         apply("rate_setpoint", _judge_setpoint(fixed, clock), None)
@@ -130,21 +130,23 @@ def correct_frames(
 
 def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     q = on_clock(series, "attitude", clock)
-    pull = _pull(series, clock)
+    pull = _specific_force(series, clock)
     push = pull - np.array([0.0, 0.0, GRAVITY])
     gyro = on_clock(series, "body_rate", clock) if "body_rate" in series else None
     force = on_clock(series, "acceleration", clock) if "acceleration" in series else None
     turns = [smooth(rate) for rate in (body_rate_of(q), gyro) if rate is not None]
-    of_markers = OFF_CENTRE * min(np.nan_to_num(rate**2).sum(axis=1).mean() for rate in turns)
+    of_markers = MAX_MARKER_OFFSET_M * min(
+        np.nan_to_num(rate**2).sum(axis=1).mean() for rate in turns
+    )
 
     def agreement(reading: Callable[[Array], Array]) -> tuple[float, float]:
         """Return how well a reading fits the motion, and how far thrust carries the vehicle."""
         turned = reading(q)
         up = upward(turned)
         scores = []
-        if rms(push[:, :2]) > LEAST_ACCELERATION + of_markers:
+        if rms(push[:, :2]) > MIN_ACCELERATION + of_markers:
             scores.append(correlation(smooth(up[:, :2], 0.2), push[:, :2]))
-        if gyro is not None and rms(gyro) > LEAST_TURN_RATE:
+        if gyro is not None and rms(gyro) > MIN_TURN_RATE:
             # The gyro's own axes may be wrong too, though two errors are less likely than one.
             turning = smooth(body_rate_of(turned))
             in_flu = correlation(turning, smooth(gyro))
@@ -158,15 +160,15 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
         return min(scores, default=1.0), float(known.mean()) if len(known) else 1.0
 
     fit, upright = agreement(lambda values: values)
-    if fit > GOOD_AGREEMENT and upright > 0.5:
+    if fit > MIN_AGREEMENT and upright > 0.5:
         return None, None
     worth = [
         _score(*agreement(r.read)) - READING_PENALTY * i for i, r in enumerate(ATTITUDE_READINGS)
     ]
     best = ATTITUDE_READINGS[int(np.argmax(worth))]
     best_fit, best_upright = agreement(best.read)
-    better = _score(best_fit, best_upright) > _score(fit, upright) + LEAST_GAIN
-    if better and best_fit > GOOD_AGREEMENT and best_upright > 0.5:
+    better = _score(best_fit, best_upright) > _score(fit, upright) + MIN_SCORE_GAIN
+    if better and best_fit > MIN_AGREEMENT and best_upright > 0.5:
         return best, None
     if fit < 0.2 or upright < 0.5:
         numbers = {"agreement": fit, "upright": upright}
@@ -198,35 +200,35 @@ def _residual_share(motion: Array, recorded: Array) -> float:
 
 def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
     turning, gyro = _body_rates(series, clock)
-    if min(rms(turning), rms(gyro)) < LEAST_TURN_RATE:
+    if min(rms(turning), rms(gyro)) < MIN_TURN_RATE:
         return None, None
     here = _residual_share(turning, gyro)
     best = min(_RATES, key=lambda r: _residual_share(turning, r.read(gyro)))
     there = _residual_share(turning, best.read(gyro))
     alike = correlation(turning, best.read(gyro))
     slope = alike * rms(best.read(gyro)) / rms(turning)  # whatever the gyro's noise
-    of_another_unit = there < here / 20 and alike > GOOD_AGREEMENT and slope < LARGEST_RATIO
+    of_another_unit = there < here / 20 and alike > MIN_AGREEMENT and slope < MAX_SIZE_RATIO
     if (there < 0.7 and there < here / 2) or of_another_unit:
         return best, None
     doubt = Note(NoteCode.BODY_RATE_DOUBTED, numbers={"left": here})
     return None, doubt if here > 0.9 else None
 
 
-LEAST_TIMES = {"body_rate": 0.93, "velocity": 0.8, "acceleration": 0.7}
+MIN_SIZE_RATIO = {"body_rate": 0.93, "velocity": 0.8, "acceleration": 0.7}
 """How many times what the pose says a measured signal is at least, or its inverse at most: a gyro's
 scale is known to a few percent, what estimates speed smooths it, a second derivative is noise."""
-LARGELY_ALIKE, CLEARLY_ALIKE = 0.7, 0.97
+MIN_SIGN_CORRELATION, MIN_SIZE_CORRELATION = 0.7, 0.97
 """Correlation from which on the sign, or the ratio of sizes, of two signals is no noise."""
-LEAST_TURN, LEAST_SECOND = 0.1, 0.05
+MIN_AXES_ANGLE_RAD, MIN_SINGULAR_VALUE_RATIO = 0.1, 0.05
 """rad by which axes may be turned against others, as a marker body was defined; and the least size
 of the second largest motion beside the largest, without which that is not seen."""
 
 
 def _rate_doubts(series: Mapping[str, Series], clock: Array) -> Iterator[Note]:
     turning, gyro = _body_rates(series, clock)
-    doubts = list(_axis_doubts(turning, gyro, ("body_rate", "attitude"), LEAST_TURN_RATE))
+    doubts = list(_axis_doubts(turning, gyro, ("body_rate", "attitude"), MIN_TURN_RATE))
     angle = _angle_between(turning, gyro)
-    if all(note.numbers["times"] > 0 for note in doubts) and angle > LEAST_TURN:
+    if all(note.numbers["times"] > 0 for note in doubts) and angle > MIN_AXES_ANGLE_RAD:
         numbers = {"degrees": float(np.degrees(angle))}
         doubts = [Note(NoteCode.AXES_TURNED, "warning", numbers=numbers)]
     yield from doubts
@@ -237,24 +239,24 @@ def _force_doubts(series: Mapping[str, Series], clock: Array) -> Iterator[Note]:
 
     Those of a height that is upside down, and of an accelerometer of its own axes.
     """
-    q, pull = on_clock(series, "attitude", clock), _pull(series, clock)
+    q, pull = on_clock(series, "attitude", clock), _specific_force(series, clock)
     force = on_clock(series, "acceleration", clock)
     names = ("acceleration", "position")
-    doubts = tuple(_axis_doubts(pull, _as_smooth(rotate(q, force)), names, LEAST_ACCELERATION))
+    doubts = tuple(_axis_doubts(pull, _smooth_thrice(rotate(q, force)), names, MIN_ACCELERATION))
     if not doubts:
         own = rotate(q * np.array([1.0, -1.0, -1.0, -1.0]), pull)
-        doubts = tuple(_axis_doubts(own, _as_smooth(force), names, LEAST_ACCELERATION))
+        doubts = tuple(_axis_doubts(own, _smooth_thrice(force), names, MIN_ACCELERATION))
     yield from doubts
 
 
-def _pull(series: Mapping[str, Series], clock: Array) -> Array:
+def _specific_force(series: Mapping[str, Series], clock: Array) -> Array:
     """Return the motion's specific force in world axes, (n, 3) m/s^2."""
     position = smooth(on_clock(series, "position", clock), 0.2)
     push = smooth(derivative(smooth(derivative(position), 0.2)), 0.2)
     return np.asarray(push + np.array([0.0, 0.0, GRAVITY]))
 
 
-def _as_smooth(force: Array) -> Array:
+def _smooth_thrice(force: Array) -> Array:
     return smooth(smooth(smooth(force, 0.2), 0.2), 0.2)
 
 
@@ -271,14 +273,14 @@ def _axis_doubts(
         The signal, and whose change it is.
     """
     known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
-    least = LEAST_TIMES[names[0]]
+    least = MIN_SIZE_RATIO[names[0]]
     for axis, name in enumerate("xyz"):
         a, b = (values[known, axis : axis + 1] for values in (motion, recorded))
         if not known.any() or min(rms(a), rms(b)) < least_motion:
             continue
         alike, times = correlation(a, b), rms(b) / rms(a)
-        of_another_size = alike > CLEARLY_ALIKE and not least < times < 1.0 / least
-        if alike < -LARGELY_ALIKE or of_another_size:
+        of_another_size = alike > MIN_SIZE_CORRELATION and not least < times < 1.0 / least
+        if alike < -MIN_SIGN_CORRELATION or of_another_size:
             numbers = {"times": float(np.copysign(times, alike))}
             signal, other = names
             yield Note(
@@ -296,7 +298,7 @@ def _angle_between(motion: Array, recorded: Array) -> float:
     if len(a) < 2 or min(rms(a), rms(b)) < CLEAR_TURN_RATE:
         return 0.0
     left, sizes, right = np.linalg.svd(b.T @ a)
-    if sizes[1] < LEAST_SECOND * sizes[0]:
+    if sizes[1] < MIN_SINGULAR_VALUE_RATIO * sizes[0]:
         return 0.0
     turned = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
     before, behind = _residual_share(a, b), _residual_share(a, b @ turned)
@@ -305,15 +307,15 @@ def _angle_between(motion: Array, recorded: Array) -> float:
     return float(np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0)))
 
 
-_CHANGES: Mapping[str, Callable[[Mapping[str, Series], Array], Iterable[Note]]] = {
+_AXIS_CHECKS: Mapping[str, Callable[[Mapping[str, Series], Array], Iterable[Note]]] = {
     "body_rate": _rate_doubts,
     "velocity": lambda s, clock: _axis_doubts(
-        *_velocities(s, clock), ("velocity", "position"), LEAST_SPEED
+        *_velocities(s, clock), ("velocity", "position"), MIN_SPEED
     ),
     "acceleration": _force_doubts,
 }
 """Signal that is a change of the pose -> what is doubted of it along single axes."""
-_DOUBTED = {
+_GENERAL_DOUBTS = {
     "body_rate": (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED),
     "velocity": (NoteCode.VELOCITY_DOUBTED, NoteCode.UNIT_DOUBTED),
     "acceleration": (NoteCode.ATTITUDE_DOUBTED, NoteCode.UNIT_DOUBTED),
@@ -325,16 +327,16 @@ def _judge_setpoint(series: Mapping[str, Series], clock: Array) -> Reading | Non
     """Return how else to read rate set-points, which a vehicle's body rate follows."""
     rate = smooth(on_clock(series, "body_rate", clock))
     wanted = smooth(on_clock(series, "rate_setpoint", clock))
-    if min(rms(rate), rms(wanted)) < LEAST_TURN_RATE:
+    if min(rms(rate), rms(wanted)) < MIN_TURN_RATE:
         return None
     best = min(_RATES, key=lambda r: _residual_share(rate, r.read(wanted)))
     there, here = _residual_share(rate, best.read(wanted)), _residual_share(rate, wanted)
-    return best if there < GOOD_AGREEMENT and there < here / 3 else None
+    return best if there < MIN_AGREEMENT and there < here / 3 else None
 
 
 def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
     moving, velocity = _velocities(series, clock)
-    if min(rms(moving), rms(velocity)) < LEAST_SPEED:
+    if min(rms(moving), rms(velocity)) < MIN_SPEED:
         return None, None
     measured = series["velocity"]
     at_samples = on_clock(series, "attitude", measured.time)
@@ -348,7 +350,7 @@ def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
     }
     best = min(readings, key=lambda r: _residual_share(moving, readings[r]))
     there, here = _residual_share(moving, readings[best]), _residual_share(moving, velocity)
-    if there < GOOD_AGREEMENT and there < here / 2:
+    if there < MIN_AGREEMENT and there < here / 2:
         return best, None
     fit = correlation(moving, velocity)
     doubt = Note(NoteCode.VELOCITY_DOUBTED, numbers={"agreement": fit})
@@ -364,11 +366,11 @@ def contradiction(series: Mapping[str, Series], missions: Sequence[Mission]) -> 
         Signal -> its samples, in the frames that `frames` finds best.
     """
     longest = max(missions, key=lambda m: m.end - m.start, default=None)
-    if longest is None or longest.end - longest.start < SHORTEST_MISSION:
+    if longest is None or longest.end - longest.start < MIN_MISSION_S:
         return None
     flown = {name: samples.between(longest.start, longest.end) for name, samples in series.items()}
     flown = {name: samples for name, samples in flown.items() if len(samples.time) > 1}
-    for pair, opposed in _PAIRS.items():
+    for pair, opposed in _CONTRADICTION_CHECKS.items():
         if set(pair) <= set(flown) and {"position", "attitude"} <= set(flown):
             agreement = opposed(flown)
             if agreement is not None:
@@ -376,36 +378,42 @@ def contradiction(series: Mapping[str, Series], missions: Sequence[Mission]) -> 
     return None
 
 
-def noted_contradiction(notes: Sequence[Note]) -> Note | None:
+def contradiction_in(notes: Sequence[Note]) -> Note | None:
     """Return the contradiction that was noted when a recording was read."""
     return next((note for note in notes if note.code is NoteCode.CONTRADICTED), None)
 
 
-def _opposition(derived: Array, recorded: Array, plenty: float) -> float | None:
+def _opposition(derived: Array, recorded: Array, min_rms: float) -> float | None:
     """Return how alike two signals are, if they are opposites and larger than what is plenty."""
     agreement = correlation(derived, recorded)
-    return agreement if agreement < OPPOSED and min(rms(derived), rms(recorded)) > plenty else None
+    return (
+        agreement
+        if agreement < OPPOSED_CORRELATION and min(rms(derived), rms(recorded)) > min_rms
+        else None
+    )
 
 
 def _tilt_contradiction(series: Mapping[str, Series]) -> float | None:
     """Return how alike tilt and acceleration are, if one does not follow from the other."""
     position, attitude = (
-        Stamped(series[name].time, series[name].values) for name in ("position", "attitude")
+        RawSeries(series[name].time, series[name].values) for name in ("position", "attitude")
     )
-    pull, tilt = pull_and_tilt(position, attitude)
-    agreement, pushed, leant = correlation(pull, tilt), rms(pull), GRAVITY * rms(tilt)
-    if pushed < CLEAR_ACCELERATION or leant < CLEAR_ACCELERATION:
+    force, tilt = force_and_tilt(position, attitude)
+    agreement, force_rms, weight_rms = correlation(force, tilt), rms(force), GRAVITY * rms(tilt)
+    if force_rms < CLEAR_ACCELERATION or weight_rms < CLEAR_ACCELERATION:
         return None
-    if agreement < OPPOSED:
+    if agreement < OPPOSED_CORRELATION:
         return agreement
-    alike_in_size = 1 / LARGEST_RATIO < pushed / leant < LARGEST_RATIO
-    moves = correlation(pull[1:], pull[:-1]) > LEAST_AUTOCORRELATION
-    return agreement if abs(agreement) < UNRELATED and alike_in_size and moves else None
+    alike_in_size = 1 / MAX_SIZE_RATIO < force_rms / weight_rms < MAX_SIZE_RATIO
+    moves = correlation(force[1:], force[:-1]) > MIN_AUTOCORRELATION
+    return agreement if abs(agreement) < UNRELATED_CORRELATION and alike_in_size and moves else None
 
 
-_PAIRS: Mapping[tuple[str, str], Callable[[Mapping[str, Series]], float | None]] = {
-    ("attitude", "body_rate"): lambda s: _opposition(*_body_rates(s, stretch(s)), CLEAR_TURN_RATE),
-    ("position", "velocity"): lambda s: _opposition(*_velocities(s, stretch(s)), CLEAR_SPEED),
+_CONTRADICTION_CHECKS: Mapping[tuple[str, str], Callable[[Mapping[str, Series]], float | None]] = {
+    ("attitude", "body_rate"): lambda s: _opposition(
+        *_body_rates(s, middle_clock(s)), CLEAR_TURN_RATE
+    ),
+    ("position", "velocity"): lambda s: _opposition(*_velocities(s, middle_clock(s)), CLEAR_SPEED),
     ("attitude", "position"): _tilt_contradiction,
 }
 """Signals that deny each other -> how alike they are, None unless that is certain."""

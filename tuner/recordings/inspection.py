@@ -19,7 +19,7 @@ from rich.text import Text
 
 from tuner.core.disk import exists
 from tuner.core.errors import InputError, RecordingError
-from tuner.recordings.cache import cached, digest, recalled
+from tuner.recordings.cache import cache_file, digest, load_or_compute
 from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class MissionReport:
 
 
 @dataclass(frozen=True)
-class Inlet:
+class InletReport:
     """Whether a recording can be fed into the simulated loop at one place.
 
     Attributes
@@ -134,7 +134,7 @@ class Inlet:
 
 
 @dataclass(frozen=True)
-class Informed:
+class CoefficientReport:
     """Whether a recording could inform a coefficient: ``yes``, ``weakly`` or ``no``, and why."""
 
     coefficient: str
@@ -175,8 +175,8 @@ class Inspection:
     topics: tuple[TopicReport, ...]
     signals: tuple[SignalReport, ...] = ()
     missions: tuple[MissionReport, ...] = ()
-    inlets: tuple[Inlet, ...] = ()
-    coefficients: tuple[Informed, ...] = ()
+    inlets: tuple[InletReport, ...] = ()
+    coefficients: tuple[CoefficientReport, ...] = ()
     clock: Mapping[str, float] = field(default_factory=dict)
     battery: tuple[float, float] | None = None
     notes: tuple[Note, ...] = ()
@@ -218,14 +218,14 @@ def _inspect(
         raise RecordingError(path, "no such file", "check the path")
 
     def found() -> Inspection:
-        from tuner.recordings.inspector import examine  # noqa: PLC0415 (numpy and the readers)
+        from tuner.recordings.inspector import inspect_recording  # noqa: PLC0415 (numpy and the readers)
 
-        return examine(path, topics, namespace, keep=cache)
+        return inspect_recording(path, topics, namespace, keep=cache)
 
     beside = path / "flight.yaml" if path.is_dir() else path.with_suffix(".yaml")
     if not cache or topics is not None or beside.is_file():
         return found()
-    before = recalled(Inspection, cached("inspection", digest(path), namespace), found)
+    before = load_or_compute(Inspection, cache_file("inspection", digest(path), namespace), found)
     return dataclasses.replace(before, path=str(path))
 
 

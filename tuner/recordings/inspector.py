@@ -28,47 +28,47 @@ from tuner.recordings.content import (
     read_content,
     read_signals,
 )
-from tuner.recordings.defects import is_stale
+from tuner.recordings.defects import has_stale_attitude
 from tuner.recordings.flight import SIGNALS, Series
 from tuner.recordings.formats import is_tabular, open_recording
-from tuner.recordings.frames import noted_contradiction
+from tuner.recordings.frames import contradiction_in
 from tuner.recordings.inspection import (
-    Informed,
-    Inlet,
+    CoefficientReport,
+    InletReport,
     Inspection,
     MissionReport,
     SignalReport,
     TopicReport,
 )
-from tuner.recordings.interpolation import RATE, derivative, resample, smooth, upward
-from tuner.recordings.loader import flights_of, flying, is_inertial, obstacle
+from tuner.recordings.interpolation import RATE_HZ, derivative, resample, smooth, upward
+from tuner.recordings.loader import flights_of, flying_stretches, inertial_error, is_inertial
 from tuner.recordings.missions import yaw_spin
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.recording import Samples, Topic
-from tuner.recordings.sources import choose_map, locate, recognised
+from tuner.recordings.sources import choose_map, locate, sources_by_name
 from tuner.recordings.topics import Sidecar, Source, TopicMap, shipped_maps
 from tuner.vehicle import COEFFICIENTS
 
-NO_DATE = 631_152_000_000_000_000
+EARLIEST_DATE_NS = 631_152_000_000_000_000
 """Stamps before 1990 count from a start-up, not from 1970."""
-LONGEST = 3600.0
+MAX_INSPECTED_S = 3600.0
 """Seconds of a mission over which speeds are sought."""
-ROLL_PITCH_RATE = 0.2
-YAW_RATE = 0.4
-SPEED = 1.5
-VERTICAL_SPEED = 3.0
-COMMAND_SPREAD = 0.03
+CLEAR_ROLL_PITCH_RATE = 0.2
+CLEAR_YAW_RATE = 0.4
+CLEAR_SPEED = 1.5
+CLEAR_VERTICAL_SPEED = 3.0
+CLEAR_COMMAND_SPREAD = 0.03
 """Below these a motion shows little of a coefficient, and below a third of them nothing."""
-LEAST_RATE = 80.0
+MIN_LAG_RATE_HZ = 80.0
 """Hz that a signal needs to show how fast a rotor follows."""
 _POSE = ("position", "attitude")
 _WRENCH = ("commanded_thrust", "commanded_torque")
 """What a vehicle file's arms and curve turn into motor commands where none were recorded."""
-_DRIVES = ("rotor_speed", "command", "thrust_setpoint")
+_ROTOR_INPUTS = ("rotor_speed", "command", "thrust_setpoint")
 """Of which the attitude inlet needs one: what turns the rotors."""
 
 
-def examine(
+def inspect_recording(
     path: Path, topics: str | Path | TopicMap | None, namespace: str, *, keep: bool = False
 ) -> Inspection:
     """Inspect a recording.
@@ -94,7 +94,7 @@ def examine(
             content = content_of(signals, options.sidecar)
         except RecordingError as err:
             # Its topics are listed nevertheless, so that the user sees what to map.
-            messages = options.given.messages if options.given else ()
+            messages = options.topic_map.messages if options.topic_map else ()
             recording = open_recording(path, messages)
             return Inspection(
                 path=str(path),
@@ -105,7 +105,7 @@ def examine(
                 topic_map="",
                 problem=f"{err.what}; {err.remedy}",
                 topics=tuple(_topic(topic, None, ()) for topic in recording.topics),
-                inlets=inlets({}, trajectory=False),
+                inlets=inlet_reports({}, trajectory=False),
             )
     if keep:
         with contextlib.suppress(RecordingError):
@@ -115,30 +115,30 @@ def examine(
 
 def _without_pose(signals: Signals) -> Inspection:
     """Return what a recording of gyro, accelerometer and motor commands alone holds."""
-    flown = flying(signals)
-    error = obstacle(signals, flown)
+    flown = flying_stretches(signals)
+    error = inertial_error(signals, flown)
     seconds = {"seconds": float(sum(end - begin for begin, end in flown))}
     fitted = () if error else (Note(NoteCode.WITHOUT_POSE, "info", numbers=seconds),)
     return replace(
         _with_signals(signals),
         problem=f"{error.what}; {error.remedy}" if error else None,
-        inlets=inlets(_measured(signals.series), trajectory=False),
+        inlets=inlet_reports(_measured_columns(signals.series), trajectory=False),
         notes=(*fitted, *signals.notes),
     )
 
 
 def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
     missions = tuple(_mission(content, i) for i in range(len(content.missions)))
-    measured = _measured(content.series)
-    unusable = is_stale(content.series, content.notes) or noted_contradiction(content.notes)
+    measured = _measured_columns(content.series)
+    unusable = has_stale_attitude(content.series, content.notes) or contradiction_in(content.notes)
     if unusable:  # a fit leaves it out
         del measured["attitude"]
     return replace(
         _with_signals(content),
         problem=None if missions else "nothing flies in it for 2 s: no mission was found",
         missions=missions,
-        inlets=inlets(measured, trajectory=sidecar.trajectory is not None),
-        coefficients=() if unusable else informed(content.series, measured, missions),
+        inlets=inlet_reports(measured, trajectory=sidecar.trajectory is not None),
+        coefficients=() if unusable else coefficient_reports(content.series, measured, missions),
         clock=_clock(content),
         notes=content.notes,
     )
@@ -149,7 +149,7 @@ def _with_signals(read: Signals) -> Inspection:
     recording, samples = read.recording, read.samples
     times = [s.receive for s in samples.values() if len(s.receive)]
     first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
-    measured, battery = _measured(read.series), read.series.get("battery_voltage")
+    measured, battery = _measured_columns(read.series), read.series.get("battery_voltage")
     voltage = None if battery is None else battery.values
     return Inspection(
         path=str(recording.path),
@@ -189,12 +189,12 @@ def _size(path: Path) -> int:
 
 
 def _date(nanoseconds: int) -> str | None:
-    if not NO_DATE < nanoseconds < 8 * NO_DATE:
+    if not EARLIEST_DATE_NS < nanoseconds < 8 * EARLIEST_DATE_NS:
         return None
     return datetime.fromtimestamp(nanoseconds * 1e-9, UTC).isoformat(timespec="seconds")
 
 
-def _measured(series: Mapping[str, Series]) -> dict[str, tuple[int, ...]]:
+def _measured_columns(series: Mapping[str, Series]) -> dict[str, tuple[int, ...]]:
     """Return signal -> its columns that were measured."""
     return {
         name: tuple(int(i) for i in np.flatnonzero(np.isfinite(samples.values).any(axis=0)))
@@ -232,7 +232,7 @@ def _clock(content: Content) -> Mapping[str, float]:
 
 def _mission(content: Content, index: int) -> MissionReport:
     mission = content.missions[index]
-    clock = np.arange(mission.start, min(mission.end, mission.start + LONGEST), 1 / RATE)
+    clock = np.arange(mission.start, min(mission.end, mission.start + MAX_INSPECTED_S), 1 / RATE_HZ)
     position = resample("position", content.series["position"], clock)
     attitude = resample("attitude", content.series["attitude"], clock)
     speed = np.linalg.norm(derivative(smooth(position)), axis=1)
@@ -249,23 +249,26 @@ def _mission(content: Content, index: int) -> MissionReport:
         duration=mission.end - mission.start,
         begins_with=mission.begins_with,
         laps=None if lap is None else len(lap.between(mission.start, mission.end).time),
-        mean_speed=_of(np.nanmean, speed),
-        top_speed=_of(np.nanmax, speed),
-        largest_tilt=float(np.degrees(np.arccos(np.clip(_of(np.nanmin, up), -1, 1)))),
+        mean_speed=_reduced(np.nanmean, speed),
+        top_speed=_reduced(np.nanmax, speed),
+        largest_tilt=float(np.degrees(np.arccos(np.clip(_reduced(np.nanmin, up), -1, 1)))),
         top_turn_rate=turning,
         yaw_rate_setpoint=None if spin is None else spin.yaw_rate,
         level_held=spin is not None and spin.level_held,
-        height=(_of(np.nanmin, position[:, 2]), _of(np.nanmax, position[:, 2])),
+        height=(
+            _reduced(np.nanmin, position[:, 2]),
+            _reduced(np.nanmax, position[:, 2]),
+        ),
         known=float(known.mean()),
         fitted=mission.fitted,
     )
 
 
-def _of(reduce: object, values: Array) -> float:
+def _reduced(reduce: object, values: Array) -> float:
     return float(reduce(values)) if np.isfinite(values).any() else float("nan")  # type: ignore[operator]
 
 
-_NEEDS: Mapping[str, Sequence[str]] = {
+_SIGNALS_OF_INLETS: Mapping[str, Sequence[str]] = {
     "reference": (*_POSE, "reference_position"),
     "body_rate": (*_POSE, "rate_setpoint", "thrust_setpoint"),
     "actuator": (*_POSE, "command"),
@@ -274,7 +277,9 @@ _NEEDS: Mapping[str, Sequence[str]] = {
 }
 
 
-def inlets(measured: Mapping[str, tuple[int, ...]], *, trajectory: bool) -> tuple[Inlet, ...]:
+def inlet_reports(
+    measured: Mapping[str, tuple[int, ...]], *, trajectory: bool
+) -> tuple[InletReport, ...]:
     """Return what each inlet lacks.
 
     Parameters
@@ -287,7 +292,7 @@ def inlets(measured: Mapping[str, tuple[int, ...]], *, trajectory: bool) -> tupl
     if all(name in measured for name in _WRENCH):
         measured = {"command": (0, 1, 2, 3), **measured}
     available = []
-    for name, needs in _NEEDS.items():
+    for name, needs in _SIGNALS_OF_INLETS.items():
         missing = [need for need in needs if need not in measured]
         if trajectory and "reference_position" in missing:
             missing.remove("reference_position")
@@ -296,17 +301,19 @@ def inlets(measured: Mapping[str, tuple[int, ...]], *, trajectory: bool) -> tupl
             if need in needs and columns is not None and len(columns) < 4:
                 lacking = [str(i) for i in range(4) if i not in columns]
                 missing.append(f"{need} of rotors {', '.join(lacking)}")
-        if name == "attitude" and not any(len(measured.get(d, ())) in (1, 4) for d in _DRIVES):
-            missing.append(" or ".join(_DRIVES))
-        available.append(Inlet(name, tuple(missing)))
+        if name == "attitude" and not any(
+            len(measured.get(d, ())) in (1, 4) for d in _ROTOR_INPUTS
+        ):
+            missing.append(" or ".join(_ROTOR_INPUTS))
+        available.append(InletReport(name, tuple(missing)))
     return tuple(available)
 
 
-def informed(
+def coefficient_reports(
     series: Mapping[str, Series],
     measured: Mapping[str, tuple[int, ...]],
     missions: Sequence[MissionReport],
-) -> tuple[Informed, ...]:
+) -> tuple[CoefficientReport, ...]:
     """Return how well a recording could show each coefficient, by the rule that its row names.
 
     Parameters
@@ -322,10 +329,14 @@ def informed(
     rates = _spread(series, "body_rate", missions)
     command = float(np.max(_spread(series, "command", missions), initial=0.0))
     speed = max(mission.top_speed for mission in missions)
-    vertical = _during(series["velocity"], missions)[:, 2] if "velocity" in series else np.zeros(1)
+    vertical = (
+        _values_during(series["velocity"], missions)[:, 2] if "velocity" in series else np.zeros(1)
+    )
     climb = float(np.nanmax(np.abs(vertical))) if len(vertical) else 0.0
     driven = bool(has & {"command", "rotor_speed", "rate_setpoint", "reference_position"})
-    quick = {n for n in ("command", "rotor_speed") if n in series and series[n].rate >= LEAST_RATE}
+    quick = {
+        n for n in ("command", "rotor_speed") if n in series and series[n].rate >= MIN_LAG_RATE_HZ
+    }
     tachometer, commands = "rotor_speed" in has, "command" in has
 
     def turning(axis: int, limit: float, name: str) -> tuple[str, str]:
@@ -333,11 +344,11 @@ def informed(
             return "weakly", "no gyro: only through the attitude"
         if not driven:
             return "no", "nothing recorded drives the simulation"
-        return _graded(float(rates[axis]), limit, f"{name} rate varies by {rates[axis]:.2f} rad/s")
+        return _grade(float(rates[axis]), limit, f"{name} rate varies by {rates[axis]:.2f} rad/s")
 
     curve = (
         ("yes", "commands and rotor speed show the curve")
-        if tachometer and commands and command > COMMAND_SPREAD
+        if tachometer and commands and command > CLEAR_COMMAND_SPREAD
         else ("weakly", "only together with the motor constant")
     )
     lag = (
@@ -349,9 +360,9 @@ def informed(
     rules = {
         "weighing": ("no", "weigh it: forces and inertias scale with it"),
         "nothing": ("no", "such flights do not show it"),
-        "roll": turning(0, ROLL_PITCH_RATE, "roll"),
-        "pitch": turning(1, ROLL_PITCH_RATE, "pitch"),
-        "yaw": turning(2, YAW_RATE, "yaw"),
+        "roll": turning(0, CLEAR_ROLL_PITCH_RATE, "roll"),
+        "pitch": turning(1, CLEAR_ROLL_PITCH_RATE, "pitch"),
+        "yaw": turning(2, CLEAR_YAW_RATE, "yaw"),
         "thrust curve": curve,
         "rotor lag": lag,
         "thrust": (
@@ -359,8 +370,8 @@ def informed(
             if tachometer
             else ("weakly", "only together with the RPM curve")
         ),
-        "speed": _graded(speed, SPEED, f"flown at up to {speed:.1f} m/s"),
-        "climb": _graded(climb, VERTICAL_SPEED, f"climbs at {climb:.1f} m/s"),
+        "speed": _grade(speed, CLEAR_SPEED, f"flown at up to {speed:.1f} m/s"),
+        "climb": _grade(climb, CLEAR_VERTICAL_SPEED, f"climbs at {climb:.1f} m/s"),
         "closed loop": (
             ("yes", "reference and set-points close the loop")
             if loop
@@ -373,18 +384,18 @@ def informed(
         ),
     }
     return tuple(
-        Informed(name, *rules[coefficient.informed_by])
+        CoefficientReport(name, *rules[coefficient.informed_by])
         for name, coefficient in COEFFICIENTS.items()
         if coefficient.informed_by is not None
     )
 
 
-def _graded(value: float, limit: float, why: str) -> tuple[str, str]:
+def _grade(value: float, limit: float, why: str) -> tuple[str, str]:
     how = "yes" if value >= limit else "weakly" if value >= limit / 3 else "no"
     return how, why
 
 
-def _during(series: Series, missions: Sequence[MissionReport]) -> Array:
+def _values_during(series: Series, missions: Sequence[MissionReport]) -> Array:
     inside = np.zeros(len(series.time), dtype=np.bool_)
     for mission in missions:
         inside |= (series.time >= mission.start) & (series.time <= mission.start + mission.duration)
@@ -398,14 +409,14 @@ def _spread(series: Mapping[str, Series], name: str, missions: Sequence[MissionR
     """
     if name not in series:
         return np.zeros(4)
-    values = _during(series[name], missions)
+    values = _values_during(series[name], missions)
     if len(values) == 0:
         return np.zeros(values.shape[1])
     largest = np.nanmax(np.abs(values), axis=0)
     return np.asarray(np.maximum(np.nanstd(values, axis=0), 0.25 * largest))
 
 
-LACKING = "position", "attitude", "command", "rotor_speed", "body_rate"
+SUGGESTED_SIGNALS = "position", "attitude", "command", "rotor_speed", "body_rate"
 """Signals that are asked for where no column seems to hold them."""
 
 
@@ -427,25 +438,27 @@ def suggested_map(path: Path) -> str:
         found = {name: place.source.replace(topic=place.topic) for name, place in places.items()}
         why = dict.fromkeys(found, f"as in the shipped map {chosen.name}")
         lines = [f"format: {recording.format}", f"extends: {chosen.name}"]
-        return _text(path, lines, found, why, [])
+        return _map_text(path, lines, found, why, [])
     columns = recording.fields("")
-    time, found = recognised(columns, recording.units)
+    time, found = sources_by_name(columns, recording.units)
     lines = ["# time: {field: ..., unit: ms}      # no column seems to hold it"]
     if time is not None:
         about = "unit" if time.unit else "its unit is told by its step"
-        lines = [f"time: {_inline(time.model_dump(exclude_none=True))}      # by its name; {about}"]
-    inferred = _inferred(path)
+        lines = [
+            f"time: {_inline_yaml(time.model_dump(exclude_none=True))}      # by its name; {about}"
+        ]
+    inferred = _inferred_units(path)
     why = {
-        signal: "by the names" + _of_unit(source, inferred.get(signal), signal)
+        signal: "by the names" + _unit_comment(source, inferred.get(signal), signal)
         for signal, source in found.items()
     }
     taken = {field for source in found.values() for field in source.fields or ()}
     taken |= set() if time is None else {time.field}
     lines.insert(0, f"format: {recording.format}")
-    return _text(path, lines, found, why, [c for c in columns if c not in taken])
+    return _map_text(path, lines, found, why, [c for c in columns if c not in taken])
 
 
-def _inferred(path: Path) -> dict[str, str]:
+def _inferred_units(path: Path) -> dict[str, str]:
     """Return in which units signals are by their numbers: signal -> words."""
     with contextlib.suppress(RecordingError):
         notes = read_content(ReadOptions(path)).notes
@@ -454,7 +467,7 @@ def _inferred(path: Path) -> dict[str, str]:
     return {}
 
 
-def _of_unit(source: Source, inferred: str | None, name: str) -> str:
+def _unit_comment(source: Source, inferred: str | None, name: str) -> str:
     if inferred:
         return f"; by the numbers {inferred}"
     if source.unit or (name == "attitude" and source.quaternion != "rpy"):
@@ -462,7 +475,7 @@ def _of_unit(source: Source, inferred: str | None, name: str) -> str:
     return "; no unit among them: SI as it seems, add it if that is wrong"
 
 
-def _text(
+def _map_text(
     path: Path,
     lines: list[str],
     found: dict[str, Source],
@@ -479,8 +492,8 @@ def _text(
     for signal, source in found.items():
         about = source.model_dump(exclude_defaults=True, exclude_none=True)
         about = {key: list(of) if isinstance(of, tuple) else of for key, of in about.items()}
-        text.append(f"  {signal}: {_inline(about)}      # {why[signal]}")
-    lacking = [signal for signal in LACKING if signal not in found]
+        text.append(f"  {signal}: {_inline_yaml(about)}      # {why[signal]}")
+    lacking = [signal for signal in SUGGESTED_SIGNALS if signal not in found]
     for signal in lacking:
         dots = ", ".join(["..."] * SIGNALS[signal][0])
         text.append(f"  # {signal}: {{fields: [{dots}], unit: si}}      # no column seems so")
@@ -489,5 +502,5 @@ def _text(
     return "\n".join(text) + "\n"
 
 
-def _inline(value: object) -> str:
+def _inline_yaml(value: object) -> str:
     return yaml.safe_dump(value, default_flow_style=True, width=10_000, allow_unicode=True).strip()

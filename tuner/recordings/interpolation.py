@@ -11,34 +11,34 @@ from tuner.core.numerics import Array
 from tuner.recordings.flight import SIGNALS, Series
 
 #: Beyond this gap between two samples, in s, nothing is known; slower signals get three periods.
-LONGEST_GAP = 0.25
+GAP_S = 0.25
 #: Seconds after their last sample for which counters hold.
-FOREVER = np.inf
+COUNTER_GAP_S = np.inf
 #: Periods of a regular publisher between two samples beyond which one is missing.
-MISSED_PERIODS = 1.5
+MIN_GAP_PERIODS = 1.5
 #: Hz and seconds of the stretch that is looked at.
-RATE = 100.0
-LONGEST_STRETCH = 60.0
+RATE_HZ = 100.0
+MAX_STRETCH_S = 60.0
 
 
 def resample(signal: str, series: Series, clock: Array) -> Array:
     """Return the (N, k) values of a signal on a uniform clock (N,), NaN where none are known."""
-    columns, _, way = SIGNALS[signal]
+    columns, _, interpolation = SIGNALS[signal]
     result = np.full((len(clock), columns), np.nan)
     if len(series.time) == 0:
         return result
-    if way == "arc":
-        return _along_arc(series, clock)
+    if interpolation == "arc":
+        return _slerp(series, clock)
     for column in range(columns):
         measured = np.isfinite(series.values[:, column])
         if not measured.any():
             continue
         time, values = series.time[measured], series.values[measured, column]
-        if way == "linear":
+        if interpolation == "linear":
             result[:, column] = np.interp(clock, time, values)
             result[np.logical_not(_covered(time, clock)), column] = np.nan
         else:
-            gap = FOREVER if signal == "lap" else longest_gap(time)
+            gap = COUNTER_GAP_S if signal == "lap" else max_gap(time)
             # A nanosecond of tolerance: stamps that were moved onto ticks carry rounding errors.
             index = np.searchsorted(time, clock + 1e-9, side="right") - 1
             last = np.maximum(index, 0)
@@ -47,13 +47,13 @@ def resample(signal: str, series: Series, clock: Array) -> Array:
     return result
 
 
-def without_gaps(series: Series) -> Series:
+def with_gaps_filled(series: Series) -> Series:
     """Return a signal that is published at a steady rate with the samples that were not recorded.
 
     Recorders drop messages that the flight controller received. Held through such a gap, a
     reference at 4 m/s would lag by 4 cm for 10 ms and kick the vehicle. The missing samples lie on
     a monotone cubic through their neighbours (Fritsch and Butland 1984), so that a step stays one.
-    Longer gaps than are bridged anywhere (`LONGEST_GAP`) are left.
+    Longer gaps than are bridged anywhere (`GAP_S`) are left.
     """
     known = np.isfinite(series.values).all(axis=1)
     time, values = series.time[known], series.values[known]
@@ -61,7 +61,7 @@ def without_gaps(series: Series) -> Series:
         return series
     steps = np.diff(time)
     period = float(np.median(steps))
-    gaps = np.flatnonzero((steps > MISSED_PERIODS * period) & (steps <= longest_gap(time)))
+    gaps = np.flatnonzero((steps > MIN_GAP_PERIODS * period) & (steps <= max_gap(time)))
     if len(gaps) == 0:
         return series
     counts = np.round(steps[gaps] / period).astype(int)
@@ -79,9 +79,9 @@ def without_gaps(series: Series) -> Series:
     return Series(steady, between)
 
 
-def longest_gap(time: Array) -> float:
+def max_gap(time: Array) -> float:
     """Return the s between samples beyond which nothing is known."""
-    return max(LONGEST_GAP, 3 * float(np.median(np.diff(time)))) if len(time) > 1 else LONGEST_GAP
+    return max(GAP_S, 3 * float(np.median(np.diff(time)))) if len(time) > 1 else GAP_S
 
 
 def runs(flags: ArrayLike) -> list[tuple[int, int]]:
@@ -95,11 +95,11 @@ def _covered(time: Array, clock: Array) -> NDArray[np.bool_]:
     after = np.clip(np.searchsorted(time, clock, side="left"), 0, len(time) - 1)
     before = np.clip(np.searchsorted(time, clock, side="right") - 1, 0, len(time) - 1)
     inside = (clock >= time[0]) & (clock <= time[-1])
-    near = time[after] - time[before] <= longest_gap(time)
+    near = time[after] - time[before] <= max_gap(time)
     return np.asarray(inside & near, dtype=np.bool_)
 
 
-def _along_arc(series: Series, clock: Array) -> Array:
+def _slerp(series: Series, clock: Array) -> Array:
     """Turn from each sample to the next at constant speed along the shorter arc (slerp)."""
     result = np.full((len(clock), 4), np.nan)
     known = _covered(series.time, clock)
@@ -125,12 +125,12 @@ def _along_arc(series: Series, clock: Array) -> Array:
     return result
 
 
-def stretch(series: Mapping[str, Series]) -> Array:
+def middle_clock(series: Mapping[str, Series]) -> Array:
     """Return a uniform clock over the middle of a recording, one minute at most."""
     time = series["position"].time
     start, end = float(time[0]), float(time[-1])
-    spare = max(0.0, end - start - LONGEST_STRETCH) / 2
-    return np.arange(start + spare, end - spare, 1 / RATE)
+    spare = max(0.0, end - start - MAX_STRETCH_S) / 2
+    return np.arange(start + spare, end - spare, 1 / RATE_HZ)
 
 
 def on_clock(series: Mapping[str, Series], name: str, clock: Array) -> Array:
@@ -140,7 +140,7 @@ def on_clock(series: Mapping[str, Series], name: str, clock: Array) -> Array:
 
 def smooth(values: Array, seconds: float = 0.05) -> Array:
     """Return (n, k) values averaged over a window around each; NaN where it is not all known."""
-    width = max(1, round(seconds * RATE) | 1)
+    width = max(1, round(seconds * RATE_HZ) | 1)
     result = np.full(values.shape, np.nan)
     if len(values) >= width:
         kernel = np.ones(width) / width
@@ -151,7 +151,7 @@ def smooth(values: Array, seconds: float = 0.05) -> Array:
 
 def derivative(values: Array) -> Array:
     """Return the derivative in time of (n, k) values on the clock."""
-    return np.asarray(np.gradient(values, 1 / RATE, axis=0))
+    return np.asarray(np.gradient(values, 1 / RATE_HZ, axis=0))
 
 
 def rotate(q: Array, v: Array) -> Array:
@@ -171,10 +171,10 @@ def body_rate_of(q: Array) -> Array:
     return body_rate_from(q, derivative(q))
 
 
-def body_rate_from(q: Array, turning: Array) -> Array:
+def body_rate_from(q: Array, q_dot: Array) -> Array:
     """Return the (n, 3) body rate, rad/s, of (n, 4) attitudes that turn so: 2 q* ⊗ dq/dt."""
     w, x, y, z = q.T
-    dw, dx, dy, dz = turning.T
+    dw, dx, dy, dz = q_dot.T
     return 2.0 * np.column_stack(
         [
             w * dx - x * dw - y * dz + z * dy,

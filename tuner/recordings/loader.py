@@ -23,7 +23,7 @@ from pydantic import ConfigDict, TypeAdapter
 from tuner.core.disk import exists, readable
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
-from tuner.recordings.cache import cached, digest, load, store
+from tuner.recordings.cache import cache_file, digest, load, store
 from tuner.recordings.clocks import Grid, clock_of
 from tuner.recordings.content import (
     Content,
@@ -35,19 +35,19 @@ from tuner.recordings.content import (
 )
 from tuner.recordings.flight import SIGNALS, Flight, Series
 from tuner.recordings.formats import is_tabular
-from tuner.recordings.interpolation import longest_gap, resample, runs, without_gaps
-from tuner.recordings.missions import IDLE, stretches, yaw_spin
+from tuner.recordings.interpolation import max_gap, resample, runs, with_gaps_filled
+from tuner.recordings.missions import MAX_IDLE_COMMAND, stretches, yaw_spin
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.states import initial_state
 from tuner.recordings.topics import TopicMap
-from tuner.recordings.unit_detection import FASTEST_TURN
+from tuner.recordings.unit_detection import MAX_TURN_RATE
 
 #: Seconds before the mission that the series keep.
-BEFORE = 2.0
+PRE_MISSION_S = 2.0
 #: Seconds after it within which samples still help to interpolate its end.
-AFTER = 0.2
+POST_MISSION_S = 0.2
 #: Longer missions, on the uniform clock, come of broken stamps.
-MOST_TICKS = 2_000_000
+MAX_TICKS = 2_000_000
 
 logger = logging.getLogger(__name__)
 
@@ -62,17 +62,17 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
     """
     path, rate, series = options.path, options.rate, content.series
     mission = content.missions[index]
-    grid = clock_of(series, rate, mission.start - BEFORE, mission.end)
+    grid = clock_of(series, rate, mission.start - PRE_MISSION_S, mission.end)
     start = grid.tick_nearest(mission.start) if grid else mission.start
     count = math.floor((mission.end - start) * rate + 1e-6) + 1
     if count < 2:
         raise RecordingError(path, "its mission ends where it starts", "inspect the recording")
-    if count > MOST_TICKS:
+    if count > MAX_TICKS:
         what = f"its mission lasts {(mission.end - start) / 3600:.0f} h"
         raise RecordingError(path, what, "give 'start' and 'end' in a side-car")
     clock = np.arange(count) / rate
     # Beyond the last tick, so that it has a sample on either side.
-    kept = (start - BEFORE, mission.end + AFTER + 1e-6)
+    kept = (start - PRE_MISSION_S, mission.end + POST_MISSION_S + 1e-6)
     near = {name: data.between(*kept) for name, data in series.items()}
     nearby = {name: Series(data.time - start, data.values) for name, data in near.items()}
     until = mission.end - start + 1e-6
@@ -88,7 +88,7 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
     if not mission.fitted:
         notes.append(Note(NoteCode.NOT_CHOSEN, "info"))
     signals = {name: _on_clock(name, nearby[name], clock, ticks) for name in mission_series}
-    notes.extend(gaps_in(signals, mission_series, rate))
+    notes.extend(gap_notes(signals, mission_series, rate))
     spin = yaw_spin(mission_series.get("rate_setpoint"), 0.0, float(clock[-1]))
     return Flight(
         name=path.stem if index == 0 else f"{path.stem}-{index + 1}",
@@ -107,7 +107,9 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
     )
 
 
-def gaps_in(signals: Mapping[str, Array], series: Mapping[str, Series], rate: float) -> list[Note]:
+def gap_notes(
+    signals: Mapping[str, Array], series: Mapping[str, Series], rate: float
+) -> list[Note]:
     """Say where a signal is unknown for longer than at the ends of its recording."""
     notes = []
     for name, values in signals.items():
@@ -115,7 +117,7 @@ def gaps_in(signals: Mapping[str, Array], series: Mapping[str, Series], rate: fl
             continue
         known = np.isfinite(values).any(axis=1)
         unknown = int((~known).sum())
-        if unknown > longest_gap(series[name].time) * rate:
+        if unknown > max_gap(series[name].time) * rate:
             longest = max(behind - first for first, behind in runs(~known))
             times = {"seconds": unknown / rate, "longest": longest / rate}
             notes.append(Note(NoteCode.SIGNAL_UNKNOWN, count=unknown, numbers=times, names=(name,)))
@@ -126,19 +128,19 @@ def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> A
     if grid is not None and SIGNALS[signal][2] == "hold" and len(series.time) > 1:
         series = Series(grid.snap(series.time), series.values)
     if signal.startswith("reference_"):
-        series = without_gaps(series)
+        series = with_gaps_filled(series)
     return resample(signal, series, clock)
 
 
 def _cache_file(options: ReadOptions) -> Path:
     """Return the file of the cache for the flights of a recording, read so."""
     path = options.path
-    return cached("flights", digest(path), path.name, *read_by(options))
+    return cache_file("flights", digest(path), path.name, *reading_key(options))
 
 
-def read_by(options: ReadOptions) -> tuple[str, ...]:
+def reading_key(options: ReadOptions) -> tuple[str, ...]:
     """Return all that decides how a recording's content is read but this program."""
-    given = options.given
+    given = options.topic_map
     messages = [digest(file) for file in given.messages if file.exists()] if given else []
     inputs = (options.namespace, options.rate, options.sidecar, given, messages)
     return tuple(map(repr, inputs))
@@ -277,11 +279,11 @@ def from_npz(content: bytes | None) -> tuple[Flight, ...] | None:
 
 
 #: What a recording must hold.
-NEEDS = ("body_rate", "acceleration", "command")
+INERTIAL_SIGNALS = ("body_rate", "acceleration", "command")
 #: Hz below which a log does not show how a vehicle turns.
-SLOWEST = 120.0
+MIN_RATE_HZ = 120.0
 #: s below which a stretch in the air shows nothing.
-SHORTEST = 2.0
+MIN_STRETCH_S = 2.0
 #: rad/s, or less, at which a vehicle turns through nine tenths of a gentle flight.
 GENTLE_TURN_RATE = 3.0
 
@@ -293,7 +295,7 @@ class InertialFlight:
     Attributes
     ----------
     series
-        `NEEDS`, and the battery's voltage where it was recorded; in s since the first sample.
+        `INERTIAL_SIGNALS` and, if recorded, the battery's voltage; in s since the first sample.
     flying
         Stretches, in s, in which the motors turn faster than idle.
     """
@@ -308,18 +310,20 @@ class InertialFlight:
 def is_inertial(signals: Signals) -> bool:
     """Return whether a recording lacks a pose, but has what a flight can be judged by without."""
     has_pose = {"position", "attitude"} <= set(signals.series)
-    return not has_pose and set(NEEDS) <= set(signals.series)
+    return not has_pose and set(INERTIAL_SIGNALS) <= set(signals.series)
 
 
-def flying(signals: Signals) -> tuple[tuple[float, float], ...]:
+def flying_stretches(signals: Signals) -> tuple[tuple[float, float], ...]:
     """Return the stretches, in s, in which the motors turn faster than idle."""
     commands = signals.series["command"]
-    turns = np.asarray(commands.values.mean(axis=1) > IDLE, dtype=np.bool_)
+    turns = np.asarray(commands.values.mean(axis=1) > MAX_IDLE_COMMAND, dtype=np.bool_)
     runs = stretches(commands.time, turns)
-    return tuple((begin, end) for begin, end in runs if end - begin >= SHORTEST)
+    return tuple((begin, end) for begin, end in runs if end - begin >= MIN_STRETCH_S)
 
 
-def obstacle(signals: Signals, flown: tuple[tuple[float, float], ...]) -> RecordingError | None:
+def inertial_error(
+    signals: Signals, flown: tuple[tuple[float, float], ...]
+) -> RecordingError | None:
     """Return why nothing can be fitted to a recording without a pose; None if it can.
 
     Parameters
@@ -328,13 +332,13 @@ def obstacle(signals: Signals, flown: tuple[tuple[float, float], ...]) -> Record
         The stretches in which its motors turn.
     """
     path, series = signals.recording.path, signals.series
-    slow = {name: series[name].rate for name in NEEDS if series[name].rate < SLOWEST}
+    slow = {name: series[name].rate for name in INERTIAL_SIGNALS if series[name].rate < MIN_RATE_HZ}
     if slow:
         rates = ", ".join(f"{name} at {rate:.0f} Hz" for name, rate in slow.items())
         return RecordingError(
             path,
             f"holds no pose, and is too slow to be fitted without one: {rates}",
-            f"log {', '.join(NEEDS)} at {SLOWEST:.0f} Hz or more",
+            f"log {', '.join(INERTIAL_SIGNALS)} at {MIN_RATE_HZ:.0f} Hz or more",
         )
     if not flown:
         return RecordingError(
@@ -347,7 +351,7 @@ def obstacle(signals: Signals, flown: tuple[tuple[float, float], ...]) -> Record
     if (
         is_tabular(signals.recording.format)
         and not stated
-        and GENTLE_TURN_RATE < often <= FASTEST_TURN
+        and GENTLE_TURN_RATE < often <= MAX_TURN_RATE
     ):
         return RecordingError(
             path,
@@ -365,8 +369,8 @@ def read_inertial(
     Raises
     ------
     RecordingError
-        The file cannot be read, holds neither a pose nor `NEEDS`, or is too slow, or nothing flies
-        in it.
+        The file cannot be read, lacks a pose and `INERTIAL_SIGNALS`, is too slow, or holds no
+        flight.
     ConfigError
         The topic map or the side-car is wrong.
     """
@@ -380,10 +384,12 @@ def read_inertial(
             with contextlib.suppress(RecordingError):  # a fit says it next
                 flights_of(content, options, keep=True)
             return None
-    runs = flying(signals)
-    if (error := obstacle(signals, runs)) is not None:
+    runs = flying_stretches(signals)
+    if (error := inertial_error(signals, runs)) is not None:
         raise error
     kept = {
-        name: signals.series[name] for name in (*NEEDS, "battery_voltage") if name in signals.series
+        name: signals.series[name]
+        for name in (*INERTIAL_SIGNALS, "battery_voltage")
+        if name in signals.series
     }
     return InertialFlight(path.stem, str(path), kept, runs, signals.notes)

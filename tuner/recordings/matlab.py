@@ -21,26 +21,26 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
 from tuner.recordings.notes import Note
 from tuner.recordings.recording import (
-    ROWS,
+    TABLE_TOPIC,
     Clock,
-    Contents,
+    ReadResult,
     Request,
     Samples,
     TabularRecording,
-    reason_of,
+    short_reason,
 )
-from tuner.recordings.sources import guess
+from tuner.recordings.sources import column_meaning
 from tuner.recordings.table import NO_TIME, read_times
 
 MAGIC, MAGIC_7_3 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 #: Bytes of all arrays together, and how many arrays: scipy recurses into those inside others.
-LARGEST, MOST_ARRAYS = 1 << 30, 4000
+MAX_BYTES, MAX_ARRAYS = 1 << 30, 4000
 #: Columns of a matrix that is taken for signals side by side.
-WIDEST = 32
+MAX_MATRIX_COLUMNS = 32
 #: Structures inside structures.
-DEEPEST = 8
+MAX_DEPTH = 8
 #: The column that stands for the time of every structure, where several have one of their own.
-TIME = "*.time"
+ANY_TIME = "*.time"
 
 
 class MatlabTable(TabularRecording):
@@ -66,7 +66,7 @@ class MatlabTable(TabularRecording):
             )
         self._times = {name: _time_of(name, self._columns) for name in self._columns}
         clocks = {time for time in self._times.values() if time is not None}
-        columns = [*([TIME] if len(clocks) > 1 else []), *self._columns]
+        columns = [*([ANY_TIME] if len(clocks) > 1 else []), *self._columns]
         super().__init__(path, "table", columns)
         whole = [name for name, value in content.items() if _is_matrix(value)]
         if len(whole) == 1 and len(self._columns) > 1 and not clocks:
@@ -76,17 +76,17 @@ class MatlabTable(TabularRecording):
                 f"position: ['{name}[1]', '{name}[2]', '{name}[3]'], and so on"
             )
             what = f"holds the bare matrix '{name}' of {count} columns, which have no names"
-            self.obstacle = (what, remedy)
+            self.naming_problem = (what, remedy)
 
-    def read(self, wanted: Mapping[str, Request]) -> Contents:
+    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
         """Read the wanted columns, each at the times of its own structure."""
-        if ROWS not in wanted:
-            return Contents({})
-        request = wanted[ROWS]
+        if TABLE_TOPIC not in wanted:
+            return ReadResult({})
+        request = wanted[TABLE_TOPIC]
         clock = self.clock(request)
         groups: dict[str, list[str]] = {}
         for name in request.fields:
-            time = self._times.get(name) if clock.field == TIME else clock.field
+            time = self._times.get(name) if clock.field == ANY_TIME else clock.field
             if time is not None and len(self._columns[time]) == len(self._columns[name]):
                 groups.setdefault(time, []).append(name)
         parts, notes = [], list[Note]()
@@ -100,7 +100,7 @@ class MatlabTable(TabularRecording):
             )
         stamps = np.concatenate([part.receive for part in parts])
         fields = {n: np.concatenate([part.fields[n] for part in parts]) for n in request.fields}
-        return Contents({ROWS: Samples(stamps, stamps, fields)}, tuple(notes))
+        return ReadResult({TABLE_TOPIC: Samples(stamps, stamps, fields)}, tuple(notes))
 
     def _part(
         self, clock: Clock, names: list[str], fields: tuple[str, ...]
@@ -119,18 +119,18 @@ def _load(path: Path) -> Mapping[str, Any]:
     """Read a file of version 5 to 7."""
     from scipy.io import loadmat  # noqa: PLC0415 (slow to import)
 
-    data = path.read_bytes() if path.stat().st_size <= LARGEST else b""
-    size, arrays = 0 if data else LARGEST + 1, 0
-    for piece in _unpacked(data):
+    data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
+    size, arrays = 0 if data else MAX_BYTES + 1, 0
+    for piece in _decompressed(data):
         size += len(piece)
         arrays += piece.count(b"\x0e\0\0\0") + piece.count(b"\0\0\0\x0e")  # at least
-        if size > LARGEST:
+        if size > MAX_BYTES:
             break
-    if size > LARGEST:
+    if size > MAX_BYTES:
         raise RecordingError(path, "is larger than any recording of a flight", "cut it")
-    if arrays > MOST_ARRAYS:
+    if arrays > MAX_ARRAYS:
         raise RecordingError(
-            path, f"holds more than {MOST_ARRAYS} arrays", "save each signal as one array"
+            path, f"holds more than {MAX_ARRAYS} arrays", "save each signal as one array"
         )
     try:
         return dict(loadmat(io.BytesIO(data), simplify_cells=True))
@@ -139,15 +139,15 @@ def _load(path: Path) -> Mapping[str, Any]:
 
 
 def _unreadable(path: Path, err: Exception) -> RecordingError:
-    what = f"is no readable MATLAB file ({reason_of(err)})"
+    what = f"is no readable MATLAB file ({short_reason(err)})"
     return RecordingError(path, what, "save it again")
 
 
-_COMPRESSED = 15
+_COMPRESSED_ELEMENT = 15
 """Kind of an element."""
 
 
-def _unpacked(data: bytes) -> Iterator[bytes]:
+def _decompressed(data: bytes) -> Iterator[bytes]:
     """Yield what the elements of a file hold, unpacked, a megabyte of packed ones at a time."""
     order: Literal["little", "big"] = "little" if data[126:128] == b"IM" else "big"
     at = 128
@@ -156,7 +156,7 @@ def _unpacked(data: bytes) -> Iterator[bytes]:
         size = int.from_bytes(data[at + 4 : at + 8], order)
         content = data[at + 8 : at + 8 + size]
         at += 8 + size
-        if kind != _COMPRESSED:
+        if kind != _COMPRESSED_ELEMENT:
             yield content
             continue
         unpacking = zlib.decompressobj()
@@ -178,27 +178,27 @@ def _load_hdf5(path: Path) -> Mapping[str, Any]:
         ) from None
     try:
         with h5py.File(path, "r") as file:
-            return _of_group(h5py, file, [0], 0)
+            return _group_arrays(h5py, file, [0], 0)
     except RecordingError:
         raise
     except Exception as err:  # whatever a hostile file makes of the library
         raise _unreadable(path, err) from None
 
 
-def _of_group(h5py: Any, group: Any, read: list[int], depth: int) -> dict[str, Any]:
+def _group_arrays(h5py: Any, group: Any, read: list[int], depth: int) -> dict[str, Any]:
     """Return the arrays of a group that lie in the file itself."""
     held: dict[str, Any] = {}
-    for name in list(group)[:MOST_ARRAYS] if depth < DEEPEST else ():
+    for name in list(group)[:MAX_ARRAYS] if depth < MAX_DEPTH else ():
         if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
             continue
         item = group[name]
         if isinstance(item, h5py.Group):
-            held[name] = _of_group(h5py, item, read, depth + 1)
+            held[name] = _group_arrays(h5py, item, read, depth + 1)
             continue
         own = not item.is_virtual and not item.external
         if own and item.dtype.kind in "fiu" and item.attrs.get("MATLAB_class") != b"char":
             read[0] += item.size * 8
-            if read[0] > LARGEST:
+            if read[0] > MAX_BYTES:
                 raise RecordingError(
                     Path(group.file.filename), "is larger than any recording of a flight", "cut it"
                 )
@@ -210,13 +210,15 @@ def _columns(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, Array]]
     """Yield the numeric columns of a structure, by name."""
     if isinstance(value, Mapping):
         label = value.get("label")
-        for name, of in value.items() if depth < DEEPEST else ():
+        for name, of in value.items() if depth < MAX_DEPTH else ():
             if not str(name).startswith("__"):
                 # what Simulink calls a signal stands beside its values
                 own = label if name == "values" and isinstance(label, str) and label else name
                 yield from _columns(f"{prefix}.{own}" if prefix else str(own), of, depth + 1)
     elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
-        for of in list(value)[:WIDEST] if depth < DEEPEST else ():  # what Simulink calls signals
+        for of in (
+            list(value)[:MAX_MATRIX_COLUMNS] if depth < MAX_DEPTH else ()
+        ):  # what Simulink calls signals
             yield from _columns(prefix, of, depth + 1)
     elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
         if 1 in value.shape or value.ndim == 1:
@@ -232,7 +234,7 @@ def _is_matrix(value: object) -> bool:
         isinstance(value, np.ndarray)
         and value.ndim == 2
         and value.dtype.kind in "fiu"
-        and 1 < min(value.shape) <= WIDEST < max(value.shape)
+        and 1 < min(value.shape) <= MAX_MATRIX_COLUMNS < max(value.shape)
     )
 
 
@@ -243,7 +245,7 @@ def _time_of(name: str, columns: Mapping[str, Array]) -> str | None:
         time
         for time, values in columns.items()
         if len(values) == count
-        and (known := guess(time.rpartition(".")[2])) is not None
+        and (known := column_meaning(time.rpartition(".")[2])) is not None
         and known.signal == "time"
     ]
     around = name

@@ -19,15 +19,15 @@ import numpy as np
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
-from tuner.recordings.recording import NANOSECONDS, Contents, Recording, Request, Samples, Topic
+from tuner.recordings.recording import NS_PER_UNIT, ReadResult, Recording, Request, Samples, Topic
 
 MAGIC = 0xBC
 #: Logs are read into memory; a kilohertz of ten variables is 3 MB a minute.
-LARGEST = 128 << 20
+MAX_LOG_BYTES = 128 << 20
 #: Bytes of the CRC at the end.
-CHECKSUM = 4
+CHECKSUM_BYTES = 4
 #: No firmware logs more at once.
-MOST_EVENTS, MOST_VARIABLES, LONGEST_NAME = 256, 512, 256
+MAX_EVENTS, MAX_VARIABLES, MAX_NAME_BYTES = 256, 512, 256
 #: Code of a type -> NumPy's.
 TYPES = {
     "b": "<i1",
@@ -42,11 +42,11 @@ TYPES = {
     "f": "<f4",
     "d": "<f8",
 }
-_STAMPS = {1: ("<u4", NANOSECONDS["ms"]), 2: ("<u8", NANOSECONDS["us"])}
+_STAMPS = {1: ("<u4", NS_PER_UNIT["ms"]), 2: ("<u8", NS_PER_UNIT["us"])}
 #: Fields of every record that are no variables; a space is in no variable's name.
 _NUMBER, _STAMP = " number", " stamp"
 #: Size and places of an event that the header does not know.
-_UNKNOWN = (LARGEST + 1, array("I"))
+_UNKNOWN_EVENT = (MAX_LOG_BYTES + 1, array("I"))
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,13 @@ class MicroSdRecording(Recording):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if path.stat().st_size > LARGEST:
+        if path.stat().st_size > MAX_LOG_BYTES:
             raise RecordingError(path, "is larger than any log of a flight", "cut it")
         self._data = path.read_bytes()
         header = _Header(path, self._data)
         events, self._unit = header.events(), header.unit
-        self._whole = zlib.crc32(self._data[:-4]) == int.from_bytes(self._data[-4:], "little")
-        end = len(self._data) - (CHECKSUM if self._whole else 0)
+        self._crc_matches = zlib.crc32(self._data[:-4]) == int.from_bytes(self._data[-4:], "little")
+        end = len(self._data) - (CHECKSUM_BYTES if self._crc_matches else 0)
         self._lost = end - _find_records(self._data, header.at, end, events)
         self._events = {event.name: event for event in events.values()}
         self.topics = tuple(
@@ -89,21 +89,23 @@ class MicroSdRecording(Recording):
         names = self._events[topic].layout.names if topic in self._events else ()
         return [name for name in names or () if name not in (_NUMBER, _STAMP)]
 
-    def read(self, wanted: Mapping[str, Request]) -> Contents:
+    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
         """Read the wanted variables of some events."""
         samples = {name: self._samples(name, request) for name, request in wanted.items()}
-        return Contents(samples, damage=self._damage())
+        return ReadResult(samples, damage=self._damage())
 
     def _damage(self) -> tuple[Damage, ...]:
         """Return what the checksum and the end of the file give away."""
-        if self._whole and not self._lost:
+        if self._crc_matches and not self._lost:
             return ()
-        if self._whole or self._lost == CHECKSUM:  # whole records, which are not as written
+        if (
+            self._crc_matches or self._lost == CHECKSUM_BYTES
+        ):  # whole records, which are not as written
             return (Damage(Cause.LOG_DAMAGED),)
         return (Damage(Cause.END_MISSING, bytes_lost=self._lost),)
 
     def _samples(self, topic: str, request: Request) -> Samples:
-        event, missing = self._events[topic], self.lacking(topic, request.fields)
+        event, missing = self._events[topic], self.missing_fields(topic, request.fields)
         if missing:
             raise RecordingError(
                 self.path, f"{topic} has no variable '{missing[0]}'", "correct the topic map"
@@ -133,42 +135,42 @@ class _Header:
 
     def events(self) -> dict[int, _Event]:
         """Read the event types: number -> event."""
-        if not 0 < self._count <= MOST_EVENTS:
-            raise self._absurd(f"{self._count} event types")
+        if not 0 < self._count <= MAX_EVENTS:
+            raise self._header_error(f"{self._count} event types")
         events = {}
         for _ in range(self._count):
             number, name, count = self._whole_number(), self._name(), self._whole_number()
-            if count > MOST_VARIABLES:
-                raise self._absurd(f"{count} variables")
+            if count > MAX_VARIABLES:
+                raise self._header_error(f"{count} variables")
             names, formats = [_NUMBER, _STAMP], ["<u2", self._stamp]
             for _ in range(count):
                 variable, _, code = self._name().removesuffix(")").rpartition("(")
                 if code not in TYPES or not variable or variable in names:
-                    raise self._absurd(f"the variable '{variable[:40]}'")
+                    raise self._header_error(f"the variable '{variable[:40]}'")
                 names.append(variable)
                 formats.append(TYPES[code])
             if number in events:
-                raise self._absurd(f"two event types {number}")
+                raise self._header_error(f"two event types {number}")
             events[number] = _Event(name, np.dtype({"names": names, "formats": formats}))
         if len({event.name for event in events.values()}) < len(events):
-            raise self._absurd("two event types of one name")
+            raise self._header_error("two event types of one name")
         return events
 
     def _whole_number(self) -> int:
         part = self._data[self.at : self.at + 2]
         if len(part) < 2:
-            raise self._absurd("an end inside it")
+            raise self._header_error("an end inside it")
         self.at += 2
         return int.from_bytes(part, "little")
 
     def _name(self) -> str:
-        end = self._data.find(b"\0", self.at, self.at + LONGEST_NAME)
+        end = self._data.find(b"\0", self.at, self.at + MAX_NAME_BYTES)
         if end < 0:
-            raise self._absurd("a name without an end")
+            raise self._header_error("a name without an end")
         name, self.at = self._data[self.at : end].decode(errors="replace"), end + 1
         return "".join(letter if letter.isprintable() else "�" for letter in name)
 
-    def _absurd(self, what: str) -> RecordingError:
+    def _header_error(self, what: str) -> RecordingError:
         return RecordingError(
             self._path, f"is no readable micro-SD log: its header has {what}", "record it again"
         )
@@ -178,7 +180,7 @@ def _find_records(data: bytes, at: int, end: int, events: Mapping[int, _Event]) 
     """Note where the records of each event begin; return the place behind the last whole one."""
     found = {n: (event.layout.itemsize, event.places) for n, event in events.items()}
     while at + 2 <= end:
-        size, places = found.get(data[at] | data[at + 1] << 8, _UNKNOWN)
+        size, places = found.get(data[at] | data[at + 1] << 8, _UNKNOWN_EVENT)
         if at + size > end:
             break
         places.append(at)

@@ -17,44 +17,44 @@ from tuner.core.numerics import Array
 from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import runs
 
-AT_REST = 1e-5
+MAX_REST_MOTION = 1e-5
 """Reference motion below this, in m or m/s, is a reference at rest."""
-PAUSE = 1.0
+MAX_PAUSE_S = 1.0
 """Set-points that pause for longer, in s, begin another mission."""
-LONGEST_PAUSE = 10.0
+MAX_POSE_PAUSE_S = 10.0
 """A pose that pauses for longer, in s, as where a clock was set, ends a mission."""
-SHORTEST_LANDING = 0.2
+MIN_LANDING_S = 0.2
 """A flight that leaves the air for less, in s, only seems to: a bounce at landing takes longer."""
-SHORTEST = 2.0
+MIN_MISSION_S = 2.0
 """A shorter stretch, in s, is no mission."""
-IDLE = 0.12
-IDLE_SPEED = 80.0
-IDLE_SHARE = 0.5
-OFF = 0.02
-OFF_SPEED = 20.0
+MAX_IDLE_COMMAND = 0.12
+MAX_IDLE_SPEED = 80.0
+MAX_IDLE_SHARE = 0.5
+MAX_OFF_COMMAND = 0.02
+MAX_OFF_SPEED = 20.0
 """A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s; but
-not above `IDLE_SHARE` of what carries the vehicle in the air, nor below what is off."""
-FLYING_HEIGHT = 0.12
+not above `MAX_IDLE_SHARE` of what carries the vehicle in the air, nor below what is off."""
+MIN_FLYING_HEIGHT_M = 0.12
 """Higher above the ground than this, in m, the vehicle flies."""
-RESTING_RANGE = 0.01
+MAX_RESTING_RANGE_M = 0.01
 """What stays within this, in m, for a second rests."""
-BIN = 0.1
+BIN_S = 0.1
 """s of which one mean position is taken."""
-FROM_THE_START = 0.5
+MAX_SETPOINT_DELAY_S = 0.5
 """Set-points that begin this soon after the pose, in s, ran all the time."""
-LONGEST_MISSION = 120.0
+MAX_WHOLE_MISSION_S = 120.0
 """s beyond which a mission is taken apart."""
-LONGEST_MANOEUVRE = 60.0
+MAX_MANOEUVRE_S = 60.0
 """s of a manoeuvre, at most."""
-LONGEST_FITTED = 180.0
+MAX_FITTED_S = 180.0
 """s of a long recording that are fitted, at most."""
-SHORTEST_MANOEUVRE = 5.0
+MIN_MANOEUVRE_S = 5.0
 """s of a manoeuvre, at least."""
-HOVER_PAUSE = 3.0
+MIN_HOVER_PAUSE_S = 3.0
 """s of hover that end a manoeuvre."""
-HOVER_BEFORE = 1.0
+HOVER_LEAD_S = 1.0
 """s of hover before it that belong to it: what is simulated begins at rest."""
-HOVER_SPEED, HOVER_TURN_RATE = 0.3, 0.3
+MAX_HOVER_SPEED, MAX_HOVER_TURN_RATE = 0.3, 0.3
 """m/s and rad/s above which a vehicle does more than hover."""
 
 
@@ -86,13 +86,15 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
     """
     pose = series["position"].time
     first, last = float(pose[0]), float(pose[-1])
-    if "attitude" in series and series["attitude"].time[-1] < last - PAUSE:
+    if "attitude" in series and series["attitude"].time[-1] < last - MAX_PAUSE_S:
         last = float(series["attitude"].time[-1])
     setpoints = next((series[n] for n in ("rate_setpoint", "thrust_setpoint") if n in series), None)
     spans = [(-np.inf, np.inf)]
     if setpoints is not None and len(setpoints.time) > 1:
-        spans = stretches(setpoints.time, np.ones(len(setpoints.time), np.bool_), bridged=PAUSE)
-    begun = len(spans) > 1 or spans[0][0] >= first + FROM_THE_START
+        spans = stretches(
+            setpoints.time, np.ones(len(setpoints.time), np.bool_), max_break=MAX_PAUSE_S
+        )
+    begun = len(spans) > 1 or spans[0][0] >= first + MAX_SETPOINT_DELAY_S
     if not begun and "reference_position" in series:
         last = min(last, float(series["reference_position"].time[-1]))
     missions, flying = [], airborne(series)
@@ -105,14 +107,14 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
                 begin = _first_motion(series, flown, min(end, down))
                 begins_with = "the reference's motion" if begin > flown else "flight"
             mission = Mission(begin, min(end, down, last), begins_with)
-            missions += _pieces(mission, series["position"].time)
-    return tuple(m for m in missions if m.end - m.start >= SHORTEST)
+            missions += _split_at_pose_pauses(mission, series["position"].time)
+    return tuple(m for m in missions if m.end - m.start >= MIN_MISSION_S)
 
 
-def _pieces(mission: Mission, pose: Array) -> list[Mission]:
+def _split_at_pose_pauses(mission: Mission, pose: Array) -> list[Mission]:
     """Return a mission without the pauses of its pose, in which nobody knows what flew."""
     inside = pose[(pose >= mission.start) & (pose <= mission.end)]
-    pieces = stretches(inside, np.ones(len(inside), np.bool_), bridged=LONGEST_PAUSE)
+    pieces = stretches(inside, np.ones(len(inside), np.bool_), max_break=MAX_POSE_PAUSE_S)
     if len(pieces) < 2:
         return [mission]
     first, *later = pieces
@@ -130,7 +132,7 @@ def _first_motion(series: Mapping[str, Series], start: float, end: float) -> flo
             samples = series[name].between(start, end)
             known = np.isfinite(samples.values).all(axis=1)
             time, values = samples.time[known], samples.values[known]
-            firsts += time[np.abs(values - values[:1]).max(axis=1) > AT_REST][:1].tolist()
+            firsts += time[np.abs(values - values[:1]).max(axis=1) > MAX_REST_MOTION][:1].tolist()
     return min(firsts, default=start)
 
 
@@ -144,42 +146,44 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
     """
     position = series["position"]
     time, height = position.time, position.values[:, 2]
-    rests = _rests(time, position.values)
+    rests = _is_still(time, position.values)
     idle, observed = _idle(series, time, height)
-    stands = _lasting(time, idle, rests)
-    grounded = stands | (_resting(time, height) & rests & ~observed)
+    stands = _lasting_idle(time, idle, rests)
+    grounded = stands | (_is_on_ground(time, height) & rests & ~observed)
     if not grounded.any():
         return [(float(time[0]), float(time[-1]))]
-    low = grounded | ~(height > _ground(time, height, grounded) + FLYING_HEIGHT)
+    low = grounded | ~(height > _ground_height(time, height, grounded) + MIN_FLYING_HEIGHT_M)
     if not stands.any():  # the ground is a guess, and what passes it without a rest flies
         for first, last in runs(low):
             low[first:last] = (grounded | rests)[first:last].any()
     return stretches(time, ~low)
 
 
-def _rests(time: Array, positions: Array) -> NDArray[np.bool_]:
+def _is_still(time: Array, positions: Array) -> NDArray[np.bool_]:
     """Return at which of n times the (n, 3) positions of a second around stay where they are."""
     from scipy import ndimage  # noqa: PLC0415 (slow to import, seldom needed)
 
-    bins = ((time - time[0]) / BIN).astype(np.int64)
+    bins = ((time - time[0]) / BIN_S).astype(np.int64)
     held, place = np.unique(bins, return_inverse=True)
     counts = np.bincount(place)
     spread = np.zeros(len(held))
-    window = round(1.0 / BIN)
+    window = round(1.0 / BIN_S)
     for column in positions.T:
         means = np.bincount(place, column) / counts
         reach = ndimage.maximum_filter1d(means, window)
         reach -= ndimage.minimum_filter1d(means, window)
         spread = np.maximum(spread, reach)
-    return np.asarray((spread < RESTING_RANGE)[place], dtype=np.bool_)
+    return np.asarray((spread < MAX_RESTING_RANGE_M)[place], dtype=np.bool_)
 
 
-def _lasting(time: Array, idle: NDArray[np.bool_], rests: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _lasting_idle(
+    time: Array, idle: NDArray[np.bool_], rests: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """Return where motors idle, but for moments inside a flight in which the vehicle moves on."""
     lasting = idle.copy()
     for first, last in runs(idle):
         inside = first > 0 and last < len(time)
-        if inside and time[last - 1] - time[first] < PAUSE and not rests[first:last].any():
+        if inside and time[last - 1] - time[first] < MAX_PAUSE_S and not rests[first:last].any():
             lasting[first:last] = False
     return lasting
 
@@ -188,11 +192,11 @@ def _idle(
     series: Mapping[str, Series], time: Array, height: Array
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return at which times the motors idle, and at which times that was recorded."""
-    clear = height > float(np.quantile(height, 0.02)) + 3 * FLYING_HEIGHT
+    clear = height > float(np.quantile(height, 0.02)) + 3 * MIN_FLYING_HEIGHT_M
     for name, limit, off in (
-        ("command", IDLE, OFF),
-        ("rotor_speed", IDLE_SPEED, OFF_SPEED),
-        ("thrust_setpoint", IDLE, OFF),
+        ("command", MAX_IDLE_COMMAND, MAX_OFF_COMMAND),
+        ("rotor_speed", MAX_IDLE_SPEED, MAX_OFF_SPEED),
+        ("thrust_setpoint", MAX_IDLE_COMMAND, MAX_OFF_COMMAND),
     ):
         if name in series and len(series[name].time) > 1:
             samples = series[name]
@@ -200,30 +204,30 @@ def _idle(
             if not known.any():
                 continue
             at = np.interp(time, samples.time[known], np.nanmean(samples.values[known], axis=1))
-            observed = (time >= samples.time[0] - SHORTEST_LANDING) & (
-                time <= samples.time[-1] + SHORTEST_LANDING
+            observed = (time >= samples.time[0] - MIN_LANDING_S) & (
+                time <= samples.time[-1] + MIN_LANDING_S
             )
             flown = at[clear & observed]
-            carries = IDLE_SHARE * float(np.median(flown)) if len(flown) else limit
+            carries = MAX_IDLE_SHARE * float(np.median(flown)) if len(flown) else limit
             idle: NDArray[np.bool_] = np.asarray(at < max(off, min(limit, carries)))
             return observed & idle, observed
     nothing = np.zeros(len(time), dtype=np.bool_)
     return nothing, nothing
 
 
-def _resting(time: Array, height: Array) -> NDArray[np.bool_]:
+def _is_on_ground(time: Array, height: Array) -> NDArray[np.bool_]:
     """Return when the vehicle lies on the ground from which, or to which, it flies."""
     resting = np.zeros(len(time), dtype=np.bool_)
     for near in (time < time[0] + 1.0, time > time[-1] - 1.0):
         level = float(np.median(height[near]))
         still = float(np.ptp(height[near])) < 0.01
         lowest = level < float(np.quantile(height, 0.02)) + 0.03
-        if still and lowest and float(np.quantile(height, 0.9)) - level > 3 * FLYING_HEIGHT:
+        if still and lowest and float(np.quantile(height, 0.9)) - level > 3 * MIN_FLYING_HEIGHT_M:
             resting |= np.abs(height - level) < 0.03
     return resting
 
 
-def _ground(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
+def _ground_height(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
     """Return the height of the ground at each time: where the vehicle last stood, or will stand."""
     where = np.flatnonzero(idle)
     before = np.clip(np.searchsorted(where, np.arange(len(time)), side="right") - 1, 0, None)
@@ -234,13 +238,13 @@ def _ground(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
 
 
 def stretches(
-    time: Array, up: NDArray[np.bool_], *, bridged: float = SHORTEST_LANDING
+    time: Array, flags: NDArray[np.bool_], *, max_break: float = MIN_LANDING_S
 ) -> list[tuple[float, float]]:
     """Return the stretches in which a condition holds, breaks of up to some s bridged."""
-    holds = time[up]
+    holds = time[flags]
     if len(holds) == 0:
         return []
-    parts = np.split(holds, np.flatnonzero(np.diff(holds) > bridged) + 1)
+    parts = np.split(holds, np.flatnonzero(np.diff(holds) > max_break) + 1)
     return [(float(part[0]), float(part[-1])) for part in parts]
 
 
@@ -284,7 +288,9 @@ def _nearly_always(flags: NDArray[np.bool_]) -> bool:
     return float(flags.mean()) > 0.95
 
 
-def manoeuvres(series: Mapping[str, Series], missions: Sequence[Mission]) -> tuple[Mission, ...]:
+def split_into_manoeuvres(
+    series: Mapping[str, Series], missions: Sequence[Mission]
+) -> tuple[Mission, ...]:
     """Return missions, the long ones as manoeuvres, those that show most marked as fitted.
 
     Parameters
@@ -292,63 +298,65 @@ def manoeuvres(series: Mapping[str, Series], missions: Sequence[Mission]) -> tup
     missions
         In the order of flight.
     """
-    if all(mission.end - mission.start <= LONGEST_MISSION for mission in missions):
+    if all(mission.end - mission.start <= MAX_WHOLE_MISSION_S for mission in missions):
         return tuple(missions)
     time, moving, turning = _motion(series)
-    active = np.asarray((moving > HOVER_SPEED) | (turning > HOVER_TURN_RATE), dtype=np.bool_)
+    active = np.asarray(
+        (moving > MAX_HOVER_SPEED) | (turning > MAX_HOVER_TURN_RATE), dtype=np.bool_
+    )
     parts: list[Mission] = []
     for mission in missions:
         parts += (
             [mission]
-            if mission.end - mission.start <= LONGEST_MISSION
-            else _parts(mission, time, active)
+            if mission.end - mission.start <= MAX_WHOLE_MISSION_S
+            else _manoeuvres_of(mission, time, active)
         )
-    vivid = moving**2 + turning**2
+    activity = moving**2 + turning**2
 
-    def shown(part: Mission) -> float:
-        return float(vivid[(time >= part.start) & (time <= part.end)].sum())
+    def activity_in(part: Mission) -> float:
+        return float(activity[(time >= part.start) & (time <= part.end)].sum())
 
-    left, chosen = LONGEST_FITTED, set[int]()
-    for number in sorted(range(len(parts)), key=lambda i: -shown(parts[i])):
-        if parts[number].end - parts[number].start <= left:
-            left -= parts[number].end - parts[number].start
+    remaining, chosen = MAX_FITTED_S, set[int]()
+    for number in sorted(range(len(parts)), key=lambda i: -activity_in(parts[i])):
+        if parts[number].end - parts[number].start <= remaining:
+            remaining -= parts[number].end - parts[number].start
             chosen.add(number)
     return tuple(replace(part, fitted=number in chosen) for number, part in enumerate(parts))
 
 
-def _parts(mission: Mission, time: Array, active: NDArray[np.bool_]) -> list[Mission]:
+def _manoeuvres_of(mission: Mission, time: Array, active: NDArray[np.bool_]) -> list[Mission]:
     """Return the manoeuvres of a mission; its beginning where there are none."""
     inside = active & (time >= mission.start) & (time <= mission.end)
     parts = []
-    for first, last in stretches(time, inside, bridged=HOVER_PAUSE):
-        begin = max(mission.start, first - HOVER_BEFORE)
-        count = int(np.ceil((last - begin) / LONGEST_MANOEUVRE - 1e-9))
+    for first, last in stretches(time, inside, max_break=MIN_HOVER_PAUSE_S):
+        begin = max(mission.start, first - HOVER_LEAD_S)
+        count = int(np.ceil((last - begin) / MAX_MANOEUVRE_S - 1e-9))
         edges = np.linspace(begin, last, max(1, count) + 1)
         parts += [
             Mission(float(a), float(b), "a manoeuvre")
             for a, b in pairwise(edges)
-            if b - a >= SHORTEST_MANOEUVRE
+            if b - a >= MIN_MANOEUVRE_S
         ]
-    whole = replace(mission, end=mission.start + LONGEST_MANOEUVRE)
+    whole = replace(mission, end=mission.start + MAX_MANOEUVRE_S)
     return parts or [whole]
 
 
 def _motion(series: Mapping[str, Series]) -> tuple[Array, Array, Array]:
     """Return (n,) bins' times, speeds in m/s and turn rates in rad/s."""
     position = series["position"]
-    time = np.arange(position.time[0], position.time[-1], BIN) + 0.5 * BIN
-    places = np.column_stack([_means(position, time, column) for column in range(3)])
-    speed = np.linalg.norm(np.gradient(places, BIN, axis=0), axis=1)
+    time = np.arange(position.time[0], position.time[-1], BIN_S) + 0.5 * BIN_S
+    places = np.column_stack([_bin_means(position, time, column) for column in range(3)])
+    speed = np.linalg.norm(np.gradient(places, BIN_S, axis=0), axis=1)
     rates = series.get("body_rate")
     if rates is None:
         return time, speed, np.zeros(len(time))
-    turning = np.column_stack([_means(rates, time, column) for column in range(3)])
+    turning = np.column_stack([_bin_means(rates, time, column) for column in range(3)])
     return time, speed, np.linalg.norm(turning, axis=1)
 
 
-def _means(samples: Series, time: Array, column: int) -> Array:
+def _bin_means(samples: Series, time: Array, column: int) -> Array:
     """Return (n,) means of a column over bins, between those where there is none."""
-    bins = ((samples.time - time[0]) / BIN + 0.5).astype(np.int64)
+    bins = ((samples.time - time[0]) / BIN_S + 0.5).astype(np.int64)
     there = (bins >= 0) & (bins < len(time)) & np.isfinite(samples.values[:, column])
     count = np.bincount(bins[there], minlength=len(time))
     total = np.bincount(bins[there], samples.values[there, column], minlength=len(time))

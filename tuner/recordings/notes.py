@@ -298,7 +298,7 @@ class Damage:
         return replace(self, start=start, end=end)
 
 
-PASSED_OVER = (NoteCode.LAYOUT_UNKNOWN, NoteCode.FIELD_MISSING)
+REJECTED_SOURCE_CODES = (NoteCode.LAYOUT_UNKNOWN, NoteCode.FIELD_MISSING)
 
 
 def reason_in_words(note: Note) -> str:
@@ -325,7 +325,7 @@ def reason_in_words(note: Note) -> str:
 def note_in_words(note: Note) -> str:
     """Return the same, and that a source was passed over for it where it was."""
     reason = reason_in_words(note)
-    return f"passed over: {reason}" if note.code in PASSED_OVER else reason
+    return f"passed over: {reason}" if note.code in REJECTED_SOURCE_CODES else reason
 
 
 def _count(number: int, noun: str) -> str:

@@ -19,16 +19,16 @@ from tuner.recordings.notes import Damage, Note
 
 Nanoseconds = NDArray[np.int64]
 #: Unit of time -> nanoseconds.
-NANOSECONDS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+NS_PER_UNIT = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 
-def reason_of(err: Exception) -> str:
+def short_reason(err: Exception) -> str:
     """Return what a library says of a file in one line, short enough for a message."""
     return " ".join(str(err).split())[:120]
 
 
 #: The one topic of a table.
-ROWS = ""
+TABLE_TOPIC = ""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Clock(Section):
     field
         Its path or column.
     unit
-        Key of `NANOSECONDS`; None is seconds in messages, and told by the step in tables.
+        Key of `NS_PER_UNIT`; None is seconds in messages, and told by the step in tables.
     """
 
     field: str
@@ -57,7 +57,7 @@ class Clock(Section):
     @property
     def nanoseconds(self) -> int:
         """How many ns make its unit."""
-        return NANOSECONDS[self.unit or "s"]
+        return NS_PER_UNIT[self.unit or "s"]
 
     @model_validator(mode="before")
     @classmethod
@@ -101,7 +101,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Usual:
+class FieldLayout:
     """Where a message type holds a signal: its fields, their unit (of `UNITS`) and axes."""
 
     fields: tuple[str, ...]
@@ -110,7 +110,7 @@ class Usual:
 
 
 @dataclass(frozen=True)
-class Contents:
+class ReadResult:
     """The wanted topics of one recording.
 
     Attributes
@@ -139,7 +139,7 @@ class Recording(ABC):
         Of the flight controller, where its log holds them: name -> value.
     units
         Column of a table -> what a row of units says of it.
-    obstacle
+    naming_problem
         Why its fields say nothing by themselves, and what to do; None where they may.
     """
 
@@ -148,9 +148,9 @@ class Recording(ABC):
     topics: Sequence[Topic]
     parameters: Mapping[str, float] = {}
     units: Mapping[str, str] = {}
-    obstacle: tuple[str, str] | None = None
+    naming_problem: tuple[str, str] | None = None
 
-    def usual(self, topic: str, signal: str) -> Usual | None:  # noqa: ARG002
+    def field_layout(self, topic: str, signal: str) -> FieldLayout | None:  # noqa: ARG002
         """Return where messages of this topic's type hold a signal; None if they do not."""
         return None
 
@@ -158,17 +158,17 @@ class Recording(ABC):
     def fields(self, topic: str) -> Sequence[str]:
         """Return the names of a topic's fields, for hints; structures by their first part."""
 
-    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
+    def missing_fields(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return those of some fields that messages of a topic do not have."""
         known = self.fields(topic)
         return tuple(name for name in fields if name not in known)
 
-    def undefined(self, topic: str) -> str | None:  # noqa: ARG002
+    def undefined_type(self, topic: str) -> str | None:  # noqa: ARG002
         """Return the message type of a topic if its definition is nowhere; None if it is known."""
         return None
 
     @abstractmethod
-    def read(self, wanted: Mapping[str, Request]) -> Contents:
+    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
         """Read some topics: topic -> what is wanted of it.
 
         Raises
@@ -191,7 +191,7 @@ class TabularRecording(Recording):
         self.path = path
         self.format = format_name
         self.columns = columns
-        self.topics = (Topic(ROWS, "table", 1),)
+        self.topics = (Topic(TABLE_TOPIC, "table", 1),)
 
     def fields(self, topic: str) -> Sequence[str]:  # noqa: ARG002
         """Return the columns."""

@@ -22,7 +22,7 @@ from tuner.recordings.topics import Source, TopicMap
 from tuner.recordings.unit_detection import ATTITUDES
 
 #: Unit as written -> unit of a topic map.
-UNITS_WRITTEN: Mapping[str, str] = {
+UNIT_SPELLINGS: Mapping[str, str] = {
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "second": "s",
     "ms": "ms", "msec": "ms", "milliseconds": "ms", "us": "us", "µs": "us", "usec": "us",
     "microseconds": "us", "ns": "ns", "nsec": "ns", "nanoseconds": "ns",
@@ -50,7 +50,7 @@ _BATTERY = {"battery_voltage", "vbat", "voltage", "battery", "bat", "batt", "vol
 _TIME = {"time", "t", "timestamp", "stamp", "time_s", "seconds", "__time", "%time",
          "datetime", "date", "rosbagtimestamp", "clock", "elapsed"}  # fmt: skip
 #: Signal -> words that speak of it where its columns are numbered.
-_MATRICES = {
+_NUMBERED_WORDS = {
     "attitude": _ATTITUDE,
     "position": _POSITION - {"xyz"},
     "velocity": _VELOCITY - {"v"},
@@ -58,20 +58,24 @@ _MATRICES = {
     "acceleration": _FORCE - {"a"},
     "angles": {"euler", "rpy", "angles"},
 }
-#: Words of what was wanted, filtered or of another body, never what was measured of the vehicle.
-_OTHER = {"setpoint", "sp", "ref", "reference", "target", "desired", "des", "cmdvel", "goal",
-          "error", "err", "cov", "covariance", "std", "var", "variance", "bias", "raw_adc", "mag",
-          "integral", "delta", "temperature", "temp", "current", "goalpose", "noise"}  # fmt: skip
-#: Words that only say of what, or by whom.
-_BODIES = {"mocap", "vicon", "optitrack", "vrpn", "qualisys", "qtm", "drone", "quad", "uav", "cf",
-           "vehicle", "body", "robot", "crazyflie", "pose", "state", "odom", "odometry", "out",
-           "signals", "local", "world", "global", "marker", "rigid", "gt", "truth", "ground",
-           "log", "sim", "measured", "meas"}  # fmt: skip
-_ESTIMATE = {"est", "estimate", "estimated", "kalman", "ekf", "filtered"}
+#: Words of set-points, errors and other sensors: a column with one is no measured signal.
+_NOT_MEASURED = {
+    "setpoint", "sp", "ref", "reference", "target", "desired", "des", "cmdvel", "goal", "error",
+    "err", "cov", "covariance", "std", "var", "variance", "bias", "raw_adc", "mag", "integral",
+    "delta", "temperature", "temp", "current", "goalpose", "noise",
+}  # fmt: skip
+#: Words that name the body or the source, and no signal.
+_NEUTRAL_WORDS = {
+    "mocap", "vicon", "optitrack", "vrpn", "qualisys", "qtm", "drone", "quad", "uav", "cf",
+    "vehicle", "body", "robot", "crazyflie", "pose", "state", "odom", "odometry", "out", "signals",
+    "local", "world", "global", "marker", "rigid", "gt", "truth", "ground", "log", "sim",
+    "measured", "meas",
+}  # fmt: skip
+_ESTIMATE_WORDS = {"est", "estimate", "estimated", "kalman", "ekf", "filtered"}
 
 
 @dataclass(frozen=True)
-class Guess:
+class ColumnMeaning:
     """What a column's name says.
 
     Attributes
@@ -97,16 +101,16 @@ def split_unit(name: str) -> tuple[str, str | None]:
     """Return a name without the unit behind it, in brackets or a last word, and the unit."""
     match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*)\s*[\])]", name)
     if match and not match[2].isdecimal():
-        unit = UNITS_WRITTEN.get(match[2].strip().lower().replace(" ", "").replace("_", "/"))
+        unit = UNIT_SPELLINGS.get(match[2].strip().lower().replace(" ", "").replace("_", "/"))
         return (match[1].strip(), unit) if unit or not match[2].strip() else (name, None)
     head, _, tail = name.rpartition("_")
-    unit = UNITS_WRITTEN.get(tail.lower())
+    unit = UNIT_SPELLINGS.get(tail.lower())
     if head and unit and len(tail) > 1 and tail.lower() not in ("rpm", "pwm", "gs", "rads"):
         return head, unit
     return name, None
 
 
-def guess(name: str, written: str | None = None) -> Guess | None:
+def column_meaning(name: str, written: str | None = None) -> ColumnMeaning | None:
     """Return what a column's name says; None where it says nothing that a flight needs.
 
     Parameters
@@ -116,47 +120,47 @@ def guess(name: str, written: str | None = None) -> Guess | None:
     """
     bare, unit = split_unit(name)
     if written is not None:
-        unit = UNITS_WRITTEN.get(written.strip("[]() ").lower(), unit)
+        unit = UNIT_SPELLINGS.get(written.strip("[]() ").lower(), unit)
     words = _words(bare)
-    if not words or _OTHER & set(words):
+    if not words or _NOT_MEASURED & set(words):
         return None
     whole = "_".join(words)
     last = re.split(r"[./]", bare.strip().lower())[-1]
     if whole in _TIME or last in _TIME:
-        return Guess("time", "", unit if unit in TIME_UNITS else None, "")
+        return ColumnMeaning("time", "", unit if unit in TIME_UNITS else None, "")
     unit = None if unit in TIME_UNITS - {"s"} else unit
     unit = None if unit == "s" else unit
     if words[-1] in ("roll", "pitch", "yaw") and not (_RATE & set(words[:-1])):
-        return Guess("angles", words[-1], unit, "_".join(words[:-1]))
+        return ColumnMeaning("angles", words[-1], unit, "_".join(words[:-1]))
     axis, rest = _axis(words)
     if axis is None:
         if whole in _BATTERY or (words[-1] in ("voltage", "vbat", "v") and _BATTERY & set(words)):
-            return Guess("battery_voltage", "", unit, "")
+            return ColumnMeaning("battery_voltage", "", unit, "")
         return None
-    return _by_words(axis, rest, unit)
+    return _meaning_of_axis(axis, rest, unit)
 
 
-def _by_words(axis: str, rest: list[str], unit: str | None) -> Guess | None:
+def _meaning_of_axis(axis: str, rest: list[str], unit: str | None) -> ColumnMeaning | None:
     """Return the signal that the words before an axis or a rotor's number mean."""
     joined = set(rest) | {"_".join(rest[i : i + 2]) for i in range(len(rest) - 1)}
-    signal = _numbered(joined, unit) if axis.isdecimal() else _along(axis, joined)
+    signal = _signal_of_numbered(joined, unit) if axis.isdecimal() else _signal_along(axis, joined)
     if signal is None:
         return None
     if signal == "rotor_speed" and unit is None and any("rpm" in word for word in joined):
         unit = "rpm"
-    return Guess(signal, axis, None if signal == "attitude" else unit, "_".join(rest))
+    return ColumnMeaning(signal, axis, None if signal == "attitude" else unit, "_".join(rest))
 
 
-def _numbered(words: set[str], unit: str | None) -> str | None:
+def _signal_of_numbered(words: set[str], unit: str | None) -> str | None:
     """Return the signal of a numbered column."""
     if unit in ("rpm", "hz") or words & _SPEED:
         return "rotor_speed"
     if words & _COMMAND:
         return "command"
-    return next((signal for signal, known in _MATRICES.items() if words & known), None)
+    return next((signal for signal, known in _NUMBERED_WORDS.items() if words & known), None)
 
 
-def _along(axis: str, words: set[str]) -> str | None:
+def _signal_along(axis: str, words: set[str]) -> str | None:
     """Return the signal of a column that is called by an axis."""
     single = {word for word in words if "_" not in word}
     turning = bool(words & {"ang", "angular"})
@@ -166,7 +170,7 @@ def _along(axis: str, words: set[str]) -> str | None:
         ("body_rate", bool(words & (_RATE - {"angular"})) or (turning and moving)),
         ("acceleration", bool(words & _FORCE) and not turning),
         ("velocity", moving),
-        ("position", bool(words & _POSITION) or single <= _ESTIMATE | _BODIES),
+        ("position", bool(words & _POSITION) or single <= _ESTIMATE_WORDS | _NEUTRAL_WORDS),
     )
     return next((signal for signal, holds in rules if holds), None)
 
@@ -182,7 +186,7 @@ def _words(name: str) -> list[str]:
 def _axis(words: list[str]) -> tuple[str | None, list[str]]:
     """Return the axis or the rotor's number that a name ends or begins with, and the rest."""
     last = words[-1]
-    if last in _ESTIMATE and len(words) > 1:
+    if last in _ESTIMATE_WORDS and len(words) > 1:
         axis, rest = _axis(words[:-1])
         return axis, [*rest, last]
     if last in ("w", "x", "y", "z") or (last.isdecimal() and len(last) == 1 and len(words) > 1):
@@ -213,7 +217,7 @@ AXES: Mapping[str, Sequence[str]] = {
 }
 
 
-def recognised(
+def sources_by_name(
     columns: Sequence[str], units: Mapping[str, str]
 ) -> tuple[Clock | None, dict[str, Source]]:
     """Return the time, and the signals, that a table's columns hold by their names.
@@ -223,7 +227,9 @@ def recognised(
     units
         Column -> unit, of a row of units.
     """
-    guesses = {name: g for name in columns if (g := guess(name, units.get(name))) is not None}
+    guesses = {
+        name: g for name in columns if (g := column_meaning(name, units.get(name))) is not None
+    }
     times = [name for name, g in guesses.items() if g.signal == "time"]
     stamps = [name for name in times if name.endswith("header.stamp")]  # rather than of recording
     time = next(iter((*stamps, *times)), None)
@@ -233,7 +239,7 @@ def recognised(
         for name, g in guesses.items():
             if g.signal == signal:
                 groups.setdefault(g.group, {}).setdefault(g.axis, name)
-        for _, held in sorted(groups.items(), key=lambda item: _rank(item[0])):
+        for _, held in sorted(groups.items(), key=lambda item: _group_rank(item[0])):
             count = range(len(axes))
             ways = (axes, [str(i) for i in count], [str(i + 1) for i in count])
             numbers = {axis for axis in held if axis.isdecimal()}
@@ -254,12 +260,12 @@ def recognised(
     return None if known is None else Clock.model_validate(known), found
 
 
-def _rank(group: str) -> tuple[bool, int]:
+def _group_rank(group: str) -> tuple[bool, int]:
     """Return the order in which the groups that hold a signal are preferred: measured, short."""
-    return bool(_ESTIMATE & set(group.split("_"))), len(group)
+    return bool(_ESTIMATE_WORDS & set(group.split("_"))), len(group)
 
 
-MOST_NAMED = 12
+MAX_NAMED = 12
 """Columns that a note names, at most."""
 
 
@@ -313,7 +319,7 @@ def locate(
     RecordingError
         If `strict`: a topic is there, but not what the map says of it.
     """
-    times = [recording.lacking("", (clock.field,)) for clock in topics.time]
+    times = [recording.missing_fields("", (clock.field,)) for clock in topics.time]
     if is_tabular(recording.format) and all(times):
         return {}, ()
     places: dict[str, Place] = {}
@@ -348,13 +354,13 @@ def _matching(recording: Recording, source: Source) -> list[str]:
 
 def _place(recording: Recording, signal: str, source: Source, topic: str) -> Place | Note | None:
     """Return where a topic holds a signal, or why it does not: None if nobody expects it to."""
-    usual = recording.usual(topic, signal)
+    usual = recording.field_layout(topic, signal)
     fields = source.fields or (usual.fields if usual else None)
     if fields is None:
         kind = next(known.type for known in recording.topics if known.name == topic)
         wild = "*" in source.topic
         return None if wild else Note(NoteCode.LAYOUT_UNKNOWN, topic=topic, names=(kind, signal))
-    missing = recording.lacking(topic, fields)
+    missing = recording.missing_fields(topic, fields)
     if missing:
         # nobody expects a table, or any topic whatsoever, to hold all that a map knows
         anywhere = is_tabular(recording.format) or source.topic == "*"
@@ -368,7 +374,9 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
     return Place(source, topic, fields, unit, source.frame or (usual.frame if usual else "enu_flu"))
 
 
-def unread(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) -> tuple[Note, ...]:
+def unread_columns(
+    recording: Recording, topics: TopicMap, places: Mapping[str, Place]
+) -> tuple[Note, ...]:
     """Return a note on the columns of a table that hold no signal and no time, if there are any.
 
     A column under another name than the map's would be missed in silence otherwise.
@@ -379,11 +387,13 @@ def unread(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) 
     read |= {clock.field for clock in topics.time}
     columns = [name for topic in recording.topics for name in recording.fields(topic.name)]
     others = tuple(name for name in columns if name not in read)
-    note = Note(NoteCode.COLUMNS_UNREAD, "info", count=len(others), names=others[:MOST_NAMED])
+    note = Note(NoteCode.COLUMNS_UNREAD, "info", count=len(others), names=others[:MAX_NAMED])
     return (note,) if others else ()
 
 
-def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tuple[Note, ...]]:
+def with_columns_by_name(
+    recording: Recording, topics: TopicMap
+) -> tuple[TopicMap, tuple[Note, ...]]:
     """Return a map of a table with the columns that it lacks and whose names say what they hold.
 
     Returns
@@ -394,7 +404,7 @@ def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tupl
     if not is_tabular(recording.format):
         return topics, ()
     columns = recording.fields("")
-    time, found = recognised(columns, recording.units)
+    time, found = sources_by_name(columns, recording.units)
     held = locate(recording, topics)[0]
     if not {"position", "attitude"} <= set(held) and len(found) + bool(time) > len(held):
         topics = topics.replace(name="the columns' names", time=(), signals={})
@@ -414,20 +424,22 @@ def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tupl
     return whole.replace(signals=signals), tuple(notes)
 
 
-def _obstacle(recording: Recording, topics: TopicMap, what: str, *, given: bool) -> tuple[str, str]:
+def _table_problem(
+    recording: Recording, topics: TopicMap, what: str, *, by_user: bool
+) -> tuple[str, str]:
     """Return why a table holds no pose, and what to do."""
     columns = recording.fields("")
-    if recording.obstacle is not None and not given:
-        return recording.obstacle
-    listed = f"{', '.join(columns[:MOST_NAMED])}{', ...' if len(columns) > MOST_NAMED else ''}"
+    if recording.naming_problem is not None and not by_user:
+        return recording.naming_problem
+    listed = f"{', '.join(columns[:MAX_NAMED])}{', ...' if len(columns) > MAX_NAMED else ''}"
     clocks = [clock.field for clock in topics.time]
     if not any(field in columns for field in clocks):
         named = f"the topic map '{topics.name}' finds no time: no column {' or '.join(clocks)}"
         return (
-            named if given else f"has no column that is a time among {listed}",
+            named if by_user else f"has no column that is a time among {listed}",
             "name it under 'time' in a topic map (--topics FILE)",
         )
-    if given:
+    if by_user:
         sources = [
             source for name in what.split(" and ") for source in topics.signals.get(name, ())
         ]
@@ -444,11 +456,13 @@ def _obstacle(recording: Recording, topics: TopicMap, what: str, *, given: bool)
     )
 
 
-def _without_definition(recording: Recording, signals: Iterable[str]) -> RecordingError | None:
+def _type_error(recording: Recording, signals: Iterable[str]) -> RecordingError | None:
     """Return the error of topics that hold some signals, if their types are defined nowhere."""
     for topic in recording.topics:
-        holds = topic.count and any(recording.usual(topic.name, signal) for signal in signals)
-        if holds and recording.undefined(topic.name) is not None:
+        holds = topic.count and any(
+            recording.field_layout(topic.name, signal) for signal in signals
+        )
+        if holds and recording.undefined_type(topic.name) is not None:
             return RecordingError(
                 recording.path,
                 f"holds {topic.name}, but not the definition of its type {topic.type}, which "
@@ -460,13 +474,13 @@ def _without_definition(recording: Recording, signals: Iterable[str]) -> Recordi
 
 
 def pose_error(
-    recording: Recording, topics: TopicMap, places: Mapping[str, Place], *, given: bool = False
+    recording: Recording, topics: TopicMap, places: Mapping[str, Place], *, by_user: bool = False
 ) -> RecordingError | None:
     """Return why no pose was found, with the nearest topic names; None where one was.
 
     Parameters
     ----------
-    given
+    by_user
         Whether a user wrote the map.
     """
     missing = [signal for signal in ("position", "attitude") if signal not in places]
@@ -474,15 +488,17 @@ def pose_error(
         return None
     what = " and ".join(missing)
     if is_tabular(recording.format):
-        return RecordingError(recording.path, *_obstacle(recording, topics, what, given=given))
+        return RecordingError(
+            recording.path, *_table_problem(recording, topics, what, by_user=by_user)
+        )
     sources = [source for signal in missing for source in topics.signals.get(signal, ())]
     if not sources:
         named = f"the topic map '{topics.name}' names no topic for {what}"
         return RecordingError(recording.path, named, "add one")
-    return _without_definition(recording, missing) or _no_topic(recording, what, sources)
+    return _type_error(recording, missing) or _topic_error(recording, what, sources)
 
 
-def _no_topic(recording: Recording, what: str, sources: Sequence[Source]) -> RecordingError:
+def _topic_error(recording: Recording, what: str, sources: Sequence[Source]) -> RecordingError:
     """Return the error that no topic holds a pose, with the nearest names."""
     path, names = recording.path, [topic.name for topic in recording.topics if topic.count]
     if all(source.topic == "*" for source in sources):

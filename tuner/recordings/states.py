@@ -18,18 +18,18 @@ from tuner.core.numerics import Array, robust_sd
 from tuner.recordings.flight import SIGNALS, InitialState, Series
 from tuner.recordings.interpolation import body_rate_from
 
-FILTER_HALF_WIDTH = 0.03
+MIN_HALF_WIDTH_S = 0.03
 """s on either side of a time from which its state is filtered."""
-FEWEST_SAMPLES = 3
+MIN_SAMPLES_EACH_SIDE = 3
 """Samples on either side that it is filtered from at least, where they follow each other slowly."""
-FARTHEST_SAMPLE = 0.5
+MAX_SAMPLE_DISTANCE_S = 0.5
 """s beyond which no sample says anything of a time."""
-HOVER = 1.0
+HOVER_WINDOW_S = 1.0
 """Seconds before the mission in which a steady hover is looked for."""
-IN_MOTION = 0.1
+HALF_WINDOW_S = 0.1
 """Seconds on each side of the start for the polynomial of a vehicle in motion."""
-HOVER_SPEED = 0.05
-HOVER_TURN_RATE = 0.1
+MAX_HOVER_SPEED = 0.05
+MAX_HOVER_TURN_RATE = 0.1
 """A hover moves slower than this, in m/s, and turns slower than this, in rad/s."""
 
 
@@ -67,17 +67,17 @@ def states_at(series: Mapping[str, Series], times: Array) -> States:
     def read(name: str) -> Array:
         if name not in series:
             return np.full((len(times), SIGNALS[name][0]), np.nan)
-        return filtered(series[name], times)
+        return local_parabolas(series[name], times)
 
     velocity = read("velocity")
     if not np.isfinite(velocity).all():
-        slope = filtered(series["position"], times, derivative=1)
+        slope = local_parabolas(series["position"], times, derivative=1)
         velocity = np.where(np.isfinite(velocity), velocity, slope)
     attitude = read("attitude")
     attitude = attitude / np.linalg.norm(attitude, axis=1, keepdims=True)
     body_rate = read("body_rate")
     if not np.isfinite(body_rate).all():
-        turning = filtered(series["attitude"], times, derivative=1)
+        turning = local_parabolas(series["attitude"], times, derivative=1)
         body_rate = np.where(np.isfinite(body_rate), body_rate, body_rate_from(attitude, turning))
     return States(
         time=np.asarray(times, float),
@@ -93,10 +93,10 @@ def states_at(series: Mapping[str, Series], times: Array) -> States:
 def half_width(series: Series) -> float:
     """Return the s on either side of a time from which a signal is filtered."""
     gap = float(np.median(np.diff(series.time))) if len(series.time) > 1 else 0.0
-    return max(FILTER_HALF_WIDTH, (FEWEST_SAMPLES + 0.5) * gap)
+    return max(MIN_HALF_WIDTH_S, (MIN_SAMPLES_EACH_SIDE + 0.5) * gap)
 
 
-def filtered(series: Series, times: Array, *, derivative: int = 0) -> Array:
+def local_parabolas(series: Series, times: Array, *, derivative: int = 0) -> Array:
     """Return a signal's columns (n, k), or their derivatives in 1/s, at some times (n,).
 
     NaN where fewer than two samples lie around a time.
@@ -105,11 +105,13 @@ def filtered(series: Series, times: Array, *, derivative: int = 0) -> Array:
     half = half_width(series)
     for column in series.values.T:
         known = np.isfinite(column)
-        columns.append(_parabolas(series.time[known], column[known], times, half, derivative))
+        columns.append(_local_parabola(series.time[known], column[known], times, half, derivative))
     return np.column_stack(columns)
 
 
-def _parabolas(time: Array, values: Array, times: Array, half: float, derivative: int) -> Array:
+def _local_parabola(
+    time: Array, values: Array, times: Array, half: float, derivative: int
+) -> Array:
     """Return the parabolas' values, or slopes, at some times; lines where samples are few."""
     if len(time) < 2:
         return np.full(len(times), np.nan)
@@ -131,7 +133,7 @@ def _parabolas(time: Array, values: Array, times: Array, half: float, derivative
     matrix[line, 2, :], matrix[line, :, 2], matrix[line, 2, 2] = 0.0, 0.0, 1.0
     right[line, 2] = 0.0
     found = np.linalg.solve(matrix, right[..., None])[..., 0]
-    near = np.abs(time[place] - times[:, None]).min(axis=1) <= FARTHEST_SAMPLE
+    near = np.abs(time[place] - times[:, None]).min(axis=1) <= MAX_SAMPLE_DISTANCE_S
     return np.where(near, found[:, derivative] / half**derivative, np.nan)
 
 
@@ -147,11 +149,11 @@ def initial_state(series: Mapping[str, Series]) -> InitialState:
         columns = SIGNALS[name][0]
         if name not in series:
             return np.full(columns, np.nan)
-        return np.array([_estimate(series[name], c, hover, line) for c in range(columns)])
+        return np.array([_at_start(series[name], c, hover, line) for c in range(columns)])
 
     velocity = at_start("velocity")
     if not np.isfinite(velocity).all():
-        velocity = np.array([_estimate(series["position"], c, False, True, 1) for c in range(3)])
+        velocity = np.array([_at_start(series["position"], c, False, True, 1) for c in range(3)])
     attitude = at_start("attitude")
     rate = at_start("body_rate")
     return InitialState(
@@ -164,7 +166,7 @@ def initial_state(series: Mapping[str, Series]) -> InitialState:
     )
 
 
-def position_error(series: Mapping[str, Series], noise: float) -> float:
+def initial_position_error(series: Mapping[str, Series], noise: float) -> float:
     """Return the standard error in m of the position (each axis) in `initial_state`.
 
     That of the end of a line through samples of a second, or of the middle of a parabola through
@@ -183,31 +185,35 @@ def position_error(series: Mapping[str, Series], noise: float) -> float:
 
 def in_hover(series: Mapping[str, Series]) -> bool:
     """Return whether the vehicle hovers through the last second before time 0."""
-    position = series["position"].between(-HOVER, 0.0)
-    if len(position.time) < 5 or position.time[0] > -0.8 * HOVER:
+    position = series["position"].between(-HOVER_WINDOW_S, 0.0)
+    if len(position.time) < 5 or position.time[0] > -0.8 * HOVER_WINDOW_S:
         return False
     slope = np.polyfit(position.time, position.values, 1)[0]
     swing = np.quantile(position.values, 0.95, axis=0) - np.quantile(position.values, 0.05, axis=0)
-    if np.abs(slope).max() > HOVER_SPEED or swing.max() > HOVER_SPEED * HOVER:
+    if np.abs(slope).max() > MAX_HOVER_SPEED or swing.max() > MAX_HOVER_SPEED * HOVER_WINDOW_S:
         return False
     if "body_rate" not in series:
         return True
-    rates = series["body_rate"].between(-HOVER, 0.0).values
-    return len(rates) > 0 and bool(np.abs(np.median(rates, axis=0)).max() < HOVER_TURN_RATE)
+    rates = series["body_rate"].between(-HOVER_WINDOW_S, 0.0).values
+    return len(rates) > 0 and bool(np.abs(np.median(rates, axis=0)).max() < MAX_HOVER_TURN_RATE)
 
 
 def _near_start(series: Series, hover: bool) -> Series:
     """Return the samples that tell of the start."""
-    return series.between(-HOVER, 0.0) if hover else series.between(-IN_MOTION, IN_MOTION)
+    return (
+        series.between(-HOVER_WINDOW_S, 0.0)
+        if hover
+        else series.between(-HALF_WINDOW_S, HALF_WINDOW_S)
+    )
 
 
-def _estimate(series: Series, column: int, hover: bool, line: bool, derivative: int = 0) -> float:
+def _at_start(series: Series, column: int, hover: bool, line: bool, derivative: int = 0) -> float:
     """Return one column, or its derivative, at time 0."""
     near = _near_start(series, hover)
     measured = np.isfinite(near.values[:, column])
     time, values = near.time[measured], near.values[measured, column]
     if len(time) == 0:
-        return float("nan") if derivative else _nearest(series, column)
+        return float("nan") if derivative else _nearest_sample(series, column)
     if hover:
         middle = np.median(values)
         spread = robust_sd(values - middle) + 1e-12
@@ -222,7 +228,7 @@ def _estimate(series: Series, column: int, hover: bool, line: bool, derivative: 
     return float(coefficients[-1 - derivative])
 
 
-def _nearest(series: Series, column: int) -> float:
+def _nearest_sample(series: Series, column: int) -> float:
     """Return the sample nearest to the start, if there is one within half a second."""
     measured = np.flatnonzero(np.isfinite(series.values[:, column]))
     if len(measured) == 0:

@@ -1,7 +1,7 @@
 """Tables: CSV and Parquet, one row a time, one column a number; their times as nanoseconds.
 
 Nothing in a table says in which unit its times are. How often a flight is sampled does: between
-`SLOWEST` and `FASTEST` Hz exactly one of s, ms, µs and ns has any given step.
+`MIN_SAMPLE_RATE_HZ` and `MAX_SAMPLE_RATE_HZ` Hz exactly one of s, ms, µs and ns has any given step.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ from pyarrow import csv as arrow_csv
 
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
-from tuner.recordings.formats import LONGEST_LINE, layout_of
+from tuner.recordings.formats import MAX_LINE_BYTES, layout_of
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode
 from tuner.recordings.recording import (
-    NANOSECONDS,
-    ROWS,
+    NS_PER_UNIT,
+    TABLE_TOPIC,
     Clock,
-    Contents,
     Nanoseconds,
+    ReadResult,
     Request,
     Samples,
     TabularRecording,
-    reason_of,
+    short_reason,
 )
 
 #: Tables with more columns, or more cells to be read, are no flight.
-MOST_COLUMNS = 10_000
-MOST_CELLS = 500_000_000
+MAX_COLUMNS = 10_000
+MAX_CELLS = 500_000_000
 #: Nor are those that hold so many cells in each byte, for numbers differ; small ones may.
-MOST_CELLS_A_BYTE, CELLS_AT_LEAST = 20, 20_000_000
+MAX_CELLS_PER_BYTE, MIN_CELL_LIMIT = 20, 20_000_000
 
 
 class Table(TabularRecording):
@@ -75,17 +75,17 @@ class Table(TabularRecording):
         else:
             self._layout = layout_of(path)
             self.units, columns = self._layout.units, list(self._layout.columns)
-        if len(set(columns)) < 2 or len(columns) > MOST_COLUMNS:
+        if len(set(columns)) < 2 or len(columns) > MAX_COLUMNS:
             raise RecordingError(
                 path, f"{len(columns)} columns are no table of a flight", "check its first line"
             )
         super().__init__(path, "table", columns)
 
-    def read(self, wanted: Mapping[str, Request]) -> Contents:
+    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
         """Read the wanted columns."""
-        if ROWS not in wanted:
-            return Contents({})
-        request = wanted[ROWS]
+        if TABLE_TOPIC not in wanted:
+            return ReadResult({})
+        request = wanted[TABLE_TOPIC]
         clock = self.clock(request)
         names = list(dict.fromkeys([clock.field, *request.fields]))
         table = self._read(names)
@@ -96,10 +96,10 @@ class Table(TabularRecording):
         kept = time != NO_TIME
         if not kept.all():
             lost = int((~kept).sum())
-            notes.append(Note(NoteCode.ROWS_WITHOUT_TIME, topic=ROWS, count=lost))
+            notes.append(Note(NoteCode.ROWS_WITHOUT_TIME, topic=TABLE_TOPIC, count=lost))
         fields = {name: values[kept] for name, values in fields.items()}
         samples = Samples(time[kept], time[kept], fields)
-        return Contents({ROWS: samples}, tuple(notes), tuple(damage))
+        return ReadResult({TABLE_TOPIC: samples}, tuple(notes), tuple(damage))
 
     def _parquet_columns(self) -> list[str]:
         from pyarrow import parquet  # noqa: PLC0415 (a third of a second)
@@ -109,11 +109,11 @@ class Table(TabularRecording):
                 self._rows = file.metadata.num_rows
                 return list(file.schema_arrow.names)
         except (ArrowException, OSError, ValueError) as err:
-            raise RecordingError(self.path, _why(err), "write it again") from None
+            raise RecordingError(self.path, _unreadable_reason(err), "write it again") from None
 
     def _read(self, names: list[str]) -> pyarrow.Table:
         cells, size = self._rows * len(names), self.path.stat().st_size
-        if cells > min(MOST_CELLS, max(CELLS_AT_LEAST, MOST_CELLS_A_BYTE * size)):
+        if cells > min(MAX_CELLS, max(MIN_CELL_LIMIT, MAX_CELLS_PER_BYTE * size)):
             raise RecordingError(self.path, "claims an absurd size", "write it again")
         try:
             if self._parquet:
@@ -124,7 +124,7 @@ class Table(TabularRecording):
         except MemoryError:
             raise RecordingError(self.path, "claims an absurd size", "write it again") from None
         except Exception as err:  # whatever a hostile table makes of the library
-            raise RecordingError(self.path, _why(err), "write it again") from None
+            raise RecordingError(self.path, _unreadable_reason(err), "write it again") from None
 
     def _read_csv(self, names: list[str]) -> pyarrow.Table:
 
@@ -138,7 +138,7 @@ class Table(TabularRecording):
             self.path if layout.separator != " " else _single_blanks(self.path),
             read_options=arrow_csv.ReadOptions(
                 use_threads=False,
-                block_size=4 * LONGEST_LINE,
+                block_size=4 * MAX_LINE_BYTES,
                 skip_rows=layout.lines_before,
                 column_names=self.columns,
                 encoding=layout.encoding,
@@ -165,18 +165,18 @@ def _single_blanks(path: Path) -> io.BytesIO:
         return io.BytesIO(b"\n".join(b" ".join(line.split()) for line in stream))
 
 
-def _why(err: Exception) -> str:
-    return f"is no readable table ({reason_of(err)})"
+def _unreadable_reason(err: Exception) -> str:
+    return f"is no readable table ({short_reason(err)})"
 
 
 #: Stands for a row without a time.
 NO_TIME = np.iinfo(np.int64).min
 #: Hz at which flights are sampled: a thousand apart, as the units of time are.
-SLOWEST, FASTEST = 3.0, 3000.0
+MIN_SAMPLE_RATE_HZ, MAX_SAMPLE_RATE_HZ = 3.0, 3000.0
 #: Rows that one stamp may be on, before it counts as one of too few digits.
-ROWS_A_STAMP = 10
+MAX_ROWS_PER_STAMP = 10
 #: Fields by whose samples the step is told.
-MOST_FIELDS = 24
+MAX_FIELDS = 24
 UNIT_NAMES = {
     "s": "in seconds",
     "ms": "in milliseconds",
@@ -186,7 +186,7 @@ UNIT_NAMES = {
 
 _DATE = r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}:\d{2}(\.\d{1,9})?(Z|[+-]\d{2}(:?\d{2})?)?$"
 _TIME_OF_DAY = r"^\d{2}:\d{2}:\d{2}(\.\d{1,9})?$"
-_DAY = 24 * 3600 * NANOSECONDS["s"]
+_DAY = 24 * 3600 * NS_PER_UNIT["s"]
 
 
 def read_times(
@@ -217,17 +217,17 @@ def read_times(
         whole = compute.cast(compute.cast(column, "timestamp[ns]"), int64())
         return np.asarray(array_of(compute.fill_null(whole, NO_TIME)), dtype=np.int64), ()
     numbers = numbers_of(column)
-    sampled = [np.isfinite(field) for field in list(fields)[:MOST_FIELDS]] or [np.isfinite(numbers)]
+    sampled = [np.isfinite(field) for field in list(fields)[:MAX_FIELDS]] or [np.isfinite(numbers)]
     if is_text(column) and not np.isfinite(numbers).any():
         times, unit = _dates(path, column, clock.field), None
     else:
-        unit = None if clock.unit else _unit(path, clock.field, numbers, sampled)
-        times = _whole(column, numbers, NANOSECONDS[clock.unit or unit or "s"])
-    _require_digits(path, column, times, sampled)
+        unit = None if clock.unit else _unit_by_step(path, clock.field, numbers, sampled)
+        times = _whole_nanoseconds(column, numbers, NS_PER_UNIT[clock.unit or unit or "s"])
+    _require_fine_stamps(path, column, times, sampled)
     if unit is None or unit == "s":
         return times, ()
     names = (clock.field, UNIT_NAMES[unit])
-    return times, (Note(NoteCode.UNIT_READ, topic=ROWS, count=len(times), names=names),)
+    return times, (Note(NoteCode.UNIT_READ, topic=TABLE_TOPIC, count=len(times), names=names),)
 
 
 def numbers_of(column: pyarrow.ChunkedArray) -> Array:
@@ -261,7 +261,9 @@ def _number(cell: object) -> float:
         return float("nan")
 
 
-def _unit(path: Path, field: str, numbers: Array, sampled: list[NDArray[np.bool_]]) -> str | None:
+def _unit_by_step(
+    path: Path, field: str, numbers: Array, sampled: list[NDArray[np.bool_]]
+) -> str | None:
     """Return the unit in which samples follow each other as those of a flight do."""
     steps = []
     for there in sampled:
@@ -270,8 +272,8 @@ def _unit(path: Path, field: str, numbers: Array, sampled: list[NDArray[np.bool_
     if not np.isfinite(steps).any():
         return None
     step = float(np.nanmedian(steps))
-    for unit, factor in NANOSECONDS.items():
-        if SLOWEST <= NANOSECONDS["s"] / (step * factor) < FASTEST:
+    for unit, factor in NS_PER_UNIT.items():
+        if MIN_SAMPLE_RATE_HZ <= NS_PER_UNIT["s"] / (step * factor) < MAX_SAMPLE_RATE_HZ:
             return unit
     raise RecordingError(
         path,
@@ -281,7 +283,7 @@ def _unit(path: Path, field: str, numbers: Array, sampled: list[NDArray[np.bool_
     )
 
 
-def _whole(column: pyarrow.ChunkedArray, numbers: Array, unit: int) -> Nanoseconds:
+def _whole_nanoseconds(column: pyarrow.ChunkedArray, numbers: Array, unit: int) -> Nanoseconds:
     """Return a column of numbers in whole ns, with every digit that a text holds."""
     known = np.isfinite(numbers) & (np.abs(numbers) < 9e18 / unit)
     result = np.full(len(numbers), NO_TIME, dtype=np.int64)
@@ -314,7 +316,7 @@ def _dates(path: Path, column: pyarrow.ChunkedArray, field: str) -> Nanoseconds:
             continue
         whole = compute.fill_null(compute.cast(stamps, pyarrow.int64()), NO_TIME)
         times = np.asarray(np.from_dlpack(whole), dtype=np.int64)
-        return _over_midnight(times) if only_of_day else times
+        return _with_days_counted(times) if only_of_day else times
     first = next((cell for cell in column.to_pylist() if cell), "")
     raise RecordingError(
         path,
@@ -323,7 +325,7 @@ def _dates(path: Path, column: pyarrow.ChunkedArray, field: str) -> Nanoseconds:
     )
 
 
-def _over_midnight(times: Nanoseconds) -> Nanoseconds:
+def _with_days_counted(times: Nanoseconds) -> Nanoseconds:
     known = times != NO_TIME
     on = times[known]
     days = np.concatenate([[0], np.cumsum(np.diff(on) < -_DAY // 2)])
@@ -332,7 +334,7 @@ def _over_midnight(times: Nanoseconds) -> Nanoseconds:
     return result
 
 
-def _require_digits(
+def _require_fine_stamps(
     path: Path,
     column: pyarrow.ChunkedArray,
     times: Nanoseconds,
@@ -342,7 +344,7 @@ def _require_digits(
     there = times[max(sampled, key=np.count_nonzero)]
     there = there[there != NO_TIME]
     different = len(np.unique(there))
-    if len(there) >= 2 * ROWS_A_STAMP and different * ROWS_A_STAMP <= len(there):
+    if len(there) >= 2 * MAX_ROWS_PER_STAMP and different * MAX_ROWS_PER_STAMP <= len(there):
         first = str(column[0].as_py()).strip()[:30]
         raise RecordingError(
             path,

@@ -24,7 +24,7 @@ from tuner.recordings.unit_detection import ATTITUDES, UNITS
 from tuner.vehicle.motor_orders import MotorOrder
 
 #: Maps may extend maps this often.
-DEEPEST = 3
+MAX_EXTENSIONS = 3
 
 
 def _as_list(value: object) -> object:
@@ -186,7 +186,7 @@ def load_topic_map(reference: str | Path, *, base: Path | None = None, depth: in
         topic_map = topic_map.model_copy(update={"messages": messages})
     if topic_map.extends is None:
         return topic_map
-    if depth >= DEEPEST:
+    if depth >= MAX_EXTENSIONS:
         raise ConfigError(path, f"extends '{topic_map.extends}' in a circle", "break it")
     under = load_topic_map(topic_map.extends, base=path.parent, depth=depth + 1)
     if under.format != topic_map.format:

@@ -25,27 +25,27 @@ from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import (
-    NANOSECONDS,
+    NS_PER_UNIT,
     Clock,
-    Contents,
+    FieldLayout,
+    ReadResult,
     Recording,
     Request,
     Samples,
     Topic,
-    Usual,
-    reason_of,
+    short_reason,
 )
 
 #: A ULog message cannot be longer; a format that claims so is no honest one.
-LONGEST_MESSAGE = 65_535
+MAX_MESSAGE_BYTES = 65_535
 #: What a log begins with.
 MAGIC = b"ULog\x01\x12\x35"
 #: Bytes before its first message.
-HEADER = 16
+HEADER_BYTES = 16
 #: Logs are read into memory; PX4 writes some 10 MB a minute.
-LARGEST = 4 << 30
+MAX_LOG_BYTES = 4 << 30
 #: Bytes that are looked through at once.
-READ_AT_ONCE = 1 << 22
+BLOCK_BYTES = 1 << 22
 
 #: Message -> its fields: type, number, name.
 Formats = dict[str, list[tuple[str, int, str]]]
@@ -71,10 +71,10 @@ class ULogRecording(Recording):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if path.stat().st_size > LARGEST:
+        if path.stat().st_size > MAX_LOG_BYTES:
             raise RecordingError(path, "is larger than any log of a flight", "cut it")
         self._formats, self.parameters = _definitions(path)
-        counts, ids, self._behind = _count(path)
+        counts, ids, self._cut_bytes = _count_messages(path)
         self.topics = tuple(
             sorted(
                 (Topic(name, ids[number], count) for number, (name, count) in counts.items()),
@@ -82,20 +82,20 @@ class ULogRecording(Recording):
             )
         )
 
-    def usual(self, topic: str, signal: str) -> Usual | None:
+    def field_layout(self, topic: str, signal: str) -> FieldLayout | None:
         """Return where a message holds a signal."""
-        return USUAL.get(topic.partition("[")[0], {}).get(signal)
+        return FIELD_LAYOUTS.get(topic.partition("[")[0], {}).get(signal)
 
     def fields(self, topic: str) -> list[str]:
         """Return the names of a message's fields."""
         return [name for _, _, name in self._formats.get(topic.partition("[")[0], [])]
 
-    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
+    def missing_fields(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return those of some fields that a message does not have."""
         kind = topic.partition("[")[0]
         return tuple(path for path in fields if not _has(self._formats, kind, path.split(".")))
 
-    def read(self, wanted: Mapping[str, Request]) -> Contents:
+    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
         """Read the wanted fields of some messages."""
         names = sorted({topic.partition("[")[0] for topic in wanted})
         log, complaint = _parse(self.path, names)
@@ -119,15 +119,15 @@ class ULogRecording(Recording):
             )
         if log.file_corruption or complaint:
             damage.append(Damage(Cause.LOG_DAMAGED))
-        if self._behind:
+        if self._cut_bytes:
             last = log.last_timestamp * 1e-6
-            damage.append(Damage(Cause.END_MISSING, bytes_lost=self._behind, start=last))
-        return Contents(samples, damage=tuple(damage))
+            damage.append(Damage(Cause.END_MISSING, bytes_lost=self._cut_bytes, start=last))
+        return ReadResult(samples, damage=tuple(damage))
 
     def _samples(self, topic: str, data: Mapping[str, Any], request: Request) -> Samples:
         if "timestamp" not in data:
             raise RecordingError(self.path, f"{topic} has no timestamp", "leave it out of the map")
-        receive = data["timestamp"].astype(np.int64) * NANOSECONDS["us"]
+        receive = data["timestamp"].astype(np.int64) * NS_PER_UNIT["us"]
         clocks = (*request.clocks, Clock(field="timestamp_sample", unit="us"))
         stamp = receive
         for clock in clocks:
@@ -149,9 +149,9 @@ class ULogRecording(Recording):
 def _blocks(path: Path) -> Iterator[tuple[bytes, list[int]]]:
     """Yield blocks of a log, each with where its whole messages begin, and the end of the last."""
     with path.open("rb") as stream:
-        stream.seek(HEADER)
+        stream.seek(HEADER_BYTES)
         rest = b""
-        while block := stream.read(READ_AT_ONCE):
+        while block := stream.read(BLOCK_BYTES):
             buffer, places, here = rest + block, [0], 0
             last, keep = len(buffer) - 3, places.append
             while here <= last:
@@ -167,7 +167,7 @@ def _blocks(path: Path) -> Iterator[tuple[bytes, list[int]]]:
 def _definitions(path: Path) -> tuple[Formats, dict[str, float]]:
     """Return formats and parameters of a log; formats are checked."""
     with path.open("rb") as stream:
-        if len(start := stream.read(HEADER)) < HEADER or not start.startswith(MAGIC):
+        if len(start := stream.read(HEADER_BYTES)) < HEADER_BYTES or not start.startswith(MAGIC):
             raise RecordingError(path, "is no PX4 log", "give the .ulg file itself")
     log, _ = _parse(path, [], header_only=True)
     formats: Formats = {
@@ -175,7 +175,7 @@ def _definitions(path: Path) -> tuple[Formats, dict[str, float]]:
         for name, known in log.message_formats.items()
     }
     for name in formats:
-        if _size(formats, name, 0) > LONGEST_MESSAGE:
+        if _count_numbers(formats, name, 0) > MAX_MESSAGE_BYTES:
             raise RecordingError(path, f"the format of {name} is absurd", "record it again")
     values = log.initial_parameters.items()
     return formats, {name: float(of) for name, of in values if isinstance(of, int | float)}
@@ -199,25 +199,25 @@ def _has(formats: Formats, kind: str, path: list[str]) -> bool:
     return False
 
 
-def _size(formats: Formats, name: str, depth: int) -> int:
+def _count_numbers(formats: Formats, name: str, depth: int) -> int:
     """Return the numbers in a format, at most a little more than a message can hold."""
     if depth > 8:
-        return LONGEST_MESSAGE + 1
+        return MAX_MESSAGE_BYTES + 1
     total = 0
     for what, count, _ in formats[name]:
-        inner = _size(formats, what, depth + 1) if what in formats else 1
+        inner = _count_numbers(formats, what, depth + 1) if what in formats else 1
         total += max(1, inner) * count
-        if total > LONGEST_MESSAGE:
+        if total > MAX_MESSAGE_BYTES:
             break
     return total
 
 
-def _count(path: Path) -> tuple[dict[int, tuple[str, int]], dict[int, str], int]:
+def _count_messages(path: Path) -> tuple[dict[int, tuple[str, int]], dict[int, str], int]:
     """Count the messages of each subscription, and the bytes behind the last whole record."""
     names: dict[int, str] = {}
     kinds: dict[int, str] = {}
     counts: Counter[int] = Counter()
-    reached = HEADER
+    reached = HEADER_BYTES
     for buffer, places in _blocks(path):
         content = np.frombuffer(buffer, dtype=np.uint8)
         at = np.array(places[:-1], dtype=np.int64)
@@ -247,22 +247,22 @@ def _parse(path: Path, names: list[str], *, header_only: bool = False) -> tuple[
             log = ULog(str(path), names, parse_header_only=header_only)
         return log, printed.getvalue()
     except Exception as err:  # pyulog's own and whatever a hostile log makes of it
-        what = f"is no readable PX4 log ({reason_of(err)})"
+        what = f"is no readable PX4 log ({short_reason(err)})"
         raise RecordingError(path, what, "record it again") from None
 
 
 SYSTEM_IDENTIFICATION, HIGH_RATE = 8, 16
 """Bits of ``SDLOG_PROFILE``."""
 DEFAULT_PROFILE = 1
-ENOUGH_OF_RATE = 0.8
+MIN_RATE_SHARE = 0.8
 """Share of a wanted rate that is enough."""
 
 
-def _fields(*names: str, unit: str = "si") -> Usual:
-    return Usual(names, unit, "ned_frd")
+def _fields(*names: str, unit: str = "si") -> FieldLayout:
+    return FieldLayout(names, unit, "ned_frd")
 
 
-def _array(name: str, *, count: int = 3, unit: str = "si") -> Usual:
+def _array(name: str, *, count: int = 3, unit: str = "si") -> FieldLayout:
     return _fields(*(f"{name}[{i}]" for i in range(count)), unit=unit)
 
 
@@ -275,7 +275,7 @@ _ODOMETRY = {
     "body_rate": _array("angular_velocity"),
 }
 
-USUAL: Mapping[str, Mapping[str, Usual]] = {
+FIELD_LAYOUTS: Mapping[str, Mapping[str, FieldLayout]] = {
     "vehicle_local_position": _LOCAL_POSITION,
     "vehicle_local_position_groundtruth": _LOCAL_POSITION,
     "vehicle_attitude": _ATTITUDE,
@@ -318,7 +318,7 @@ USUAL: Mapping[str, Mapping[str, Usual]] = {
 
 
 @dataclass(frozen=True)
-class Wanted:
+class LogNeed:
     """A message that a fit needs.
 
     Attributes
@@ -337,38 +337,38 @@ class Wanted:
     profiles: tuple[int, ...] = ()
 
 
-WANTED = (
-    Wanted(
+LOG_NEEDS = (
+    LogNeed(
         ("vehicle_angular_velocity", "sensor_combined"),
         200.0,
         "how it turns: inertia and the rotors' lag",
         (SYSTEM_IDENTIFICATION, HIGH_RATE),
     ),
-    Wanted(
+    LogNeed(
         ("actuator_motors", "actuator_outputs"),
         200.0,
         "what the motors were asked for: inertia and the rotors' lag",
         (SYSTEM_IDENTIFICATION, HIGH_RATE),
     ),
-    Wanted(
+    LogNeed(
         ("vehicle_acceleration", "sensor_combined"),
         200.0,
         "thrust and drag",
         (SYSTEM_IDENTIFICATION,),
     ),
-    Wanted(("vehicle_rates_setpoint",), 100.0, "what the rate loop was asked for", (HIGH_RATE,)),
-    Wanted(("vehicle_attitude",), 100.0, "the attitude that is compared", (HIGH_RATE,)),
-    Wanted(
+    LogNeed(("vehicle_rates_setpoint",), 100.0, "what the rate loop was asked for", (HIGH_RATE,)),
+    LogNeed(("vehicle_attitude",), 100.0, "the attitude that is compared", (HIGH_RATE,)),
+    LogNeed(
         ("vehicle_local_position", "vehicle_mocap_odometry", "vehicle_visual_odometry"),
         50.0,
         "position and speed: drag and mass",
     ),
-    Wanted(("esc_status",), 100.0, "rotor speeds: the motor constant by itself", (HIGH_RATE,)),
+    LogNeed(("esc_status",), 100.0, "rotor speeds: the motor constant by itself", (HIGH_RATE,)),
 )
 
 
 @dataclass(frozen=True)
-class Advice:
+class LoggingAdvice:
     """What to log more of.
 
     Attributes
@@ -383,7 +383,7 @@ class Advice:
     shows: str
 
 
-def advice_of(rates: Mapping[str, float]) -> tuple[Advice, ...]:
+def logging_advice(rates: Mapping[str, float]) -> tuple[LoggingAdvice, ...]:
     """Return which messages are missing, or too slow.
 
     Parameters
@@ -392,20 +392,20 @@ def advice_of(rates: Mapping[str, float]) -> tuple[Advice, ...]:
         Message -> Hz at which it was logged.
     """
     found = []
-    for wanted in WANTED:
+    for wanted in LOG_NEEDS:
         fastest = max(wanted.messages, key=lambda name: rates.get(name, 0.0))
         logged = rates.get(fastest, 0.0)
-        if logged < ENOUGH_OF_RATE * wanted.rate:
-            found.append(Advice(wanted.messages[0], logged, wanted.rate, wanted.shows))
+        if logged < MIN_RATE_SHARE * wanted.rate:
+            found.append(LoggingAdvice(wanted.messages[0], logged, wanted.rate, wanted.shows))
     return tuple(found)
 
 
-def settings_in_words(advice: tuple[Advice, ...], parameters: Mapping[str, float]) -> str:
+def logger_settings(advice: tuple[LoggingAdvice, ...], parameters: Mapping[str, float]) -> str:
     """Return which logger settings would log what is advised; empty if nothing is."""
     if not advice:
         return ""
     profile = round(parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))
-    of_message = {wanted.messages[0]: wanted for wanted in WANTED}
+    of_message = {wanted.messages[0]: wanted for wanted in LOG_NEEDS}
     bits, lines = 0, []
     for each in advice:
         wanted = of_message[each.message]

@@ -47,14 +47,14 @@ UNITS: Mapping[str, tuple[float, float]] = {
 }
 
 #: Signals whose vectors are written in world or in body axes.
-WORLD = {
+WORLD_SIGNALS = {
     "position",
     "velocity",
     "reference_position",
     "reference_velocity",
     "reference_acceleration",
 }
-BODY = {"body_rate", "acceleration", "rate_setpoint", "commanded_torque"}
+BODY_SIGNALS = {"body_rate", "acceleration", "rate_setpoint", "commanded_torque"}
 #: Signals that are quaternions.
 ATTITUDES = {"attitude", "attitude_setpoint"}
 
@@ -71,10 +71,10 @@ def to_enu_flu(values: Array, signal: str) -> Array:
     A quaternion from FRD to NED becomes one from FLU to ENU: the world turns by
     (0, 1, 1, 0)/sqrt(2), the body by (0, 1, 0, 0).
     """
-    if signal in WORLD:
+    if signal in WORLD_SIGNALS:
         north, east, down = values.T
         return np.column_stack([east, north, -down])
-    if signal in BODY:
+    if signal in BODY_SIGNALS:
         forward, right, down = values.T
         return np.column_stack([forward, -right, -down])
     if signal in ATTITUDES:
@@ -119,35 +119,35 @@ ATTITUDE_READINGS = (
 )
 
 
-LENGTHS = {"position": False, "velocity": True}
+LENGTH_SIGNALS = {"position": False, "velocity": True}
 """Signals of lengths that may come in another unit than metres; whether they are speeds."""
 LENGTH_UNITS = {"cm": "in centimetres", "mm": "in millimetres"}
 """Units that are recognised, and how a sentence calls them."""
 
-BIN = 0.1
+BIN_S = 0.1
 """s of which one median is taken, of noise, bursts of stamps and single corrupt samples."""
-REACH = 3
+HALF_BINS = 3
 """Bins on either side of a time over which the acceleration there is a mean."""
-LONGEST = 300.0
+MAX_DISTANCE_S = 300.0
 """s to either side of the middle stamp that are looked at; those far off are wrong."""
-SLOW_STEP = 0.03
+MIN_SLOW_STEP_S = 0.03
 """s from sample to sample, above which times may be a thousand times too long."""
-LEAST_COSINE = 0.3
+MIN_TILT_COSINE = 0.3
 """Cosine of the tilt below which thrust carries little of the weight."""
 
-LEAST_TILT_RMS = 0.002
+MIN_TILT_RMS = 0.002
 """rad of tilt, root mean square, of which less is noise."""
-LEAST_AGREEMENT = 0.8
+MIN_AGREEMENT = 0.8
 """Share of the tilt that has to point as the vehicle accelerates."""
 SIGNIFICANCE = 3.0
 """Standard deviations by which chance would have to err for that."""
 SCALE_RANGE = (0.45, 1.6)
 """How far the lengths of a unit may seem to be from it."""
-LEAST_SCALE = 2.0
+MIN_OTHER_UNIT_SCALE = 2.0
 """Units to a metre that no flight in metres seems to have."""
-SPEED_RATIO = 3.0
+MAX_SPEED_RATIO = 3.0
 """Times that a recorded speed may be off the change of a position in its unit."""
-NAMES = {
+UNIT_PHRASES = {
     "si": "in SI units",
     "deg": "in degrees",
     "deg/s": "in degrees per second",
@@ -163,14 +163,14 @@ NAMES = {
 GRAVITY_RANGE = (0.75, 1.4)
 """How far a steady specific force, as recorded, is from gravity, of a vehicle that flies or
 stands."""
-FASTEST_TURN = 40.0
+MAX_TURN_RATE = 40.0
 """rad/s that no vehicle turns at for a tenth of its flight: gyros end at 35."""
-FEWEST_SAMPLES = 20
+MIN_SAMPLES = 20
 """Samples without which a range says nothing of their unit."""
 
 
 @dataclass(frozen=True)
-class Stamped:
+class RawSeries:
     """Samples in any order: (n,) s, and (n, k) values that are NaN where not measured."""
 
     time: Array
@@ -196,8 +196,8 @@ class Scale:
     sure: bool = False
 
 
-def scales_of(recorded: Mapping[str, Stamped]) -> dict[str, Scale]:
-    """Return the scale of each signal of `LENGTHS` that a recording holds.
+def scales_of(recorded: Mapping[str, RawSeries]) -> dict[str, Scale]:
+    """Return the scale of each signal of `LENGTH_SIGNALS` that a recording holds.
 
     Position and speed share the better known one where one changes about as the other says.
 
@@ -211,7 +211,7 @@ def scales_of(recorded: Mapping[str, Stamped]) -> dict[str, Scale]:
         return {}
     scales = {
         signal: scale_of(recorded[signal], recorded["attitude"], speeds=speeds)
-        for signal, speeds in LENGTHS.items()
+        for signal, speeds in LENGTH_SIGNALS.items()
         if signal in recorded
     }
     if len(scales) > 1 and _share_a_unit(recorded["position"], recorded["velocity"]):
@@ -219,7 +219,7 @@ def scales_of(recorded: Mapping[str, Stamped]) -> dict[str, Scale]:
     return scales
 
 
-def is_too_slow(recorded: Mapping[str, Stamped]) -> bool:
+def is_too_slow(recorded: Mapping[str, RawSeries]) -> bool:
     """Return whether times are a thousand times too long: lengths make sense only if they are.
 
     A table's unit of time is told by its step, which slow microseconds share with quick
@@ -228,10 +228,10 @@ def is_too_slow(recorded: Mapping[str, Stamped]) -> bool:
     if not {"position", "attitude"} <= set(recorded):
         return False
     step = np.diff(np.sort(recorded["position"].time))
-    if not len(step) or np.median(step) < SLOW_STEP:
+    if not len(step) or np.median(step) < MIN_SLOW_STEP_S:
         return False
     quick = {
-        name: Stamped(1e-3 * samples.time, samples.values) for name, samples in recorded.items()
+        name: RawSeries(1e-3 * samples.time, samples.values) for name, samples in recorded.items()
     }
     slowly, quickly = (
         fits_gravity(signals["position"], signals["attitude"]) for signals in (recorded, quick)
@@ -240,7 +240,7 @@ def is_too_slow(recorded: Mapping[str, Stamped]) -> bool:
 
 
 def fits_gravity(
-    position: Stamped, attitude: Stamped, units: Iterable[str] = ("si", *LENGTH_UNITS)
+    position: RawSeries, attitude: RawSeries, units: Iterable[str] = ("si", *LENGTH_UNITS)
 ) -> bool:
     """Return whether positions in one of some units accelerate as an attitude says."""
     scale, (low, high) = scale_of(position, attitude), SCALE_RANGE
@@ -252,7 +252,7 @@ def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
 
     Metres (``si``) where they are, and wherever that cannot be told.
     """
-    if not scale.sure or scale.per_metre < LEAST_SCALE:
+    if not scale.sure or scale.per_metre < MIN_OTHER_UNIT_SCALE:
         return "si", None
     low, high = SCALE_RANGE
     for unit, name in LENGTH_UNITS.items():
@@ -263,7 +263,7 @@ def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
     return "si", Note(NoteCode.UNIT_DOUBTED, topic=topic, numbers=numbers, names=(signal,))
 
 
-def scale_of(lengths: Stamped, attitude: Stamped, *, speeds: bool = False) -> Scale:
+def scale_of(lengths: RawSeries, attitude: RawSeries, *, speeds: bool = False) -> Scale:
     """Return the scale of recorded positions or speeds, of that attitude which fits them best.
 
     Parameters
@@ -271,71 +271,72 @@ def scale_of(lengths: Stamped, attitude: Stamped, *, speeds: bool = False) -> Sc
     speeds
         Whether the lengths are speeds.
     """
-    lengths, attitude = _near(lengths, attitude)
+    lengths, attitude = _near_middle(lengths, attitude)
     if not len(lengths.time) or not len(attitude.time):
         return Scale()
-    centres = _centres(lengths, attitude)
-    push = _push(lengths, centres, speeds=speeds)
+    centres = _bin_centres(lengths, attitude)
+    push = _accelerations(lengths, centres, speeds=speeds)
     readings = (attitude.values, *(r.read(attitude.values) for r in ATTITUDE_READINGS))
     return _best_known(
-        _scale(*_against_tilt(push, Stamped(attitude.time, values), centres)) for values in readings
+        _slope_scale(*_force_and_tilt(push, RawSeries(attitude.time, values), centres))
+        for values in readings
     )
 
 
-def pull_and_tilt(position: Stamped, attitude: Stamped) -> tuple[Array, Array]:
+def force_and_tilt(position: RawSeries, attitude: RawSeries) -> tuple[Array, Array]:
     """Return a_xy - a_z t and t, see above, at times a bin apart: (n, 2) each.
 
-    Both are the same weighted mean over `REACH` bins to either side; times at which either is not
-    known, or the vehicle lies on its side, are left out.
+    Both are the same weighted mean over `HALF_BINS` bins to either side. Times without either, or
+    with the vehicle on its side, are left out.
     """
-    centres = _centres(position, attitude)
-    return _against_tilt(_push(position, centres), attitude, centres)
+    centres = _bin_centres(position, attitude)
+    return _force_and_tilt(_accelerations(position, centres), attitude, centres)
 
 
-def _push(lengths: Stamped, centres: Array, *, speeds: bool = False) -> Array:
-    """Return accelerations, (n, 3), `REACH` bins from either end of some bins."""
-    if len(centres) <= 2 * REACH:
+def _accelerations(lengths: RawSeries, centres: Array, *, speeds: bool = False) -> Array:
+    """Return accelerations, (n, 3), `HALF_BINS` bins from either end of some bins."""
+    if len(centres) <= 2 * HALF_BINS:
         return np.empty((0, 3))
     at = _binned(lengths, centres)
     if speeds:
-        at = np.where(np.isfinite(at), np.nancumsum(at, axis=0) * BIN, np.nan)
+        at = np.where(np.isfinite(at), np.nancumsum(at, axis=0) * BIN_S, np.nan)
     # a second difference is the mean of the second derivative by a triangle of weights
-    second = at[2 * REACH :] - 2 * at[REACH:-REACH] + at[: -2 * REACH]
-    return np.asarray(second / (REACH * BIN) ** 2)
+    second = at[2 * HALF_BINS :] - 2 * at[HALF_BINS:-HALF_BINS] + at[: -2 * HALF_BINS]
+    return np.asarray(second / (HALF_BINS * BIN_S) ** 2)
 
 
-def _against_tilt(push: Array, attitude: Stamped, centres: Array) -> tuple[Array, Array]:
-    """Return what `pull_and_tilt` does, of accelerations."""
+def _force_and_tilt(push: Array, attitude: RawSeries, centres: Array) -> tuple[Array, Array]:
+    """Return what `force_and_tilt` does, of accelerations."""
     if not len(push):
         return np.empty((0, 2)), np.empty((0, 2))
     norm = np.linalg.norm(attitude.values, axis=1, keepdims=True)
     turned = attitude.values / np.where(norm > 0.5, norm, np.nan)
     up = upward(turned)
-    weights = np.convolve(np.ones(REACH), np.ones(REACH)) / REACH**2
-    columns = _binned(Stamped(attitude.time, up), centres).T
+    weights = np.convolve(np.ones(HALF_BINS), np.ones(HALF_BINS)) / HALF_BINS**2
+    columns = _binned(RawSeries(attitude.time, up), centres).T
     leant = np.column_stack([np.convolve(c, weights, "valid")[1:-1] for c in columns])
-    known = np.isfinite(push).all(axis=1) & (leant[:, 2] > LEAST_COSINE)
+    known = np.isfinite(push).all(axis=1) & (leant[:, 2] > MIN_TILT_COSINE)
     tilt = leant[known, :2] / leant[known, 2:]
     return push[known, :2] - push[known, 2:] * tilt, tilt
 
 
-def _scale(pull: Array, tilt: Array) -> Scale:
+def _slope_scale(pull: Array, tilt: Array) -> Scale:
     """Return the slope of (n, 2) pulls over tilts, by least absolute deviations."""
-    if len(tilt) <= 2 * REACH:
+    if len(tilt) <= 2 * HALF_BINS:
         return Scale()
     # a tilt that stays is wind, or a marker body that was defined on a slope
     pull, tilt = pull - np.median(pull, axis=0), tilt - np.median(tilt, axis=0)
     size = np.linalg.norm(tilt, axis=1)
     pull, tilt, size = pull[size > 0], tilt[size > 0], size[size > 0]
-    if not len(size) or np.sqrt(np.mean(size**2)) < LEAST_TILT_RMS:
+    if not len(size) or np.sqrt(np.mean(size**2)) < MIN_TILT_RMS:
         return Scale()
     slope = (pull * tilt).sum(axis=1) / size**2
     order = np.argsort(slope)
     middle = np.searchsorted(np.cumsum(size[order]), 0.5 * size.sum())
     agreement = float(size[slope > 0].sum() / size.sum())
     # neighbours share what they are means of: one in REACH of them is a throw of its own
-    chance = 0.5 * np.sqrt(REACH * (size**2).sum()) / size.sum()
-    sure = bool(agreement > max(LEAST_AGREEMENT, 0.5 + SIGNIFICANCE * chance))
+    chance = 0.5 * np.sqrt(HALF_BINS * (size**2).sum()) / size.sum()
+    sure = bool(agreement > max(MIN_AGREEMENT, 0.5 + SIGNIFICANCE * chance))
     return Scale(float(slope[order][middle]) / GRAVITY, agreement, sure)
 
 
@@ -343,48 +344,48 @@ def _best_known(scales: Iterable[Scale]) -> Scale:
     return max(scales, key=lambda scale: (scale.sure, scale.agreement))
 
 
-def _share_a_unit(position: Stamped, speed: Stamped) -> bool:
+def _share_a_unit(position: RawSeries, speed: RawSeries) -> bool:
     """Return whether the position changes about as fast as a recorded speed says."""
-    position, speed = _near(position, speed)
+    position, speed = _near_middle(position, speed)
     if not len(position.time) or not len(speed.time):
         return False
-    centres = _centres(position, speed)
+    centres = _bin_centres(position, speed)
     if len(centres) < 2:
         return False
-    moved, speeds = np.gradient(_binned(position, centres), BIN, axis=0), _binned(speed, centres)
+    moved, speeds = np.gradient(_binned(position, centres), BIN_S, axis=0), _binned(speed, centres)
     known = np.isfinite(moved).all(axis=1) & np.isfinite(speeds).all(axis=1)
     if not known.any():
         return False
     lengths = (np.median(np.linalg.norm(values[known], axis=1)) for values in (moved, speeds))
     slower, faster = sorted(lengths)
-    return bool(faster < SPEED_RATIO * slower)
+    return bool(faster < MAX_SPEED_RATIO * slower)
 
 
-def _centres(*signals: Stamped) -> Array:
+def _bin_centres(*signals: RawSeries) -> Array:
     """Return the s in the middle of all bins that hold samples of some signals."""
     first = min(samples.time.min() for samples in signals)
     last = max(samples.time.max() for samples in signals)
-    return np.asarray(first + BIN * (np.arange(int((last - first) / BIN) + 1) + 0.5))
+    return np.asarray(first + BIN_S * (np.arange(int((last - first) / BIN_S) + 1) + 0.5))
 
 
-def _near(*signals: Stamped) -> list[Stamped]:
+def _near_middle(*signals: RawSeries) -> list[RawSeries]:
     """Return signals' samples about the middle stamp of the last; those far off are wrong."""
     last = signals[-1].time
     middle = np.median(last) if len(last) else 0.0
-    near = [np.abs(samples.time - middle) < LONGEST for samples in signals]
-    return [Stamped(s.time[n], s.values[n]) for s, n in zip(signals, near, strict=True)]
+    near = [np.abs(samples.time - middle) < MAX_DISTANCE_S for samples in signals]
+    return [RawSeries(s.time[n], s.values[n]) for s, n in zip(signals, near, strict=True)]
 
 
-def _binned(samples: Stamped, centres: Array) -> Array:
+def _binned(samples: RawSeries, centres: Array) -> Array:
     """Return (n, k) values at the centres (n,) of bins, between the medians of those around.
 
-    NaN where no bin within `REACH` to either side holds a sample.
+    NaN where no bin within `HALF_BINS` to either side holds a sample.
     """
     result = np.full((len(centres), samples.values.shape[1]), np.nan)
     for values, column in zip(samples.values.T, result.T, strict=True):
         known = np.isfinite(values)
         time, value = samples.time[known], values[known]
-        bins = ((time - centres[0]) / BIN + 0.5).astype(np.int64)
+        bins = ((time - centres[0]) / BIN_S + 0.5).astype(np.int64)
         held, first, count = np.unique(np.sort(bins), return_index=True, return_counts=True)
         if len(held) < 2:
             continue
@@ -394,11 +395,11 @@ def _binned(samples: Stamped, centres: Array) -> Array:
         # bins before and behind each that hold something
         behind = np.clip(np.searchsorted(held, np.arange(len(centres))), 0, len(held) - 1)
         before = np.where(held[behind] > np.arange(len(centres)), np.maximum(behind - 1, 0), behind)
-        column[held[behind] - held[before] > REACH] = np.nan
+        column[held[behind] - held[before] > HALF_BINS] = np.nan
     return result
 
 
-MOST_TILT, LEAST_TILT = 0.55 * math.pi, 0.06
+MAX_TILT_RAD, MIN_TILT_DEG = 0.55 * math.pi, 0.06
 """rad that are more than a tilt, and less than a vehicle in the air has of them in degrees."""
 
 
@@ -414,25 +415,25 @@ def unit_by_range(signal: str, values: Array, assumed: str) -> str:
     values
         (n, k) as recorded; NaN where not measured.
     """
-    rule = _RULES.get(signal)
+    rule = _RANGE_RULES.get(signal)
     known = values[np.isfinite(values).all(axis=1)] if signal != "command" else values
-    if rule is None or len(known) < FEWEST_SAMPLES or not np.isfinite(known).any():
+    if rule is None or len(known) < MIN_SAMPLES or not np.isfinite(known).any():
         return assumed
     found = rule(known)
-    return found or ("" if assumed == "pwm_us" and _no_pulses(known) else assumed)
+    return found or ("" if assumed == "pwm_us" and _are_no_pulses(known) else assumed)
 
 
-NO_PULSE = (1.02, 850.0)
+NO_COMMAND_RANGE = (1.02, 850.0)
 """Between them are no commands from 0 to 1, and no widths of pulses in µs."""
 
 
-def _no_pulses(values: Array) -> bool:
-    low, high = NO_PULSE
+def _are_no_pulses(values: Array) -> bool:
+    low, high = NO_COMMAND_RANGE
     known = values[np.isfinite(values) & (values != 0)]
     return bool(np.mean((known > low) & (known < high)) > 0.01) if len(known) else False
 
 
-def _command(values: Array) -> str | None:
+def _command_unit(values: Array) -> str | None:
     known = values[np.isfinite(values)]
     low, middle, often, high = np.quantile(known, (0.002, 0.5, 0.9, 0.99))
     if low >= -1.02 and high <= 1.02:
@@ -447,7 +448,7 @@ def _command(values: Array) -> str | None:
     return None
 
 
-def _force(values: Array) -> str | None:
+def _acceleration_unit(values: Array) -> str | None:
     """Return the unit in which the mean is gravity, which turns with the body but little."""
     low, high = GRAVITY_RANGE
     size = float(np.linalg.norm(np.median(values, axis=0)))
@@ -457,18 +458,20 @@ def _force(values: Array) -> str | None:
     return None
 
 
-_RULES: Mapping[str, Callable[[Array], str | None]] = {
-    "command": _command,
+_RANGE_RULES: Mapping[str, Callable[[Array], str | None]] = {
+    "command": _command_unit,
     "battery_voltage": lambda v: "mV" if 2000 < float(np.median(v)) < 100_000 else None,
-    "acceleration": _force,
+    "acceleration": _acceleration_unit,
     # no gyro measures so many radians
     "body_rate": lambda w: (
-        "deg/s" if np.quantile(np.linalg.norm(w, axis=1), 0.9) > FASTEST_TURN else None
+        "deg/s" if np.quantile(np.linalg.norm(w, axis=1), 0.9) > MAX_TURN_RATE else None
     ),
 }
 
 
-def unit_of_angles(path: object, attitude: Stamped, position: Stamped | None, *, must: bool) -> str:
+def unit_of_angles(
+    path: object, attitude: RawSeries, position: RawSeries | None, *, required: bool
+) -> str:
     """Return whether roll, pitch and yaw are in degrees (``deg``) or radians (``si``).
 
     Parameters
@@ -477,7 +480,7 @@ def unit_of_angles(path: object, attitude: Stamped, position: Stamped | None, *,
         (n, 3) as recorded.
     position
         As recorded, in any unit of length; None without one.
-    must
+    required
         Whether it is an error that neither range nor gravity tells; else it is radians.
 
     Raises
@@ -489,13 +492,13 @@ def unit_of_angles(path: object, attitude: Stamped, position: Stamped | None, *,
     if not len(angles):
         return "si"
     tilt = float(np.quantile(angles[:, :2], 0.99))
-    if float(np.quantile(angles, 0.99)) > math.tau + 0.1 or tilt > MOST_TILT:
+    if float(np.quantile(angles, 0.99)) > math.tau + 0.1 or tilt > MAX_TILT_RAD:
         return "deg"
-    if tilt < LEAST_TILT:
+    if tilt < MIN_TILT_DEG:
         return "si"
     if position is not None:
         attitudes = {
-            unit: Stamped(attitude.time, quaternion_of(to_si(attitude.values, unit)))
+            unit: RawSeries(attitude.time, quaternion_of(to_si(attitude.values, unit)))
             for unit in ("si", "deg")
         }
         for lengths in (("si",), ("si", *LENGTH_UNITS)):  # metres first: a radian is 57 degrees
@@ -504,7 +507,7 @@ def unit_of_angles(path: object, attitude: Stamped, position: Stamped | None, *,
             ]
             if len(fitting) == 1:
                 return fitting[0]
-    if must:
+    if required:
         raise RecordingError(
             str(path),
             f"its angles reach {tilt:.2g}, and neither their size nor the motion tells degrees "

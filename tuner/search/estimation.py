@@ -28,7 +28,7 @@ from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings.content import ReadOptions
 from tuner.recordings.flight import Flight
-from tuner.recordings.loader import read_by
+from tuner.recordings.loader import reading_key
 from tuner.search.continuation import Undecided, grow
 from tuner.search.findings import findings_at, unmatched
 from tuner.search.iteration import Iteration, Outcome
@@ -66,7 +66,7 @@ def fingerprint(job: Job) -> str:
 def _read_by(flight: Flight, job: Job) -> tuple[str, ...]:
     """Return how a flight's recording is read: a map or a side-car may have changed since."""
     given = job.settings.job
-    return read_by(ReadOptions.of(Path(flight.path), given.topics, given.namespace))
+    return reading_key(ReadOptions.of(Path(flight.path), given.topics, given.namespace))
 
 
 def save(path: Path, key: str, progress: Progress, seconds: float) -> None:

@@ -27,9 +27,9 @@ from tuner.objective.rotor_signals import (
 )
 from tuner.objective.trajectory import with_named_reference
 from tuner.objective.windows import require_windows
-from tuner.recordings.defects import is_stale
+from tuner.recordings.defects import has_stale_attitude
 from tuner.recordings.flight import Flight
-from tuner.recordings.frames import noted_contradiction
+from tuner.recordings.frames import contradiction_in
 from tuner.recordings.loader import InertialFlight, load_flights, read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import parameters_of
@@ -222,13 +222,13 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     if flight_settings is not None:
         inlet = flight_settings.inlet or inlet
         offset = offset if flight_settings.time_offset is None else flight_settings.time_offset
-    if is_stale(flight.series, flight.notes):
+    if has_stale_attitude(flight.series, flight.notes):
         raise RecordingError(
             flight.path,
             "its attitude stops changing while the vehicle moves on, too soon for a flight",
             "look at what stopped: the controller, or the logger",
         )
-    denied = noted_contradiction(flight.notes)
+    denied = contradiction_in(flight.notes)
     if denied is not None:
         raise RecordingError(
             flight.path,

@@ -24,7 +24,7 @@ from tuner.core.numerics import Array
 from tuner.findings.findings import Code, Finding
 from tuner.objective.rotor_signals import Source, squared_speed
 from tuner.recordings.flight import Flight
-from tuner.recordings.states import filtered, states_at
+from tuner.recordings.states import local_parabolas, states_at
 from tuner.search.job_flights import Recording
 from tuner.vehicle import VehicleFile
 
@@ -126,7 +126,7 @@ def _shares(flight: Flight, vehicle: VehicleFile, source: Source, edges: Array) 
 def _motion(flight: Flight, edges: Array) -> Array:
     """Return what shares depend on (n, k), window by window."""
     middle = 0.5 * (edges[1:] + edges[:-1])
-    rates = filtered(flight.series["body_rate"], edges)
+    rates = local_parabolas(flight.series["body_rate"], edges)
     state = states_at(flight.series, middle)
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import, seldom needed)
 

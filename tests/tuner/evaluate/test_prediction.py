@@ -9,7 +9,7 @@ from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.prediction import Predictions, hold, predict
 from tuner.findings.sentences import PREDICTED
 from tuner.recordings.flight import Series
-from tuner.recordings.states import FILTER_HALF_WIDTH
+from tuner.recordings.states import MIN_HALF_WIDTH_S
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, with_values
 
@@ -80,7 +80,7 @@ def test_what_lies_ahead_is_not_looked_at(truth, full_flight, updated):
 @pytest.mark.parametrize("inlet", ["body_rate", "actuator", "attitude"])
 def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
     position = full_flight.series["position"]
-    ahead = (position.time > 3.0 + 1.1 * FILTER_HALF_WIDTH) & (position.time < 3.4)
+    ahead = (position.time > 3.0 + 1.1 * MIN_HALF_WIDTH_S) & (position.time < 3.4)
     away = 0.02  # m: as far as a start might have been from where it was recorded
     shifted = Series(position.time, position.values + np.where(ahead, away, 0.0)[:, None])
     elsewhere = replace(full_flight, series=dict(full_flight.series) | {"position": shifted})
@@ -98,7 +98,7 @@ def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
     (windows, met, predicted), (windows_moved, met_moved, moved) = map(
         errors, (full_flight, elsewhere)
     )
-    there = (windows.position.time > 3.0 + 1.1 * FILTER_HALF_WIDTH) & (windows.position.time < 3.4)
+    there = (windows.position.time > 3.0 + 1.1 * MIN_HALF_WIDTH_S) & (windows.position.time < 3.4)
     only_recorded = np.where(there, -away, 0.0)[:, None].repeat(3, 1)
     change = windows_moved.position.error - windows.position.error
     np.testing.assert_allclose(change, only_recorded, atol=1e-9)
@@ -106,7 +106,7 @@ def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
     followed = met_moved.position.error - met.position.error - only_recorded
     assert np.abs(followed).max() > 0.1 * away  # the test would see a start that is fitted
     begun = np.flatnonzero(np.isclose(predicted.begins, 3.0))
-    behind = predicted.ahead > 0.4 + 2.0 * FILTER_HALF_WIDTH  # where the path is as recorded again
+    behind = predicted.ahead > 0.4 + 2.0 * MIN_HALF_WIDTH_S  # where the path is as recorded again
     for name in set(predicted.errors) - {"position"}:
         np.testing.assert_allclose(
             moved.errors[name][:, begun], predicted.errors[name][:, begun], rtol=1e-9

@@ -12,7 +12,7 @@ from tuner.config import Options, settle
 from tuner.evaluate.prediction import predict
 from tuner.evaluate.torque_observer import TICKS, TorqueObserver
 from tuner.recordings.flight import Series
-from tuner.recordings.states import FILTER_HALF_WIDTH
+from tuner.recordings.states import MIN_HALF_WIDTH_S
 from tuner.search.job_flights import read_usable
 from tuner.vehicle import ControllerFile, with_values
 
@@ -78,7 +78,7 @@ def test_it_is_told_by_no_sample_that_is_yet_to_come(flown):
     for name in ("body_rate", "rotor_speed", "command"):
         if name in series:
             rows = series[name]
-            filtered = FILTER_HALF_WIDTH if name == "body_rate" else 1e-9
+            filtered = MIN_HALF_WIDTH_S if name == "body_rate" else 1e-9
             later = (rows.time > 3.0 + filtered)[:, None]
             series[name] = Series(rows.time, np.where(later, 0.9 * rows.values, rows.values))
     here, elsewhere = moment(flight), moment(replace(flight, series=series))

@@ -18,7 +18,7 @@ from tuner.objective.inlets import INLETS, bypassed_by, freed_by
 from tuner.objective.segments import window_segments
 from tuner.objective.space import space_of
 from tuner.objective.windows import windows_of
-from tuner.recordings.defects import LIMITS, outliers
+from tuner.recordings.defects import LIMITS, is_outlier
 from tuner.recordings.flight import Series
 from tuner.recordings.notes import Note, NoteCode
 from tuner.search import job_flights as recordings_module
@@ -140,10 +140,10 @@ def test_rotors_of_a_small_drone_change_quickly_without_being_outliers():
     speed = 2000.0 + 40.0 * np.sin(2 * np.pi * 1.0 * time) + generator.normal(0.0, 2.0, 400)
     speed[::40] += 80.0  # one sample of a correction
     speed[205] += 900.0
-    assert np.flatnonzero(outliers(time, speed, LIMITS["rotor_speed"])).tolist() == [205]
+    assert np.flatnonzero(is_outlier(time, speed, LIMITS["rotor_speed"])).tolist() == [205]
     large = 0.3 * speed  # the same of a rotor at 600 rad/s
     large[205] -= 270.0 - 60.0
-    assert np.flatnonzero(outliers(time, large, LIMITS["rotor_speed"])).tolist() == [205]
+    assert np.flatnonzero(is_outlier(time, large, LIMITS["rotor_speed"])).tolist() == [205]
 
 
 def test_what_holds_for_many_flights_is_said_once():

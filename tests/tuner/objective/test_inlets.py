@@ -11,7 +11,7 @@ from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
 from tuner.objective.initial_conditions import STATES
 from tuner.objective.inlets import INLETS
-from tuner.recordings.inspector import inlets
+from tuner.recordings.inspector import inlet_reports
 from tuner.search.inlet_choice import inlet_for
 from tuner.vehicle import COEFFICIENTS
 
@@ -19,7 +19,7 @@ from tuner.vehicle import COEFFICIENTS
 def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():
     names = list(INLETS)
     assert list(get_args(InletName)) == names
-    assert [inlet.name for inlet in inlets({}, trajectory=False)] == names
+    assert [inlet.name for inlet in inlet_reports({}, trajectory=False)] == names
 
 
 def test_every_inlet_of_the_simulator_is_fed_by_one_class():

@@ -12,7 +12,7 @@ import pytest
 from tests.tuner.recordings import making
 from tuner.recordings import cache
 from tuner.recordings import loader as loading
-from tuner.recordings.cache import digest, own_folder
+from tuner.recordings.cache import cache_root, digest
 from tuner.recordings.content import ReadOptions
 from tuner.recordings.flight import Flight
 from tuner.recordings.loader import load_flight
@@ -87,7 +87,7 @@ def test_same_content_elsewhere_is_known(bag: Path, reads: list[Path], tmp_path:
 
 def test_damaged_cache_is_read_anew(bag: Path, reads: list[Path]) -> None:
     first = load_flight(bag)
-    (kept,) = (own_folder() / "flights").iterdir()
+    (kept,) = (cache_root() / "flights").iterdir()
     kept.write_bytes(kept.read_bytes()[:-100])
     assert_equal(first, load_flight(bag))
     assert len(reads) == 2
@@ -110,7 +110,7 @@ def test_concurrent_runs_agree(bag: Path) -> None:
     outputs = {run.communicate()[0] for run in runs}
     assert [run.returncode for run in runs] == [0, 0]
     assert len(outputs) == 1
-    names = [file.name for file in (own_folder() / "flights").iterdir()]
+    names = [file.name for file in (cache_root() / "flights").iterdir()]
     assert len(names) == 1
     assert not names[0].startswith(".")
 

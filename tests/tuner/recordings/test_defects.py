@@ -7,7 +7,12 @@ import pytest
 
 from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
-from tuner.recordings.defects import clean, is_stale, stays_while_tilting, without_stale
+from tuner.recordings.defects import (
+    clean,
+    has_stale_attitude,
+    is_position_frozen,
+    without_stale_end,
+)
 from tuner.recordings.flight import Series
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
@@ -185,7 +190,7 @@ def flight(stops: float, *, moves: bool) -> dict[str, Series]:
 
 
 def test_a_mission_ends_where_the_attitude_stops_changing() -> None:
-    kept, notes = without_stale(flight(6.0, moves=True))
+    kept, notes = without_stale_end(flight(6.0, moves=True))
     assert [note.names for note in notes] == [("attitude",), ("body_rate",)]
     assert {note.code for note in notes} == {NoteCode.STALE}
     assert notes[0].numbers["seconds"] == pytest.approx(3.99, abs=0.015)
@@ -196,7 +201,7 @@ def test_a_mission_ends_where_the_attitude_stops_changing() -> None:
 @pytest.mark.parametrize(("stops", "moves"), [(6.0, False), (9.5, True), (20.0, True)])
 def test_a_vehicle_at_rest_and_a_moment_without_change_are_left_alone(stops, moves) -> None:
     signals = flight(stops, moves=moves)
-    kept, notes = without_stale(signals)
+    kept, notes = without_stale_end(signals)
     assert notes == []
     assert kept == signals
     assert find_missions(kept)[0].end == pytest.approx(TIME[-1])
@@ -205,20 +210,20 @@ def test_a_vehicle_at_rest_and_a_moment_without_change_are_left_alone(stops, mov
 def test_a_last_pose_that_is_sent_for_good_is_no_pose_while_the_gyro_turns() -> None:
     signals = flight(6.0, moves=False)
     turning = np.column_stack([0.4 * np.cos(TIME), 0.4 * np.sin(TIME), 0 * TIME])
-    kept, (note,) = without_stale(signals | {"body_rate": Series(TIME, turning)})
+    kept, (note,) = without_stale_end(signals | {"body_rate": Series(TIME, turning)})
     assert note.names == ("attitude",)
     assert find_missions(kept)[0].end == pytest.approx(6.0, abs=0.015)
     noise = np.random.default_rng(2).normal(0.0, 0.02, (len(TIME), 3))
-    assert without_stale(signals | {"body_rate": Series(TIME, noise)})[1] == []
+    assert without_stale_end(signals | {"body_rate": Series(TIME, noise)})[1] == []
 
 
 def test_a_gyro_that_never_changes_measured_nothing_where_the_vehicle_moves() -> None:
     signals = flight(20.0, moves=True) | {"body_rate": Series(TIME, np.zeros((len(TIME), 3)))}
-    kept, (note,) = without_stale(signals)
+    kept, (note,) = without_stale_end(signals)
     assert (note.code, note.names) == (NoteCode.STALE, ("body_rate",))
     assert set(kept) == {"position", "attitude"}
     rest = {name: Series(TIME, 0 * s.values + s.values[0]) for name, s in signals.items()}
-    assert without_stale(rest) == (rest, [])
+    assert without_stale_end(rest) == (rest, [])
 
 
 @pytest.mark.parametrize(("digits", "code"), [(1, NoteCode.STAMPS_COARSE), (2, None)])
@@ -238,7 +243,7 @@ def test_where_no_position_is_seen_nothing_is_taken_for_motion(lost) -> None:
     position = signals["position"]
     unseen = np.where(TIME[:, None] < 3.0, position.values, np.nan)
     signals["position"] = Series(TIME[lost], unseen[lost])
-    assert without_stale(signals) == (signals, [])
+    assert without_stale_end(signals) == (signals, [])
 
 
 def written(path, stops: float):
@@ -257,24 +262,24 @@ def test_a_flight_of_which_too_little_is_left_is_read_but_not_fitted(tmp_path) -
     with pytest.raises(RecordingError, match="its attitude stops changing"):
         recordings_of(settings, [short])
     assert short.duration == pytest.approx(TIME[-1], abs=0.02)
-    assert is_stale(short.series, short.notes)
+    assert has_stale_attitude(short.series, short.notes)
     ((looked_at, then), _) = inspect_recordings([short.path, tmp_path / "longer.csv"], cache=False)
     assert all("attitude" in inlet.missing for inlet in looked_at.inlets)
     assert looked_at.coefficients == ()
     assert longer.duration == pytest.approx(6.0, abs=0.02)
-    assert not is_stale(longer.series, longer.notes)
+    assert not has_stale_attitude(longer.series, longer.notes)
     assert not any("attitude" in inlet.missing for inlet in then.inlets)
     assert then.coefficients
 
 
 def test_a_position_that_stays_while_the_vehicle_tilts_is_none(tmp_path) -> None:
     signals = flight(20.0, moves=True)
-    assert not stays_while_tilting(signals)
+    assert not is_position_frozen(signals)
     still = signals["position"].values * [0.0, 0.0, 1.0]
-    assert stays_while_tilting(signals | {"position": Series(TIME, still)})
+    assert is_position_frozen(signals | {"position": Series(TIME, still)})
     level = np.tile([1.0, 0.0, 0.0, 0.0], (len(TIME), 1))
     spin = {"position": Series(TIME, still), "attitude": Series(TIME, level)}
-    assert not stays_while_tilting(spin)
+    assert not is_position_frozen(spin)
     path = tmp_path / "still.csv"
     table = np.column_stack([TIME, still, signals["attitude"].values])
     np.savetxt(path, table, delimiter=",", header="t,px,py,pz,qw,qx,qy,qz", comments="")

@@ -19,7 +19,7 @@ from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
 from tuner.recordings.flight import Series
-from tuner.recordings.frames import contradiction, correct_frames, noted_contradiction
+from tuner.recordings.frames import contradiction, contradiction_in, correct_frames
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
@@ -84,7 +84,7 @@ def test_where_nothing_else_flew_the_run_ends_with_one_line(
 def test_inspection_says_so_in_one_line(reversed_circle: Path) -> None:
     ((inspection,), _) = inspect_recordings([reversed_circle], cache=False)
     (doubt,) = (note for note in inspection.notes if note.kind == "warning")
-    assert doubt == noted_contradiction(inspection.notes)
+    assert doubt == contradiction_in(inspection.notes)
     assert all("attitude" in inlet.missing for inlet in inspection.inlets)
     assert inspection.coefficients == ()
 
@@ -92,7 +92,7 @@ def test_inspection_says_so_in_one_line(reversed_circle: Path) -> None:
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_no_flight_that_flew_is_left_out(path: Path) -> None:
     for flight in load_flights(path, cache=False):
-        assert noted_contradiction(flight.notes) is None
+        assert contradiction_in(flight.notes) is None
 
 
 def circle(
@@ -196,5 +196,5 @@ def test_a_velocity_in_other_axes_is_turned_into_the_worlds(axes: str, wind: flo
 def test_a_moment_is_no_certainty() -> None:
     assert contradiction(circle(np.pi), (Mission(0.0, 4.0, "the first command"),)) is None
     assert contradiction(circle(np.pi), ()) is None
-    assert noted_contradiction(()) is None
-    assert noted_contradiction([Note(NoteCode.STALE)]) is None
+    assert contradiction_in(()) is None
+    assert contradiction_in([Note(NoteCode.STALE)]) is None

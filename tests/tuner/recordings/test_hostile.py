@@ -31,11 +31,11 @@ from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause, NoteCode
 from tuner.recordings.ros.container import (
-    LARGEST_CHUNK,
+    MAX_CHUNK_BYTES,
     Chunk,
     DamagedError,
     FileBytes,
-    joined,
+    block_of,
     read_wanted,
     unpack,
     zstd,
@@ -184,14 +184,14 @@ def test_metadata_that_multiplies(tmp_path: Path) -> None:
 def test_messages_that_unpack_to_too_much_together() -> None:
     bomb = zstd().compress(bytes(100 << 20))
     with bounded(megabytes=500.0):
-        block = unpacked_block(joined([0] * 50, [bomb] * 50))
-    assert int((block.end - block.start).sum()) <= LARGEST_CHUNK
-    few = unpacked_block(joined([1, 2, 3], [zstd().compress(b"ab"), b"damaged", bomb[:9]]))
+        block = unpacked_block(block_of([0] * 50, [bomb] * 50))
+    assert int((block.end - block.start).sum()) <= MAX_CHUNK_BYTES
+    few = unpacked_block(block_of([1, 2, 3], [zstd().compress(b"ab"), b"damaged", bomb[:9]]))
     assert (few.end - few.start).tolist() == [2, 0, 0]
 
 
 def test_a_database_that_unpacks_to_too_much(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("tuner.recordings.ros.recording.UNPACKED_AT_LEAST", 1 << 20)
+    monkeypatch.setattr("tuner.recordings.ros.recording.MIN_UNPACK_LIMIT", 1 << 20)
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "x.db3.zstd").write_bytes(zstd().compress(bytes(64 << 20)))
     assert "x.db3.zstd unpacks to an absurd size" in refused(tmp_path / "b")

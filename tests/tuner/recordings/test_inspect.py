@@ -15,9 +15,9 @@ from rich.console import Console
 
 from tests.tuner.recordings import making
 from tuner.job.recording_verdict import verdict_of
-from tuner.recordings.cache import own_folder
+from tuner.recordings.cache import cache_root
 from tuner.recordings.inspection import Inspection, as_json, inspect_recordings, render
-from tuner.recordings.inspector import inlets
+from tuner.recordings.inspector import inlet_reports
 from tuner.vehicle import COEFFICIENTS
 
 
@@ -141,7 +141,7 @@ def test_damaged_cache_is_found_anew(kind: str, tmp_path: Path) -> None:
     bag = shutil.copy(making.CIRCLE, tmp_path)
     (inspection,), _ = inspect_recordings([bag])
     verdict = verdict_of(inspection)
-    for kept in (own_folder() / kind).iterdir():
+    for kept in (cache_root() / kind).iterdir():
         kept.write_bytes(kept.read_bytes()[:-20])
     (again,), _ = inspect_recordings([bag])
     assert again == inspection
@@ -151,7 +151,9 @@ def test_damaged_cache_is_found_anew(kind: str, tmp_path: Path) -> None:
 def test_commanded_thrust_and_torque_stand_for_the_motor_commands() -> None:
     wrench = {"commanded_thrust": (0,), "commanded_torque": (0, 1, 2)}
     pose = {"position": (0, 1, 2), "attitude": (0, 1, 2, 3)}
-    fed = {inlet.name for inlet in inlets(pose | wrench, trajectory=False) if not inlet.missing}
+    fed = {
+        inlet.name for inlet in inlet_reports(pose | wrench, trajectory=False) if not inlet.missing
+    }
     assert fed == {"actuator", "attitude"}
-    (actuator,) = (i for i in inlets(pose, trajectory=False) if i.name == "actuator")
+    (actuator,) = (i for i in inlet_reports(pose, trajectory=False) if i.name == "actuator")
     assert actuator.missing == ("command",)

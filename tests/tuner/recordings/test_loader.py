@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.flight import Series
-from tuner.recordings.interpolation import LONGEST_GAP, without_gaps
-from tuner.recordings.loader import gaps_in, load_flight
+from tuner.recordings.interpolation import GAP_S, with_gaps_filled
+from tuner.recordings.loader import gap_notes, load_flight
 from tuner.recordings.topics import load_topic_map
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
@@ -124,7 +124,7 @@ def circling(time: np.ndarray) -> np.ndarray:
 @given(st.sets(st.integers(1, len(TIME) - 2), max_size=30))
 def test_lost_samples_of_a_circle_come_back(lost: set[int]) -> None:
     kept = np.array([i not in lost for i in range(len(TIME))])
-    got = without_gaps(Series(TIME[kept], circling(TIME)[kept]))
+    got = with_gaps_filled(Series(TIME[kept], circling(TIME)[kept]))
     np.testing.assert_allclose(got.time, TIME, atol=1e-9)
     alone = not any(i + 1 in lost for i in lost)
     error = np.abs(got.values - circling(TIME)).max()
@@ -134,31 +134,31 @@ def test_lost_samples_of_a_circle_come_back(lost: set[int]) -> None:
 
 def test_a_steady_series_is_left_alone() -> None:
     series = Series(TIME, circling(TIME))
-    assert without_gaps(series) is series
+    assert with_gaps_filled(series) is series
 
 
 def test_a_step_stays_between_its_ends() -> None:
     values = np.where(TIME < 3.0, 0.0, 1.0)[:, None]
     kept = np.abs(TIME - 3.0) > 0.025
-    got = without_gaps(Series(TIME[kept], values[kept]))
+    got = with_gaps_filled(Series(TIME[kept], values[kept]))
     assert len(got.time) == len(TIME)
     assert np.all((got.values >= 0.0) & (got.values <= 1.0))
 
 
-@pytest.mark.parametrize("gap", [2.0 * LONGEST_GAP, 1.0])
+@pytest.mark.parametrize("gap", [2.0 * GAP_S, 1.0])
 def test_long_gaps_and_lone_samples_stay(gap: float) -> None:
     kept = (TIME < 2.0) | (2.0 + gap <= TIME)
-    assert len(without_gaps(Series(TIME[kept], circling(TIME)[kept])).time) == kept.sum()
-    assert len(without_gaps(Series(TIME[:1], circling(TIME)[:1])).time) == 1
+    assert len(with_gaps_filled(Series(TIME[kept], circling(TIME)[kept])).time) == kept.sum()
+    assert len(with_gaps_filled(Series(TIME[:1], circling(TIME)[:1])).time) == 1
 
 
 def test_an_unknown_sample_counts_as_lost() -> None:
     values = circling(TIME)
     values[100] = np.nan
-    got = without_gaps(Series(TIME, values))
+    got = with_gaps_filled(Series(TIME, values))
     np.testing.assert_allclose(got.values, circling(TIME), atol=1e-3)
     unknown = Series(TIME, np.full((len(TIME), 3), np.nan))
-    assert without_gaps(unknown) is unknown
+    assert with_gaps_filled(unknown) is unknown
 
 
 @pytest.mark.parametrize(
@@ -170,5 +170,5 @@ def test_a_signal_is_unknown_only_beyond_what_its_rate_leaves_open(
     clock = np.arange(0.0, 20.0, 0.01)
     sampled = Series(np.arange(0.0, 20.0, 1.0 / hertz), np.ones((int(20 * hertz), 1)))
     values = np.where(clock < lost, np.nan, 16.0)[:, None]
-    notes = gaps_in({"battery_voltage": values}, {"battery_voltage": sampled}, 100.0)
+    notes = gap_notes({"battery_voltage": values}, {"battery_voltage": sampled}, 100.0)
     assert bool(notes) is is_said

@@ -13,13 +13,13 @@ from tuner.findings.findings import Code
 from tuner.recordings.flight import Series
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import (
-    LONGEST_FITTED,
-    LONGEST_MANOEUVRE,
+    MAX_FITTED_S,
+    MAX_MANOEUVRE_S,
     Mission,
     YawSpin,
     airborne,
     find_missions,
-    manoeuvres,
+    split_into_manoeuvres,
     yaw_spin,
 )
 from tuner.search.job_flights import load_flights, read_usable
@@ -179,13 +179,13 @@ def flown(moves: np.ndarray) -> dict[str, Series]:
 
 def test_a_short_mission_stays_as_it_is() -> None:
     missions = (Mission(0.0, 100.0, "flight"), Mission(110.0, 150.0, "flight"))
-    assert manoeuvres(flown(np.ones_like(CLOCK)), missions) == missions
+    assert split_into_manoeuvres(flown(np.ones_like(CLOCK)), missions) == missions
 
 
 def test_hover_parts_manoeuvres_and_the_liveliest_are_fitted() -> None:
     turn = (CLOCK // 100).astype(int)
     moves = np.where((CLOCK % 100 > 30) & (CLOCK % 100 < 75), 0.5 + 0.1 * turn, 0.0)
-    found = manoeuvres(flown(moves), (Mission(0.0, 999.0, "flight"),))
+    found = split_into_manoeuvres(flown(moves), (Mission(0.0, 999.0, "flight"),))
     assert len(found) == 10
     assert [m.start for m in found] == pytest.approx([100 * i + 29 for i in range(10)], abs=1.0)
     assert [m.end for m in found] == pytest.approx([100 * i + 75 for i in range(10)], abs=1.0)
@@ -193,15 +193,15 @@ def test_hover_parts_manoeuvres_and_the_liveliest_are_fitted() -> None:
 
 
 def test_what_never_hovers_is_cut_into_pieces() -> None:
-    found = manoeuvres(flown(np.ones_like(CLOCK)), (Mission(10.0, 990.0, "flight"),))
-    assert max(m.end - m.start for m in found) <= LONGEST_MANOEUVRE + 1e-6
+    found = split_into_manoeuvres(flown(np.ones_like(CLOCK)), (Mission(10.0, 990.0, "flight"),))
+    assert max(m.end - m.start for m in found) <= MAX_MANOEUVRE_S + 1e-6
     assert sum(m.end - m.start for m in found) == pytest.approx(980.0, abs=2.0)
-    assert sum(m.end - m.start for m in found if m.fitted) <= LONGEST_FITTED
+    assert sum(m.end - m.start for m in found if m.fitted) <= MAX_FITTED_S
 
 
 def test_what_only_hovers_is_cut_to_a_piece() -> None:
-    (found,) = manoeuvres(flown(np.zeros_like(CLOCK)), (Mission(10.0, 990.0, "flight"),))
-    assert (found.start, found.end, found.fitted) == (10.0, 10.0 + LONGEST_MANOEUVRE, True)
+    (found,) = split_into_manoeuvres(flown(np.zeros_like(CLOCK)), (Mission(10.0, 990.0, "flight"),))
+    assert (found.start, found.end, found.fitted) == (10.0, 10.0 + MAX_MANOEUVRE_S, True)
 
 
 @pytest.fixture(scope="module")

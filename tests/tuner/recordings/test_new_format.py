@@ -19,7 +19,7 @@ MODULE = '''
 import numpy as np
 
 from tuner.recordings.formats import Reader
-from tuner.recordings.recording import ROWS, Contents, Samples, TabularRecording
+from tuner.recordings.recording import TABLE_TOPIC, ReadResult, Samples, TabularRecording
 
 
 class StructuredArray(TabularRecording):
@@ -28,11 +28,11 @@ class StructuredArray(TabularRecording):
         super().__init__(path, "numpy", self._rows.dtype.names)
 
     def read(self, wanted):
-        request = wanted[ROWS]
+        request = wanted[TABLE_TOPIC]
         clock = self.clock(request)
         time = (self._rows[clock.field] * clock.nanoseconds).astype(np.int64)
         fields = {name: self._rows[name].astype(float) for name in request.fields}
-        return Contents({ROWS: Samples(time, time, fields)})
+        return ReadResult({TABLE_TOPIC: Samples(time, time, fields)})
 
 
 READER = Reader(

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tuner.recordings.notes import PASSED_OVER, Note, NoteCode, note_in_words
+from tuner.recordings.notes import REJECTED_SOURCE_CODES, Note, NoteCode, note_in_words
 
 NUMBERS = dict.fromkeys(
     [
@@ -40,7 +40,7 @@ def test_signals_of_one_topic_are_listed_and_a_clock_is_in_milliseconds():
     assert note_in_words(late).startswith("its clock is +80.0 ms late")
 
 
-@pytest.mark.parametrize("code", PASSED_OVER)
+@pytest.mark.parametrize("code", REJECTED_SOURCE_CODES)
 def test_what_was_passed_over_says_so(code):
     text = note_in_words(Note(code, topic="/battery", names=("voltage", "battery_voltage")))
     assert text.startswith("passed over: ")

@@ -17,7 +17,7 @@ from tuner.recordings.flight import Flight
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.ulog import advice_of, settings_in_words
+from tuner.recordings.ulog import logger_settings, logging_advice
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.motor_orders import motor_order_of
@@ -151,14 +151,14 @@ def test_what_to_log_more_of() -> None:
         ("vehicle_angular_velocity", "actuator_motors", "vehicle_acceleration", "esc_status",
          "vehicle_rates_setpoint", "vehicle_attitude", "vehicle_local_position"), 250.0,
     )  # fmt: skip
-    assert advice_of(everything) == ()
-    assert settings_in_words((), {}) == ""
-    (advice,) = advice_of(everything | {"vehicle_local_position": 10.0})
-    assert settings_in_words((advice,), {"SDLOG_PROFILE": 25.0}) == (
+    assert logging_advice(everything) == ()
+    assert logger_settings((), {}) == ""
+    (advice,) = logging_advice(everything | {"vehicle_local_position": 10.0})
+    assert logger_settings((advice,), {"SDLOG_PROFILE": 25.0}) == (
         "lines 'vehicle_local_position 20' in etc/logging/logger_topics.txt on the SD card"
     )
-    (advice,) = advice_of(everything | {"vehicle_attitude": 20.0})
-    assert settings_in_words((advice,), {}) == "SDLOG_PROFILE 17 instead of 1"
+    (advice,) = logging_advice(everything | {"vehicle_attitude": 20.0})
+    assert logger_settings((advice,), {}) == "SDLOG_PROFILE 17 instead of 1"
 
 
 @pytest.fixture(scope="module")

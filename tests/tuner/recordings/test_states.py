@@ -7,12 +7,12 @@ import pytest
 
 from tuner.recordings.flight import Series
 from tuner.recordings.states import (
-    FILTER_HALF_WIDTH,
-    filtered,
+    MIN_HALF_WIDTH_S,
     half_width,
     in_hover,
+    initial_position_error,
     initial_state,
-    position_error,
+    local_parabolas,
     states_at,
 )
 
@@ -27,11 +27,11 @@ def test_fast_motion_is_kept_and_noise_is_not():
     generator = np.random.default_rng(2)
     noise = generator.normal(0.0, 0.02, len(TIME))
     at = np.linspace(0.1, 2.8, 400)
-    clean = filtered(Series(TIME, wave(TIME)[:, None]), at)[:, 0]
+    clean = local_parabolas(Series(TIME, wave(TIME)[:, None]), at)[:, 0]
     assert np.abs(clean - wave(at)).max() < 0.003
-    noisy = filtered(Series(TIME, (wave(TIME) + noise)[:, None]), at)[:, 0]
+    noisy = local_parabolas(Series(TIME, (wave(TIME) + noise)[:, None]), at)[:, 0]
     assert np.std(noisy - clean) < 0.7 * 0.02
-    slope = filtered(Series(TIME, wave(TIME)[:, None]), at, derivative=1)[:, 0]
+    slope = local_parabolas(Series(TIME, wave(TIME)[:, None]), at, derivative=1)[:, 0]
     np.testing.assert_allclose(slope, 4 * np.pi * np.cos(4 * np.pi * at), atol=0.25)
 
 
@@ -39,13 +39,15 @@ def test_slow_samples_are_filtered_over_more_time_and_gaps_are_bridged():
     slow = Series(TIME[::5], wave(TIME[::5], 0.5)[:, None])
     assert half_width(Series(TIME, TIME[:, None])) == pytest.approx(0.035, abs=0.006)
     assert half_width(slow) == pytest.approx(0.175)
-    assert half_width(slow) > FILTER_HALF_WIDTH
+    assert half_width(slow) > MIN_HALF_WIDTH_S
     gap = (TIME < 1.0) | (TIME > 1.2)
     series = Series(TIME[gap], (3.0 * TIME[gap])[:, None])
-    assert filtered(series, np.array([1.1]))[0, 0] == pytest.approx(3.3)
-    assert np.isnan(filtered(series, np.array([9.0]))).all()
+    assert local_parabolas(series, np.array([1.1]))[0, 0] == pytest.approx(3.3)
+    assert np.isnan(local_parabolas(series, np.array([9.0]))).all()
     column = np.where(TIME < 1.0, np.nan, 1.0)
-    both = filtered(Series(TIME, np.column_stack([column, np.ones(len(TIME))])), np.array([0.2]))
+    both = local_parabolas(
+        Series(TIME, np.column_stack([column, np.ones(len(TIME))])), np.array([0.2])
+    )
     assert np.isnan(both[0, 0])
     assert both[0, 1] == pytest.approx(1.0)
 
@@ -116,5 +118,5 @@ def test_what_follows_the_start_does_not_reach_into_a_hover() -> None:
 def test_the_position_at_the_start_scatters_as_is_said(speed: float, turn: float) -> None:
     flights = [_flight(speed, turn, seed) for seed in range(300)]
     found = np.array([initial_state(series).position for series in flights])
-    error = position_error(flights[0], 5e-4)
+    error = initial_position_error(flights[0], 5e-4)
     assert found.std(axis=0) == pytest.approx(np.full(3, error), rel=0.15)

@@ -20,7 +20,7 @@ from tuner.recordings.formats import READERS
 from tuner.recordings.interpolation import body_rate_of
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode, note_in_words
-from tuner.recordings.sources import recognised
+from tuner.recordings.sources import sources_by_name
 from tuner.recordings.topics import load_topic_map, read_sidecar, shipped_maps
 from tuner.recordings.unit_detection import UNITS, to_enu_flu
 
@@ -199,11 +199,11 @@ def test_a_table_as_neurobem_has_it_needs_no_map(tmp_path: Path) -> None:
 
 def test_what_turns_is_told_from_what_moves_by_the_columns_names() -> None:
     kinds = ("angular_vel", "ang_acc", "lin_vel", "acc")
-    _, found = recognised(["t", *(f"{kind}_{axis}" for kind in kinds for axis in "xyz")], {})
+    _, found = sources_by_name(["t", *(f"{kind}_{axis}" for kind in kinds for axis in "xyz")], {})
     assert {signal: source.fields[0] for signal, source in found.items() if source.fields} == {
         "velocity": "lin_vel_x", "body_rate": "angular_vel_x", "acceleration": "acc_x"
     }  # fmt: skip
-    assert recognised(["t", *(f"ang_acc_{axis}" for axis in "xyz")], {})[1] == {}
+    assert sources_by_name(["t", *(f"ang_acc_{axis}" for axis in "xyz")], {})[1] == {}
 
 
 def test_a_pattern_takes_the_busiest_topic_and_says_so(short: Path, tmp_path: Path) -> None:

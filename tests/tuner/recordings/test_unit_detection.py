@@ -15,7 +15,14 @@ from tests.tuner.recordings import making
 from tuner.recordings.flight import Array, Flight
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.unit_detection import Scale, Stamped, scale_of, scales_of, to_enu_flu, unit_of
+from tuner.recordings.unit_detection import (
+    RawSeries,
+    Scale,
+    scale_of,
+    scales_of,
+    to_enu_flu,
+    unit_of,
+)
 
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", Path(__file__).parents[4] / "shared" / "flights"))
 FILES = sorted((REAL / "nanobench").glob("*.csv"))
@@ -25,7 +32,7 @@ UNITS = pytest.mark.parametrize("unit", PER_METRE)
 
 def flight(
     speed: float, *, rate: float = 100.0, noise: float = 0.001, seconds: float = 20.0, seed: int = 0
-) -> dict[str, Stamped]:
+) -> dict[str, RawSeries]:
     """Return a lemniscate of 4 m by 2 m at about some m/s, in SI units.
 
     Noise is white, in m, m/s and, of a quaternion's components, without a unit.
@@ -44,18 +51,18 @@ def flight(
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     signals = {"position": motion(0), "velocity": motion(1), "attitude": attitude}
     return {
-        name: Stamped(time, values + noise * random.normal(size=values.shape))
+        name: RawSeries(time, values + noise * random.normal(size=values.shape))
         for name, values in signals.items()
     }
 
 
-def in_unit(signals: Mapping[str, Stamped], unit: str) -> dict[str, Stamped]:
+def in_unit(signals: Mapping[str, RawSeries], unit: str) -> dict[str, RawSeries]:
     """Return signals with their lengths in a unit."""
     factors = {"position": PER_METRE[unit], "velocity": PER_METRE[unit], "attitude": 1.0}
-    return {name: Stamped(s.time, factors[name] * s.values) for name, s in signals.items()}
+    return {name: RawSeries(s.time, factors[name] * s.values) for name, s in signals.items()}
 
 
-def units(signals: Mapping[str, Stamped]) -> set[str]:
+def units(signals: Mapping[str, RawSeries]) -> set[str]:
     """Return the units that the lengths are read in."""
     return {unit_of(name, "", scale)[0] for name, scale in scales_of(signals).items()}
 
@@ -101,7 +108,7 @@ def test_stamps_and_samples_may_be_as_loggers_leave_them(unit: str) -> None:
         values[random.random(len(values)) < 0.05] = 1e5
         time[7] -= 3e7
         order = random.permutation(len(time))
-        signals[name] = Stamped(time[order], values[order])
+        signals[name] = RawSeries(time[order], values[order])
     assert units(signals) == {unit}
 
 
@@ -118,7 +125,7 @@ def test_stamps_and_samples_may_be_as_loggers_leave_them(unit: str) -> None:
 def test_an_attitude_in_another_order_tells_it_too(unit: str, recorded) -> None:
     signals = in_unit(flight(1.0), unit)
     attitude = signals["attitude"]
-    assert units(signals | {"attitude": Stamped(attitude.time, recorded(attitude.values))}) == {
+    assert units(signals | {"attitude": RawSeries(attitude.time, recorded(attitude.values))}) == {
         unit
     }
 
@@ -126,7 +133,7 @@ def test_an_attitude_in_another_order_tells_it_too(unit: str, recorded) -> None:
 @pytest.mark.parametrize("per_metre", [3.28, 39.37])
 def test_a_unit_without_a_name_is_doubted(per_metre: float) -> None:
     signals = flight(1.5)
-    position = Stamped(signals["position"].time, per_metre * signals["position"].values)
+    position = RawSeries(signals["position"].time, per_metre * signals["position"].values)
     scale = scale_of(position, signals["attitude"])
     unit, note = unit_of("position", "/pose", scale)
     assert unit == "si"
@@ -148,19 +155,19 @@ def test_a_speed_need_not_share_the_positions_unit() -> None:
 def test_a_speed_that_tells_nothing_follows_the_position() -> None:
     """It was recorded for two seconds only."""
     signals = in_unit(flight(1.5), "mm")
-    velocity = Stamped(signals["velocity"].time[:200], signals["velocity"].values[:200])
+    velocity = RawSeries(signals["velocity"].time[:200], signals["velocity"].values[:200])
     assert not scale_of(velocity, signals["attitude"], speeds=True).sure
     assert units(signals | {"velocity": velocity}) == {"mm"}
-    foreign = Stamped(velocity.time, 1e-3 * velocity.values)
+    foreign = RawSeries(velocity.time, 1e-3 * velocity.values)
     scales = scales_of(signals | {"velocity": foreign})
     assert unit_of("velocity", "", scales["velocity"]) == ("si", None)
 
 
 def test_nothing_is_known_of_nothing() -> None:
-    none = Stamped(np.empty(0), np.empty((0, 3)))
+    none = RawSeries(np.empty(0), np.empty((0, 3)))
     attitude = flight(1.0)["attitude"]
-    assert scale_of(none, attitude) == scale_of(attitude, Stamped(np.empty(0), np.empty((0, 4))))
-    assert scale_of(Stamped(attitude.time, np.full((2000, 3), np.nan)), attitude) == Scale()
+    assert scale_of(none, attitude) == scale_of(attitude, RawSeries(np.empty(0), np.empty((0, 4))))
+    assert scale_of(RawSeries(attitude.time, np.full((2000, 3), np.nan)), attitude) == Scale()
     assert scales_of({"position": none}) == {}
     assert set(scales_of({"position": none, "velocity": none, "attitude": attitude})) == {
         "position",
@@ -168,9 +175,9 @@ def test_nothing_is_known_of_nothing() -> None:
     }
 
 
-def lengths_and_attitude(flown: Flight) -> dict[str, Stamped]:
+def lengths_and_attitude(flown: Flight) -> dict[str, RawSeries]:
     names = ("position", "velocity", "attitude")
-    return {name: Stamped(flown.series[name].time, flown.series[name].values) for name in names}
+    return {name: RawSeries(flown.series[name].time, flown.series[name].values) for name in names}
 
 
 @UNITS

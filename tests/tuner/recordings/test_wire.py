@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tuner.recordings.ros.container import joined
+from tuner.recordings.ros.container import block_of
 from tuner.recordings.ros.messages import Block, Definitions, decode, missing_fields
 
 TEXT = """
@@ -104,7 +104,7 @@ def serialised(message: Any, form: str) -> bytes:
 @settings(max_examples=60, deadline=None)
 @given(st.lists(outer, min_size=1, max_size=5), st.sampled_from(["ros1", "little", "big"]))
 def test_every_field_of_every_message(messages: list[Any], form: str) -> None:
-    block = joined(list(range(len(messages))), [serialised(m, form) for m in messages])
+    block = block_of(list(range(len(messages))), [serialised(m, form) for m in messages])
     columns, whole = decoded(block, form)
     assert whole.all()
     for path in FIELDS:
@@ -119,7 +119,7 @@ def test_a_cut_message_is_not_whole_and_spoils_no_other(
 ) -> None:
     raw = serialised(message, form)
     cut = data.draw(st.integers(0, len(raw) - 1))
-    block = joined([0, 1, 2], [raw, raw[:cut], raw])
+    block = block_of([0, 1, 2], [raw, raw[:cut], raw])
     columns, whole = decoded(block, form)
     assert whole.tolist() == [True, False, True]
     for path in FIELDS:
@@ -138,7 +138,7 @@ def test_byte_orders_may_mix_and_counts_may_lie(form: str) -> None:
     at = good.index(np.float32(3.0).tobytes()) - 4
     lying[at : at + 4] = b"\xff\xff\xff\x7f"
     others = [good] if form == "ros1" else [serialised(message, "big")]
-    columns, whole = decoded(joined([0, 1, 2], [good, lying, *others]), form)
+    columns, whole = decoded(block_of([0, 1, 2], [good, lying, *others]), form)
     assert whole.tolist() == [True, False, True]
     assert columns["last"][[0, 2]].tolist() == [9.0, 9.0]
 

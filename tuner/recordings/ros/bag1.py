@@ -32,8 +32,8 @@ from tuner.recordings.ros.container import (
     DamagedError,
     Entries,
     FileBytes,
-    Found,
     Record,
+    RecordContent,
     unsigned,
 )
 from tuner.recordings.ros.messages import Block, Bytes, Index
@@ -41,8 +41,8 @@ from tuner.recordings.ros.messages import Block, Bytes, Index
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
 #: Record headers are some dozens of bytes; a connection's holds its definition beside it.
-LONGEST_HEADER = 1 << 16
-LONGEST_DATA = 1 << 24
+MAX_HEADER_BYTES = 1 << 16
+MAX_RECORD_BYTES = 1 << 24
 
 
 @dataclass
@@ -65,7 +65,7 @@ class Bag1(ChunkedFile):
         if not self.connections:
             raise RecordingError(self.path, "holds no messages", "record it again")
 
-    def _lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int:
+    def _count_lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int:
         return sum(chunk.held.get(number, 0) for chunk in chunks for number in wanted)
 
     def _read_index(self, data: FileBytes, first: int) -> None:
@@ -79,21 +79,21 @@ class Bag1(ChunkedFile):
         if at >= len(data) or connections > len(data) // 20 or chunks > len(data) // 20:
             raise DamagedError("its end is missing", Cause.END_MISSING)
         for _ in range(connections):
-            header, content, at = _whole(data, at, CONNECTION)
+            header, content, at = _whole_record(data, at, CONNECTION)
             known = _connection(header, content)
             self.connections[known.id] = known
         counts: Counter[int] = Counter()
         for _ in range(chunks):
-            header, content, at = _whole(data, at, CHUNK_INFO)
+            header, content, at = _whole_record(data, at, CHUNK_INFO)
             position, info = _chunk_info(header, content)
             self._chunks.append(replace(_chunk(*_record(data, position, CHUNK)), **info))
             counts.update(info["held"])
-        self._count(counts)
+        self._set_counts(counts)
 
     def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
         entries, at = {}, chunk.position + chunk.length
         for _ in chunk.held:
-            header, content, at = _whole(data, at, INDEX)
+            header, content, at = _whole_record(data, at, INDEX)
             entries[_number(header, b"conn", 4)] = _entries(content)
         return entries
 
@@ -101,13 +101,15 @@ class Bag1(ChunkedFile):
         with contextlib.suppress(DamagedError):
             while at < len(data):
                 header, begin, end = _record(data, at)
-                found: Found = None
+                found: RecordContent = None
                 kind = header.get(b"op")
                 if kind == bytes([CHUNK]):
                     found = _chunk(header, begin, min(end, len(data)))
                 elif kind == bytes([MESSAGE]):
                     found = _number(header, b"conn", 4), _time(header.get(b"time", b""))
-                elif kind == bytes([CONNECTION]) and end <= min(len(data), begin + LONGEST_DATA):
+                elif kind == bytes([CONNECTION]) and end <= min(
+                    len(data), begin + MAX_RECORD_BYTES
+                ):
                     known = _connection(header, data[begin:end])
                     self.connections.setdefault(known.id, known)
                 yield at, end, found
@@ -118,11 +120,11 @@ class Bag1(ChunkedFile):
         inside = (offset >= 0) & (offset + 4 <= length)
         offset, time = offset[inside], time[inside]
         size = unsigned(content, offset, 4)
-        inside = (offset + 8 + size <= length) & (size < LONGEST_HEADER)
+        inside = (offset + 8 + size <= length) & (size < MAX_HEADER_BYTES)
         offset, time, size = offset[inside], time[inside], size[inside]
         start = offset + 8 + size
         end = start + unsigned(content, start - 4, 4)
-        inside = (end <= length) & _belongs(content, number, offset + 4, size)
+        inside = (end <= length) & _is_of(content, number, offset + 4, size)
         return Block(content, start[inside], end[inside], time[inside])
 
 
@@ -133,7 +135,7 @@ Header = dict[bytes, bytes]
 def _record(data: Content, at: int, op: int | None = None) -> tuple[Header, int, int]:
     """Return the header of a record, and where its data begin and end, if need be behind all."""
     begin = at + 8 + _length(data, at)
-    if begin > at + 8 + LONGEST_HEADER:
+    if begin > at + 8 + MAX_HEADER_BYTES:
         raise DamagedError("a record header is absurdly long")
     header, size = _header(data[at + 4 : begin - 4]), _length(data, begin - 4)
     if op is not None and header.get(b"op") != bytes([op]):
@@ -141,10 +143,10 @@ def _record(data: Content, at: int, op: int | None = None) -> tuple[Header, int,
     return header, begin, begin + size
 
 
-def _whole(data: Content, at: int, op: int) -> tuple[Header, bytes, int]:
+def _whole_record(data: Content, at: int, op: int) -> tuple[Header, bytes, int]:
     """Return the header and the data of a record, and where the next begins."""
     header, begin, end = _record(data, at, op)
-    content = data[begin : min(end, begin + LONGEST_DATA)]
+    content = data[begin : min(end, begin + MAX_RECORD_BYTES)]
     if len(content) < end - begin:
         raise DamagedError("a record is absurdly long")
     return header, content, end
@@ -220,7 +222,7 @@ def _entries(content: bytes) -> tuple[Index, Index]:
     return entries[:, 0] * 1_000_000_000 + entries[:, 1], entries[:, 2]
 
 
-def _belongs(content: Bytes, connection: int, header: Index, size: Index) -> NDArray[np.bool_]:
+def _is_of(content: Bytes, connection: int, header: Index, size: Index) -> NDArray[np.bool_]:
     """Return which record headers name a connection; those of one length are laid out alike."""
     belongs = np.zeros(len(header), dtype=np.bool_)
     if len(header) == 0:

@@ -20,11 +20,11 @@ from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.messages import Block, Bytes, Index
 
 #: The largest chunk that is unpacked: cameras and lidars stay far below it.
-LARGEST_CHUNK = 128 << 20
+MAX_CHUNK_BYTES = 128 << 20
 #: Messages outside of chunks that are read together.
-AT_ONCE = 4096
+LOOSE_PER_CHUNK = 4096
 #: Wanted pieces of an uncompressed chunk that lie this near are read in one go, in bytes.
-NEAR = 1 << 16
+MAX_READ_GAP_BYTES = 1 << 16
 
 
 class FileBytes:
@@ -106,7 +106,7 @@ def unpack(compression: str, packed: bytes, size: int) -> bytes:
     DamagedError
         The compression is unknown, the size absurd or nothing can be unpacked.
     """
-    if not 0 < size <= LARGEST_CHUNK:
+    if not 0 < size <= MAX_CHUNK_BYTES:
         raise DamagedError(f"a chunk claims {size} bytes")
     try:
         if compression == "bz2":
@@ -138,7 +138,7 @@ def unsigned(buffer: Bytes, at: Index, size: int) -> Index:
     return np.asarray(spread.view(f"<u{size}")[:, 0].astype(np.int64), dtype=np.int64)
 
 
-def joined(times: Sequence[int], payloads: Sequence[bytes]) -> Block:
+def block_of(times: Sequence[int], payloads: Sequence[bytes]) -> Block:
     """Return a block of messages that were read one by one."""
     lengths = np.array([len(payload) for payload in payloads], dtype=np.int64)
     end = np.cumsum(lengths)
@@ -194,9 +194,9 @@ class Chunk:
         )
 
 
-Found = Chunk | tuple[int, int] | None
+RecordContent = Chunk | tuple[int, int] | None
 """What a record is: a chunk, a message (its connection, and ns), or something else."""
-Record = tuple[int, int, Found]
+Record = tuple[int, int, RecordContent]
 """Where a record begins and ends, and what it is."""
 
 
@@ -224,7 +224,7 @@ class ChunkedFile(Container):
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
         """Find the payloads of a connection's messages, whose records begin at some offsets."""
 
-    def _lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int | None:  # noqa: ARG002
+    def _count_lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int | None:  # noqa: ARG002
         """Return how many wanted messages some chunks held, where that is known."""
         return None
 
@@ -245,7 +245,7 @@ class ChunkedFile(Container):
             self.damage.append(
                 Damage(
                     Cause.CHUNKS_DAMAGED,
-                    lost=self._lost(lost, wanted),
+                    lost=self._count_lost(lost, wanted),
                     bytes_lost=sum(chunk.length for chunk in lost),
                     occurrences=len(lost),
                     start=min((chunk.start for chunk in lost if chunk.start), default=None),
@@ -259,7 +259,7 @@ class ChunkedFile(Container):
             entries = chunk.entries or self._index(data, chunk)
         except DamagedError:
             entries = self._walked(data, chunk)[0].entries
-        if chunk.packed or chunk.length < 4 * NEAR:
+        if chunk.packed or chunk.length < 4 * MAX_READ_GAP_BYTES:
             content = np.frombuffer(_unpacked(data, chunk), dtype=np.uint8)
         else:  # only the wanted pieces of one that may hold images unpacked
             content, entries = read_wanted(data, chunk, entries, wanted)
@@ -284,7 +284,9 @@ class ChunkedFile(Container):
         for at, end, found in self._records(data, first):
             if end > len(data) and not isinstance(found, Chunk):
                 break
-            if loose and (isinstance(found, Chunk) or sum(map(len, loose.values())) >= AT_ONCE):
+            if loose and (
+                isinstance(found, Chunk) or sum(map(len, loose.values())) >= LOOSE_PER_CHUNK
+            ):
                 self._chunks.append(Chunk(0, reached).holding(loose))
                 loose = {}
             if isinstance(found, tuple):
@@ -302,13 +304,13 @@ class ChunkedFile(Container):
         for chunk in self._chunks:
             counts.update(chunk.held)
         start = max((chunk.end for chunk in self._chunks if chunk.end is not None), default=None)
-        self._count(counts)
+        self._set_counts(counts)
         lost += len(data) - reached
         self.damage.append(
             Damage(cause, salvaged=sum(counts.values()), bytes_lost=lost, start=start)
         )
 
-    def _count(self, counts: Mapping[int, int]) -> None:
+    def _set_counts(self, counts: Mapping[int, int]) -> None:
         """Tell the connections how many messages each has."""
         self.connections = {
             number: replace(known, count=counts.get(number, 0))
@@ -318,7 +320,7 @@ class ChunkedFile(Container):
 
 def _unpacked(data: FileBytes, chunk: Chunk) -> bytes:
     """Return the records of a chunk."""
-    if chunk.length > LARGEST_CHUNK:
+    if chunk.length > MAX_CHUNK_BYTES:
         raise DamagedError(f"a chunk claims {chunk.length} bytes")
     content = data[chunk.position : chunk.position + chunk.length]
     return unpack(chunk.compression, content, chunk.size) if chunk.packed else content
@@ -342,10 +344,10 @@ def read_wanted(
     bounds = np.unique(np.concatenate([offset for _, offset in entries.values()]))
     bounds = np.append(bounds[bounds < chunk.length], chunk.length)
     ends = bounds[np.searchsorted(bounds, starts, side="right")]
-    first = np.concatenate([[0], np.flatnonzero(starts[1:] - ends[:-1] > NEAR) + 1])
+    first = np.concatenate([[0], np.flatnonzero(starts[1:] - ends[:-1] > MAX_READ_GAP_BYTES) + 1])
     last = np.append(first[1:], len(starts)) - 1
     lengths = ends[last] - starts[first]
-    if lengths.sum() > LARGEST_CHUNK:
+    if lengths.sum() > MAX_CHUNK_BYTES:
         raise DamagedError("a chunk is absurdly long")
     begins = chunk.position + starts[first]
     pieces = [data[at : at + n] for at, n in zip(begins.tolist(), lengths.tolist(), strict=True)]

@@ -22,18 +22,18 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
-from tuner.recordings.ros.container import LARGEST_CHUNK, Connection, Container, joined
+from tuner.recordings.ros.container import MAX_CHUNK_BYTES, Connection, Container, block_of
 from tuner.recordings.ros.messages import Block
 
 #: Messages that are decoded together, and their bytes.
-AT_ONCE = 16384
-BYTES_AT_ONCE = 16 << 20
+MESSAGES_PER_BLOCK = 16384
+BYTES_PER_BLOCK = 16 << 20
 #: Steps of the database's machine, in millions, after which a query is no honest one.
-PATIENCE = 5_000
+MAX_QUERY_STEPS = 5_000
 #: How often reading goes on behind a damaged page, each time twice as far behind it.
-ATTEMPTS = 24
+MAX_ATTEMPTS = 24
 #: What SQLite makes of a damaged file; it takes absurd sizes for a lack of memory.
-BROKEN = (sqlite3.Error, MemoryError, OverflowError)
+DAMAGE_ERRORS = (sqlite3.Error, MemoryError, OverflowError)
 
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
@@ -55,8 +55,8 @@ class Db3(Container):
                     raise RecordingError(
                         self.path, "is no ROS 2 recording", "give the recording itself"
                     )
-                self._learn(database, "message_definitions" in tables)
-        except BROKEN as err:
+                self._read_definitions(database, "message_definitions" in tables)
+        except DAMAGE_ERRORS as err:
             raise RecordingError(
                 self.path, f"cannot be read ({err})", "try sqlite3's '.recover' on it"
             ) from None
@@ -69,7 +69,7 @@ class Db3(Container):
         rows = self._rows(
             f"topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) AND "
             "typeof(timestamp) = 'integer' AND typeof(data) = 'blob' "
-            f"AND length(data) < {LARGEST_CHUNK} AND",
+            f"AND length(data) < {MAX_CHUNK_BYTES} AND",
             tuple(wanted),
         )
         held: dict[int, list[tuple[int, bytes]]] = {}
@@ -77,10 +77,10 @@ class Db3(Container):
         for number, time, blob in rows:
             held.setdefault(number, []).append((time, blob))
             count, size = count + 1, size + len(blob)
-            if count >= AT_ONCE or size >= BYTES_AT_ONCE:
-                yield from ((n, joined(*zip(*some, strict=True))) for n, some in held.items())
+            if count >= MESSAGES_PER_BLOCK or size >= BYTES_PER_BLOCK:
+                yield from ((n, block_of(*zip(*some, strict=True))) for n, some in held.items())
                 held, count, size = {}, 0, 0
-        yield from ((n, joined(*zip(*some, strict=True))) for n, some in held.items())
+        yield from ((n, block_of(*zip(*some, strict=True))) for n, some in held.items())
 
     def _rows(self, query: str, values: tuple[int, ...]) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query in the order of their number.
@@ -90,7 +90,7 @@ class Db3(Container):
         """
         done, attempts = 0, 0
         reached: float | None = None
-        while attempts < ATTEMPTS:
+        while attempts < MAX_ATTEMPTS:
             try:
                 with _opened(self.path) as database:
                     for row in database.execute(
@@ -101,7 +101,7 @@ class Db3(Container):
                             reached = row[2] * 1e-9
                         yield row[1:]
                 break
-            except BROKEN:
+            except DAMAGE_ERRORS:
                 attempts += 1
                 done += 1 << attempts
         if attempts and not self.damage:
@@ -115,11 +115,11 @@ class Db3(Container):
                     "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"
                 ).fetchall()
             )
-        except BROKEN:
+        except DAMAGE_ERRORS:
             rows = self._rows("topic_id, timestamp FROM messages WHERE", ())
             return Counter(number for number, _ in rows)
 
-    def _learn(self, database: sqlite3.Connection, has_definitions: bool) -> None:
+    def _read_definitions(self, database: sqlite3.Connection, has_definitions: bool) -> None:
         texts = {}
         if has_definitions:
             forms = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
@@ -151,7 +151,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         database.execute("PRAGMA cell_size_check = ON")
         if _is_cut(path):  # else SQLite refuses a file that is shorter than it says
             database.execute("PRAGMA writable_schema = ON")
-        database.set_progress_handler(lambda: int(next(steps) > PATIENCE), 1_000_000)
+        database.set_progress_handler(lambda: int(next(steps) > MAX_QUERY_STEPS), 1_000_000)
         yield database
 
 

@@ -21,7 +21,7 @@ from rosbags.typesys.msg import normalize_msgtype
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause
 from tuner.recordings.ros.container import (
-    LARGEST_CHUNK,
+    MAX_CHUNK_BYTES,
     Chunk,
     ChunkedFile,
     Connection,
@@ -29,8 +29,8 @@ from tuner.recordings.ros.container import (
     DamagedError,
     Entries,
     FileBytes,
-    Found,
     Record,
+    RecordContent,
     unsigned,
 )
 from tuner.recordings.ros.messages import Block, Bytes, Index
@@ -41,7 +41,7 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, CHUNK_INDEX, STATISTICS, DATA_EN
 )  # fmt: skip
 
 #: Bytes of a message record before its payload: op, length, channel, sequence, two times.
-BEFORE_PAYLOAD = 9 + 22
+MESSAGE_HEAD_BYTES = 9 + 22
 #: Channel, sequence and time of a message. No true time is beyond 2^63: read with a sign, as in the
 #: indexes, a damaged one lies centuries before the others, and fits into an array.
 _HEAD = struct.Struct("<HIq")
@@ -83,7 +83,7 @@ class Mcap(ChunkedFile):
         (start,) = struct.unpack_from("<Q", footer, 9)
         if not 0 < start <= end:
             raise DamagedError("it has no summary", Cause.NOT_CLOSED)
-        if end - start > LARGEST_CHUNK:
+        if end - start > MAX_CHUNK_BYTES:
             raise DamagedError("its summary is absurdly long")
         counts: dict[int, int] = {}
         summary = data[start:end]
@@ -94,14 +94,14 @@ class Mcap(ChunkedFile):
             elif op == STATISTICS:
                 counts = _counts(content)
             else:
-                self._learn(op, content)
+                self._read_definitions(op, content)
         if not self._chunks or not self.connections:
             raise DamagedError("its summary names no chunks")
-        self._count(counts)
+        self._set_counts(counts)
 
     def _records(self, data: Content, at: int) -> Iterator[Record]:
         for op, begin, end in records(data, at):
-            found: Found = None
+            found: RecordContent = None
             whole = end <= len(data)
             if op in (0, FOOTER, DATA_END):
                 return
@@ -110,12 +110,12 @@ class Mcap(ChunkedFile):
             elif op == MESSAGE and whole and end - begin >= _HEAD.size + 8:
                 number, _, time = _HEAD.unpack(data[begin : begin + _HEAD.size])
                 found = number, time
-            elif op in (SCHEMA, CHANNEL) and whole and end - begin < LARGEST_CHUNK:
+            elif op in (SCHEMA, CHANNEL) and whole and end - begin < MAX_CHUNK_BYTES:
                 with contextlib.suppress(DamagedError):
-                    self._learn(op, data[begin:end])
+                    self._read_definitions(op, data[begin:end])
             yield begin - 9, end, found
 
-    def _learn(self, op: int, content: bytes) -> None:
+    def _read_definitions(self, op: int, content: bytes) -> None:
         """Take in a schema or a channel."""
         try:
             if op == SCHEMA:
@@ -143,12 +143,12 @@ class Mcap(ChunkedFile):
         return {number: _entries(data, at, number) for number, at in chunk.held.items()}
 
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
-        inside = (offset >= 0) & (offset + BEFORE_PAYLOAD <= len(content))
+        inside = (offset >= 0) & (offset + MESSAGE_HEAD_BYTES <= len(content))
         offset, time = offset[inside], time[inside]
         end = offset + 9 + unsigned(content, offset + 1, 8)
         inside = (content[offset] == MESSAGE) & (unsigned(content, offset + 9, 2) == number)
-        inside &= (end >= offset + BEFORE_PAYLOAD) & (end <= len(content))
-        return Block(content, offset[inside] + BEFORE_PAYLOAD, end[inside], time[inside])
+        inside &= (end >= offset + MESSAGE_HEAD_BYTES) & (end <= len(content))
+        return Block(content, offset[inside] + MESSAGE_HEAD_BYTES, end[inside], time[inside])
 
 
 def records(data: Content, at: int) -> Iterator[tuple[int, int, int]]:
@@ -206,7 +206,7 @@ def _entries(data: FileBytes, at: int, number: int) -> tuple[Index, Index]:
     if len(head) != 15:
         raise DamagedError("an index is missing")
     op, _, channel, length = struct.unpack("<BQHI", head)
-    if op != INDEX or channel != number or length > LARGEST_CHUNK // 8 or length % 16:
+    if op != INDEX or channel != number or length > MAX_CHUNK_BYTES // 8 or length % 16:
         raise DamagedError("an index makes no sense")
     content = data[at + 15 : at + 15 + length]
     if len(content) != length:

@@ -23,13 +23,13 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.core.files import read_bytes
-from tuner.recordings.recording import Usual, reason_of
+from tuner.recordings.recording import FieldLayout, short_reason
 
 #: Fields of a message type in their order: name and rosbags' description of what it holds.
 Fields = list[tuple[str, Any]]
 
 #: The longest honest definition is some 20 kB; beyond this a parser is only kept busy.
-LONGEST = 200_000
+MAX_DEFINITION_CHARS = 200_000
 
 #: Types of motion capture's own packages, which databases of ROS 2 Humble and before do not carry.
 MOTION_CAPTURE = {
@@ -82,10 +82,10 @@ class Definitions:
             Its definition is missing or cannot be understood.
         """
         if kind not in self._known:
-            self._learn(kind)
+            self._read_definitions(kind)
         return self._known[kind]
 
-    def _learn(self, kind: str) -> None:
+    def _read_definitions(self, kind: str) -> None:
         text = self.texts.get(kind)
         if text is not None and text.format is not MessageDefinitionFormat.NONE:
             self._known.update(_parse(self.path, text, kind))
@@ -108,14 +108,14 @@ class Definitions:
 
 
 def _parse(path: Path, text: MessageDefinition, kind: str) -> dict[str, Fields]:
-    if len(text.data) > LONGEST:
+    if len(text.data) > MAX_DEFINITION_CHARS:
         raise RecordingError(path, f"the definition of {kind} is absurdly long", "leave it out")
     try:
         return _types(text.format, text.data, kind)
     except InputError:
         raise
     except Exception as err:  # the parser meets hostile text and has no common error class
-        what = f"the definition of {kind} makes no sense ({reason_of(err)})"
+        what = f"the definition of {kind} makes no sense ({short_reason(err)})"
         raise RecordingError(path, what, "record it again") from None
 
 
@@ -135,7 +135,7 @@ def _type_of(path: Path) -> str:
 
 def _read(path: Path) -> MessageDefinition:
     try:
-        text = read_bytes(path, most=LONGEST, remedy="").decode()
+        text = read_bytes(path, most=MAX_DEFINITION_CHARS, remedy="").decode()
     except (ConfigError, UnicodeDecodeError):
         raise RecordingError(
             path, "cannot be read as a message definition", "name a .msg file"
@@ -143,90 +143,94 @@ def _read(path: Path) -> MessageDefinition:
     return MessageDefinition(MessageDefinitionFormat.MSG, text)
 
 
-def _of(prefix: str, fields: tuple[str, ...] = _XYZ) -> Usual:
-    return Usual(tuple(f"{prefix}.{name}" for name in fields))
+def _layout(prefix: str, fields: tuple[str, ...] = _XYZ) -> FieldLayout:
+    return FieldLayout(tuple(f"{prefix}.{name}" for name in fields))
 
 
-def _pose(prefix: str) -> dict[str, Usual]:
+def _pose(prefix: str) -> dict[str, FieldLayout]:
     return {
-        "position": _of(f"{prefix}position"),
-        "attitude": _of(f"{prefix}orientation", _WXYZ),
-        "reference_position": _of(f"{prefix}position"),
+        "position": _layout(f"{prefix}position"),
+        "attitude": _layout(f"{prefix}orientation", _WXYZ),
+        "reference_position": _layout(f"{prefix}position"),
     }
 
 
-def _twist(prefix: str) -> dict[str, Usual]:
+def _twist(prefix: str) -> dict[str, FieldLayout]:
     return {
-        "velocity": _of(f"{prefix}linear"),
-        "body_rate": _of(f"{prefix}angular"),
-        "reference_velocity": _of(f"{prefix}linear"),
+        "velocity": _layout(f"{prefix}linear"),
+        "body_rate": _layout(f"{prefix}angular"),
+        "reference_velocity": _layout(f"{prefix}linear"),
     }
 
 
 _TRANSFORM = {
-    "position": _of("transform.translation"),
-    "attitude": _of("transform.rotation", _WXYZ),
+    "position": _layout("transform.translation"),
+    "attitude": _layout("transform.rotation", _WXYZ),
 }
 _FIRST_BODY = _pose("rigidbodies[0].pose.")
-_VECTOR = {"velocity": _of("vector"), "body_rate": _of("vector"), "acceleration": _of("vector")}
+_VECTOR = {
+    "velocity": _layout("vector"),
+    "body_rate": _layout("vector"),
+    "acceleration": _layout("vector"),
+}
 
 #: Message type -> signal -> where it is, fields in the order of the signal's columns. Whether a
 #: twist is written in world or body axes depends on the topic: it is checked against the motion.
-USUAL: Mapping[str, Mapping[str, Usual]] = {
+FIELD_LAYOUTS: Mapping[str, Mapping[str, FieldLayout]] = {
     "geometry_msgs/msg/PoseStamped": _pose("pose."),
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose("pose.pose."),
     "geometry_msgs/msg/TransformStamped": _TRANSFORM,
     "geometry_msgs/msg/TwistStamped": _twist("twist."),
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist("twist.twist."),
     "geometry_msgs/msg/Vector3Stamped": _VECTOR,
-    "geometry_msgs/msg/AccelStamped": {"acceleration": _of("accel.linear")},
+    "geometry_msgs/msg/AccelStamped": {"acceleration": _layout("accel.linear")},
     # of several rigid bodies the first; a topic map names another
     "mocap4r2_msgs/msg/RigidBodies": _FIRST_BODY,
     "mocap_msgs/msg/RigidBodies": _FIRST_BODY,
     "motion_capture_tracking_interfaces/msg/NamedPoseArray": _pose("poses[0].pose."),
     "nav_msgs/msg/Odometry": {**_pose("pose.pose."), **_twist("twist.twist.")},
     "sensor_msgs/msg/Imu": {
-        "attitude": _of("orientation", _WXYZ),
-        "body_rate": _of("angular_velocity"),
-        "acceleration": _of("linear_acceleration"),
+        "attitude": _layout("orientation", _WXYZ),
+        "body_rate": _layout("angular_velocity"),
+        "acceleration": _layout("linear_acceleration"),
     },
     "gazebo_msgs/msg/LinkState": {**_pose("pose."), **_twist("twist.")},
     "gazebo_msgs/msg/ModelState": {**_pose("pose."), **_twist("twist.")},
     "mavros_msgs/msg/RCOut": {
-        "command": Usual(tuple(f"channels[{rotor}]" for rotor in range(4)), unit="pwm_us"),
+        "command": FieldLayout(tuple(f"channels[{rotor}]" for rotor in range(4)), unit="pwm_us"),
     },
     "mavros_msgs/msg/ESCStatus": {
-        "rotor_speed": Usual(tuple(f"esc_status[{r}].rpm" for r in range(4)), unit="rpm"),
+        "rotor_speed": FieldLayout(tuple(f"esc_status[{r}].rpm" for r in range(4)), unit="rpm"),
     },
     "mavros_msgs/msg/ESCTelemetry": {
-        "rotor_speed": Usual(tuple(f"esc_telemetry[{r}].rpm" for r in range(4)), unit="rpm"),
+        "rotor_speed": FieldLayout(tuple(f"esc_telemetry[{r}].rpm" for r in range(4)), unit="rpm"),
     },
     "mavros_msgs/msg/AttitudeTarget": {
-        "attitude_setpoint": _of("orientation", _WXYZ),
-        "rate_setpoint": _of("body_rate"),
-        "thrust_setpoint": Usual(("thrust",)),
+        "attitude_setpoint": _layout("orientation", _WXYZ),
+        "rate_setpoint": _layout("body_rate"),
+        "thrust_setpoint": FieldLayout(("thrust",)),
     },
     "mavros_msgs/msg/PositionTarget": {
-        "reference_position": _of("position"),
-        "reference_velocity": _of("velocity"),
-        "reference_acceleration": _of("acceleration_or_force"),
+        "reference_position": _layout("position"),
+        "reference_velocity": _layout("velocity"),
+        "reference_acceleration": _layout("acceleration_or_force"),
     },
     "mav_msgs/msg/Actuators": {
-        "rotor_speed": Usual(tuple(f"angular_velocities[{rotor}]" for rotor in range(4))),
-        "command": Usual(tuple(f"normalized[{rotor}]" for rotor in range(4))),
+        "rotor_speed": FieldLayout(tuple(f"angular_velocities[{rotor}]" for rotor in range(4))),
+        "command": FieldLayout(tuple(f"normalized[{rotor}]" for rotor in range(4))),
     },
     "actuator_msgs/msg/Actuators": {
-        "rotor_speed": Usual(tuple(f"velocity[{rotor}]" for rotor in range(4))),
-        "command": Usual(tuple(f"normalized[{rotor}]" for rotor in range(4))),
+        "rotor_speed": FieldLayout(tuple(f"velocity[{rotor}]" for rotor in range(4))),
+        "command": FieldLayout(tuple(f"normalized[{rotor}]" for rotor in range(4))),
     },
     "controller_msgs/msg/FlatTarget": {
-        "reference_position": _of("position"),
-        "reference_velocity": _of("velocity"),
-        "reference_acceleration": _of("acceleration"),
+        "reference_position": _layout("position"),
+        "reference_velocity": _layout("velocity"),
+        "reference_acceleration": _layout("acceleration"),
     },
-    "sensor_msgs/msg/BatteryState": {"battery_voltage": Usual(("voltage",))},
-    "std_msgs/msg/Int32": {"lap": Usual(("data",))},
-    "std_msgs/msg/UInt32": {"lap": Usual(("data",))},
+    "sensor_msgs/msg/BatteryState": {"battery_voltage": FieldLayout(("voltage",))},
+    "std_msgs/msg/Int32": {"lap": FieldLayout(("data",))},
+    "std_msgs/msg/UInt32": {"lap": FieldLayout(("data",))},
 }
 
 
@@ -235,10 +239,10 @@ Index = NDArray[np.int64]
 Cursor = int | Index
 
 #: Nothing honest nests deeper, or holds more structures in an array before a wanted field.
-DEEPEST = 12
-MOST = 256
+MAX_DEPTH = 12
+MAX_ELEMENTS = 256
 
-_KINDS = {
+_NUMPY_KINDS = {
     "bool": "u1",
     "byte": "u1",
     "char": "u1",
@@ -357,7 +361,7 @@ class _Walker:
         Of bytes, as NumPy writes it.
     columns
         Path -> (n,) numbers.
-    left
+    steps_left
         Values that are walked through at most: types may multiply.
     """
 
@@ -368,7 +372,7 @@ class _Walker:
     order: str = "<"
     aligned: bool = False
     columns: dict[str, NDArray[Any]] = field(default_factory=dict)
-    left: int = 100_000
+    steps_left: int = 100_000
 
     def walk(self, what: Any, path: str, of: _Messages, cursor: Cursor, depth: int) -> Cursor:
         """Walk through one value from a place behind the messages' starts; return that behind it.
@@ -378,12 +382,12 @@ class _Walker:
         what
             rosbags' description of the value.
         """
-        self.left -= 1
+        self.steps_left -= 1
         node, detail = what
         element = what if node in (Nodetype.BASE, Nodetype.NAME) else detail[0]
         text = element[0] == Nodetype.BASE and element[1][0] == "string"
-        if self.left < 0 or depth > DEEPEST:
-            self._give_up(of)
+        if self.steps_left < 0 or depth > MAX_DEPTH:
+            self._stop(of)
         elif node == Nodetype.NAME:
             for name, inner in self.definitions.fields(detail):
                 if not self.wanted:
@@ -392,14 +396,14 @@ class _Walker:
         elif node == Nodetype.BASE and text:
             cursor = self._sequence("u1", "", of, cursor)
         elif node == Nodetype.ARRAY and (text or element[0] != Nodetype.BASE):
-            if detail[1] > MOST:
-                self._give_up(of)
-            for i in range(min(detail[1], MOST)):
+            if detail[1] > MAX_ELEMENTS:
+                self._stop(of)
+            for i in range(min(detail[1], MAX_ELEMENTS)):
                 cursor = self.walk(element, f"{path}[{i}]", of, cursor, depth + 1)
         elif text or element[0] != Nodetype.BASE:
             cursor = self._structures(element, path, of, cursor, depth)
-        elif (kind := _KINDS.get(element[1][0])) is None:
-            self._give_up(of)
+        elif (kind := _NUMPY_KINDS.get(element[1][0])) is None:
+            self._stop(of)
         elif node == Nodetype.SEQUENCE:
             cursor = self._sequence(kind, path, of, cursor)
         else:
@@ -410,9 +414,9 @@ class _Walker:
             )
         return cursor
 
-    def _give_up(self, of: _Messages) -> None:
+    def _stop(self, of: _Messages) -> None:
         """Let nothing more be found: what comes next in the type cannot be walked through."""
-        self.left = 0
+        self.steps_left = 0
         self.whole[of.rows] = False
 
     def _numbers(
@@ -452,10 +456,10 @@ class _Walker:
         counts, cursor = self._length(of, cursor)
         at = np.zeros(len(of.rows), dtype=np.int64) + cursor
         # Each element takes at least a byte, and nobody walks through more than MOST of them.
-        absurd = counts > np.minimum(of.end - of.start - at, MOST)
+        absurd = counts > np.minimum(of.end - of.start - at, MAX_ELEMENTS)
         self.whole[of.rows[absurd]] = False
         counts = np.where(absurd, 0, counts)
-        reach = min(max(self._indices(path), default=-1) + 1, MOST)
+        reach = min(max(self._indices(path), default=-1) + 1, MAX_ELEMENTS)
         for i in range(max(int(counts.max(initial=0)), reach)):
             has = np.flatnonzero(counts > i)
             at[has] = self.walk(element, f"{path}[{i}]", of.of(has), at[has], depth + 1)

@@ -23,28 +23,28 @@ from tuner.recordings import ulog
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import (
     Clock,
-    Contents,
+    FieldLayout,
     Nanoseconds,
+    ReadResult,
     Recording,
     Request,
     Samples,
     Topic,
-    Usual,
 )
 from tuner.recordings.ros.bag1 import Bag1
 from tuner.recordings.ros.container import (
-    LARGEST_CHUNK,
+    MAX_CHUNK_BYTES,
     Connection,
     Container,
     DamagedError,
-    joined,
+    block_of,
     unpack,
     zstd,
 )
 from tuner.recordings.ros.db3 import Db3
 from tuner.recordings.ros.mcap import Mcap
 from tuner.recordings.ros.messages import (
-    USUAL,
+    FIELD_LAYOUTS,
     Block,
     Definitions,
     Fields,
@@ -54,7 +54,7 @@ from tuner.recordings.ros.messages import (
 
 #: Files compressed as a whole are unpacked to so many times their size, and to so many bytes if
 #: they are small: flights do not come to more.
-MOST_TIMES_PACKED, UNPACKED_AT_LEAST = 100, 1 << 30
+MAX_UNPACK_RATIO, MIN_UNPACK_LIMIT = 100, 1 << 30
 
 
 @dataclass
@@ -132,7 +132,7 @@ class Folder(Container):
             self._unpacked = Path(mkdtemp(prefix="tune-"))
             weakref.finalize(self, shutil.rmtree, self._unpacked, True)
         target = self._unpacked / file_name(path.stem)
-        room = max(UNPACKED_AT_LEAST, MOST_TIMES_PACKED * path.stat().st_size)
+        room = max(MIN_UNPACK_LIMIT, MAX_UNPACK_RATIO * path.stat().st_size)
         try:
             with zstd().open(path, "rb") as packed, target.open("wb") as stream:
                 while part := packed.read(1 << 20):
@@ -148,16 +148,16 @@ class Folder(Container):
 def unpacked_block(block: Block) -> Block:
     """Unpack messages that were compressed one by one; a damaged one becomes empty.
 
-    So do those behind `LARGEST_CHUNK` bytes.
+    So do those behind `MAX_CHUNK_BYTES` bytes.
     """
-    payloads, room = [], LARGEST_CHUNK
+    payloads, room = [], MAX_CHUNK_BYTES
     for start, end in zip(block.start, block.end, strict=True):
         try:
             payloads.append(unpack("zstd", block.buffer[start:end].tobytes(), room))
         except DamagedError:
             payloads.append(b"")
         room -= len(payloads[-1])
-    return joined(block.time.tolist(), payloads)
+    return block_of(block.time.tolist(), payloads)
 
 
 def open_file(path: Path) -> Container:
@@ -204,26 +204,26 @@ class RosRecording(Recording):
             Topic(name, kind, count) for (name, kind), count in sorted(counts.items())
         )
 
-    def usual(self, topic: str, signal: str) -> Usual | None:
+    def field_layout(self, topic: str, signal: str) -> FieldLayout | None:
         """Return where messages of this topic's type hold a signal."""
         kind = self._kind(topic)
         if kind.startswith("px4_msgs/"):
             in_log = re.sub(r"(?<!^)(?=[A-Z])", "_", kind.rpartition("/")[2]).lower()
-            return ulog.USUAL.get(in_log, {}).get(signal)
-        return USUAL.get(kind, {}).get(signal)
+            return ulog.FIELD_LAYOUTS.get(in_log, {}).get(signal)
+        return FIELD_LAYOUTS.get(kind, {}).get(signal)
 
     def fields(self, topic: str) -> list[str]:
         """Return the names of the fields of a topic's messages."""
         return [name for name, _ in self._type(topic) or ()]
 
-    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
+    def missing_fields(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return those of some fields that a topic's messages do not have."""
         try:
             return self._missing(self._kind(topic), fields)
         except RecordingError:
             return fields
 
-    def undefined(self, topic: str) -> str | None:
+    def undefined_type(self, topic: str) -> str | None:
         """Return the message type of a topic if its definition is nowhere; None if it is known."""
         return self._kind(topic) if self._type(topic) is None else None
 
@@ -235,7 +235,7 @@ class RosRecording(Recording):
     def _kind(self, topic: str) -> str:
         return next((known.type for known in self.topics if known.name == topic), "")
 
-    def read(self, wanted: Mapping[str, Request]) -> Contents:
+    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
         """Read the wanted fields of some topics."""
         plans: dict[int, tuple[list[str], Clock | None]] = {}
         for connection in self._container.connections.values():
@@ -256,7 +256,7 @@ class RosRecording(Recording):
             if count
         ]
         samples = {name: _joined(rows) for name, rows in parts.items() if rows}
-        return Contents(samples, damage=(*self._container.damage, *cut))
+        return ReadResult(samples, damage=(*self._container.damage, *cut))
 
     def _missing(self, kind: str, fields: Sequence[str]) -> tuple[str, ...]:
         return missing_fields(self._definitions, kind, fields)
