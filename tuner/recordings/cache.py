@@ -1,6 +1,6 @@
-"""The cache of what was read: keyed by content, settings and the readers' own source.
+"""The cache of read recordings, keyed by their content, the settings and the readers' source.
 
-It imports no numpy, so that a recording seen before is answered before that is loaded.
+It imports no numpy, so that a cached answer does not wait for it.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from tuner.core.errors import OutputError
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
-#: Files above this, in bytes, are not read again only to learn that they are unchanged.
+#: Larger files are recognised by name, size and time of change instead of their content.
 MAX_HASHED_BYTES = 256 << 20
-#: Together the cached files take no more than this; the longest unused go first.
+#: The cached files together take no more; the longest unused are removed first.
 MAX_CACHE_BYTES = 2 << 30
 
 
@@ -50,7 +50,6 @@ def digest(path: Path) -> str:
         about = [(str(file), file.stat()) for file in files]
         if sum(stat.st_size for _, stat in about) <= MAX_HASHED_BYTES:
             return _digest(path, files)
-        # Name, size and time of change stand for the content of what takes seconds to read.
         parts = [(n, s.st_size, s.st_mtime_ns, s.st_ino) for n, s in about]
         known = cache_file("digest", json.dumps(parts))
         if (known_digest := load(known)) is not None and len(known_digest) == 64:
@@ -87,13 +86,13 @@ def source_version(folder: str = "") -> str:
 
 
 def cache_file(kind: str, *key: str) -> Path:
-    """Return the file in which something with this key is kept."""
+    """Return the cache's file for a key."""
     parts = source_version("recordings"), kind, *key
     return cache_root() / kind / hashlib.sha256("\0".join(parts).encode()).hexdigest()[:40]
 
 
 def load(path: Path) -> bytes | None:
-    """Return what is kept in a file of the cache; None where nothing is, or it cannot be read."""
+    """Return the content of a cached file; None if it is missing or unreadable."""
     try:
         content = path.read_bytes()
         path.touch()
@@ -103,12 +102,12 @@ def load(path: Path) -> bytes | None:
 
 
 def load_or_compute(kind: type[T], path: Path, compute: Callable[[], T]) -> T:
-    """Return a dataclass that a file of the cache holds, or find it and keep it there.
+    """Return a dataclass from the cache, or compute and cache it.
 
     Parameters
     ----------
     path
-        The file; one that is damaged holds nothing.
+        The file; a damaged one is replaced.
     """
     if (content := load(path)) is not None:
         with contextlib.suppress(ValidationError):
@@ -119,7 +118,7 @@ def load_or_compute(kind: type[T], path: Path, compute: Callable[[], T]) -> T:
 
 
 def store(path: Path, content: bytes) -> None:
-    """Keep something: it appears whole or not at all, and a full disk is no error."""
+    """Write a cached file atomically; a full disk is no error."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as unfinished:

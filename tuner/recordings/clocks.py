@@ -1,8 +1,8 @@
-"""Clocks of a recording: which stamps to believe, the mission's ticks, the pose's offset.
+"""Clocks of a recording: stamps against times of arrival, the mission's ticks, the pose's offset.
 
-A stamp says when something was measured, its arrival when it was recorded. A loop that publishes
-regularly shows the ticks of the mission's uniform clock. Where pose and gyro are stamped by
-different clocks, their correlation shows by how much.
+A stamp is the time of measurement, the arrival that of recording. A loop that publishes regularly
+shows the ticks of the mission's uniform clock. Where different clocks stamp pose and gyro, their
+cross-correlation shows the offset.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from tuner.recordings.notes import Kind, Note, NoteCode
 from tuner.recordings.recording import Nanoseconds, Samples
 
 NS_PER_SECOND = 1_000_000_000
-#: A stamp that leaves its neighbours by more than this, while its arrival does not, has jumped.
+#: A stamp that leaves its neighbours by more, while its arrival does not, has jumped.
 MIN_CLOCK_JUMP_NS = NS_PER_SECOND // 10
-#: Topics whose stamps differ by more than this from the others' are on a clock of their own.
+#: Topics whose stamps differ by more from the others' have a clock of their own.
 MIN_CLOCK_OFFSET_NS = NS_PER_SECOND // 2
-#: A stamp this part of a period off its tick still belongs to that tick.
+#: Share of a period by which a stamp may be off its tick.
 MAX_TICK_DEVIATION = 0.2
-#: No clock drifts faster, in s/s: such stamps have another rate.
+#: s/s. No clock drifts faster: such stamps have another rate.
 MAX_CLOCK_DRIFT = 0.01
-#: A smaller offset, in s, is left to the fit, which has a time offset and latencies to find.
+#: A smaller offset is left to the fit, which estimates a time offset and latencies.
 MIN_POSE_OFFSET_S = 0.02
-#: Seconds within which an offset is looked for.
+#: The search range of the offset, to either side.
 MAX_POSE_OFFSET_S = 0.6
-#: How much less unlike the signals must be at the offset than without it.
+#: 1 - correlation at the offset over that without it, at most.
 MAX_MISMATCH_RATIO = 0.8
-#: Turning below this, in rad/s, or a correlation below that is no evidence.
+#: rad/s, and a correlation: less is no evidence of an offset.
 MIN_TURN_RATE = 0.1
 MIN_CORRELATION = 0.6
-#: Seconds over which both are averaged against noise.
+#: Both signals are averaged over this window against noise.
 AVERAGING_WINDOW_S = 0.1
 
 
@@ -56,17 +56,16 @@ def message_times(
 ) -> tuple[dict[str, Nanoseconds], tuple[Note, ...]]:
     """Return the times of every topic's messages, all on one clock.
 
-    Header stamps are when something was measured; the time of recording is later by a varying
-    delay. So stamps are used, once single wrong ones and jumps of a clock that was set while it
-    ran are repaired by the times of recording. A topic stamped by a clock that is not the others'
-    is moved onto theirs, as far as the times of recording show.
+    Header stamps are times of measurement; arrivals are later by a varying delay. So stamps are
+    used, after single wrong ones and jumps of a clock that was set are repaired by the arrivals. A
+    topic stamped by another clock than the rest is moved onto theirs.
 
     Parameters
     ----------
     receive_only
-        Topics whose stamps are not to be used.
+        Topics whose stamps are ignored.
     slow_topics
-        Topics for which the time of recording is as good as a stamp.
+        Topics that change so slowly that the arrival serves as well as a stamp.
     """
     notes: list[Note] = []
     unset_topics: list[str] = []
@@ -94,7 +93,7 @@ def message_times(
             notes.append(Note(NoteCode.OTHER_CLOCK, topic=topic, count=count, numbers=shift))
     for topic, messages in samples.items():
         if topic not in times:
-            # Where all stamps count from a start-up, arrivals are moved to count from there too.
+            # Where stamps count from a start-up, arrivals are shifted to count from there too.
             times[topic] = messages.receive + (common if abs(common) > NS_PER_SECOND else 0)
             if topic in unset_topics:
                 notes.append(Note(NoteCode.STAMPS_UNSET, topic=topic, count=len(messages.receive)))
@@ -107,7 +106,7 @@ def message_times(
 def _repair_stamps(
     topic: str, stamp: Nanoseconds, receive: Nanoseconds
 ) -> tuple[Nanoseconds, list[Note]]:
-    """Undo jumps of a stamp that the time of recording did not make."""
+    """Undo jumps of the stamps that the arrivals do not show."""
     if len(stamp) < 3:
         return stamp, []
     step, arrival = np.diff(stamp), np.diff(receive)
@@ -165,11 +164,11 @@ class Grid:
     origin
         s, the time of one tick.
     rate
-        Hz; the wanted clock's, or a multiple of it that the publisher keeps.
+        Hz; the requested rate, or a multiple of it that the publisher keeps.
     drift
         Seconds per second by which the publisher's clock runs slower than its stamps.
     spread
-        s, the 95th percentile of how late stamps are on their ticks.
+        s, the 95th percentile of the stamps' delay after their ticks.
     """
 
     origin: float
@@ -182,10 +181,10 @@ class Grid:
         return self.origin + round((time - self.origin) * self.rate) / self.rate
 
     def snap(self, time: Array) -> Array:
-        """Return (n,) stamps moved to their ticks, or unchanged where they follow no ticks.
+        """Return (n,) stamps moved to their ticks; unchanged if they follow none.
 
         A loop that publishes on every tick stamps a fraction of a millisecond late. Held on the
-        uniform clock as it stands, such a sample would be read one whole tick late.
+        uniform clock, such a sample would otherwise be read a whole tick late.
         """
         phase = (time - self.origin) * self.rate
         on_drifting = phase * (1 - self.drift)
@@ -199,9 +198,9 @@ class Grid:
 def fit_grid(time: Array, rate: float) -> Grid | None:
     """Fit ticks of a known rate, or a multiple, to (n,) increasing stamps that come a little late.
 
-    A publisher's timer fires on the tick and the stamp is written a little later, never earlier,
-    so that the ticks are the lower envelope of the stamps: the first percentile of how late they
-    are, once a steady drift of the clock is taken away. None if the stamps follow no such ticks.
+    A publisher's timer fires on the tick and the stamp is written a little later, never earlier:
+    the ticks are the lower envelope of the stamps, taken as the first percentile of their delays
+    after removal of a steady drift. None if the stamps follow no ticks.
     """
     if len(time) < 20:
         return None
@@ -232,7 +231,7 @@ def fit_grid(time: Array, rate: float) -> Grid | None:
 def clock_of(
     series: Mapping[str, Series], rate: float, start: float = -np.inf, end: float = np.inf
 ) -> Grid | None:
-    """Return the ticks that the reference or, where there is none, the set-points follow."""
+    """Return the ticks of the reference or, without one, of the set-points."""
     for name in ("reference_position", "rate_setpoint", "thrust_setpoint"):
         grid = fit_grid(series[name].between(start, end).time, rate) if name in series else None
         if grid is not None:
@@ -241,9 +240,9 @@ def clock_of(
 
 
 def pose_offset(series: Mapping[str, Series]) -> float | None:
-    """Return by how many seconds the attitude's stamps are late against the gyro's.
+    """Return the delay in s of the attitude's stamps against the gyro's.
 
-    None where one is missing or the vehicle turns too little.
+    None if one is missing or the vehicle turns too little.
     """
     if "attitude" not in series or "body_rate" not in series:
         return None
@@ -283,12 +282,12 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
 def align_pose(
     series: Mapping[str, Series], topics: Mapping[str, str]
 ) -> tuple[dict[str, Series], tuple[Note, ...]]:
-    """Move the pose onto the clock of the gyro where they are visibly apart.
+    """Move the pose onto the clock of the gyro where they clearly differ.
 
     Parameters
     ----------
     topics
-        Signal -> topic; what shares the attitude's topic is moved with it.
+        Signal -> topic; signals of the attitude's topic are moved with it.
     """
     aligned = dict(series)
     topic = topics.get("attitude", "")

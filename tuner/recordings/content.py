@@ -1,4 +1,4 @@
-"""What a recording holds: its signals cleaned and on one clock, and the missions in them."""
+"""The content of a recording: its signals, cleaned and on one clock, and its missions."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ from tuner.recordings.unit_detection import (
 from tuner.vehicle.motor_orders import columns_of, motor_order_of, order_in_words
 
 PX4_REFERENCES = ("trajectory_setpoint", "vehicle_local_position_setpoint")
-"""Messages that ask PX4's own position control for something."""
+"""References of PX4's own position control."""
 DRIVING_SIGNALS = (
     "command",
     "rotor_speed",
@@ -59,22 +59,22 @@ DRIVING_SIGNALS = (
     "commanded_thrust",
     "reference_position",
 )
-"""Signals of which one has to be there beside a pose, for anything to drive a simulation."""
+"""A simulation needs one of these beside a pose."""
 PER_MOTOR = ("command", "rotor_speed")
-"""Signals with a column a motor."""
+"""Signals with one column per motor."""
 SLOW_SIGNALS = {"lap", "battery_voltage"}
-"""Signals for which the time of recording is as good as a stamp."""
+"""Signals that change so slowly that their arrival serves as well as a stamp."""
 
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How a recording is to be read: as its user and its side-car say.
+    """Options of reading a recording, from the user and its side-car.
 
     Attributes
     ----------
     topic_map
-        The topic map that the user or, failing that, the side-car names; None takes the shipped map
-        that finds most signals.
+        The topic map of the user, else of the side-car; None takes the shipped map that finds most
+        signals.
     namespace
         Prefix of the recorded topics that the map does not have, as ``uav1``.
     rate
@@ -119,12 +119,12 @@ class ReadOptions:
 
 @dataclass(frozen=True)
 class Signals:
-    """The signals of a recording, cleaned, before a pose is asked for.
+    """The cleaned signals of a recording, with or without a pose.
 
     Attributes
     ----------
     places
-        Signal -> where it was found.
+        Signal -> its source.
     samples
         Topic -> its messages as recorded.
     topics
@@ -132,9 +132,9 @@ class Signals:
     series
         Signal -> cleaned samples, in seconds since the first pose, or the first sample without one.
     damage
-        What the file has lost, with times as those of ``series``.
+        What the file has lost, with times as in ``series``.
     no_pose
-        Why they hold no pose, where they do not.
+        Why they hold no pose; None if they do.
     """
 
     recording: Recording
@@ -150,7 +150,7 @@ class Signals:
 
 @dataclass(frozen=True)
 class Content(Signals):
-    """A recording once read: its signals on one clock and in one frame, and what was flown."""
+    """A recording: its signals on one clock and in one frame, and its missions."""
 
     missions: tuple[Mission, ...]
 
@@ -220,7 +220,7 @@ def read_signals(options: ReadOptions) -> Signals:
 
 
 def _notes_of_places(places: Mapping[str, Place]) -> list[Note]:
-    """Return what the places of signals alone tell."""
+    """Return notes on the sources of signals."""
     notes, speed, reference = [], places.get("rotor_speed"), places.get("reference_position")
     if speed is not None and speed.source.unit is None:  # what they were taken for
         notes.append(Note(NoteCode.SPEED_UNIT_OPEN, "info", speed.topic, names=(speed.unit,)))
@@ -232,7 +232,7 @@ def _notes_of_places(places: Mapping[str, Place]) -> list[Note]:
 
 
 def _stamp_delay(raw: Mapping[str, RawSignal], contents: ReadResult, epoch: int) -> float:
-    """Return the s from the recorder's clock to that of the stamps since some nanoseconds."""
+    """Return the s from the recorder's clock to that of the stamps, counted from `epoch` ns."""
     first = "position" if "position" in raw else min(raw, default=None)
     if first is None:
         return 0.0
@@ -267,7 +267,7 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     else:
         series = cut
     denied = contradiction(series, missions)
-    if denied is not None:  # which says what the doubts of frames are about
+    if denied is not None:  # it explains the doubts about frames
         turned = (*(note for note in turned if note.code not in DOUBTS), denied)
     notes = (*signals.notes, *shifted, *turned, *stale, *dead, *none)
     read = vars(signals) | {"series": series, "notes": notes}
@@ -277,7 +277,7 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
 def _with_times_in_us(
     raw: dict[str, RawSignal],
 ) -> tuple[dict[str, RawSignal], list[Note]]:
-    """Return signals with times a thousandth as long, where gravity says that they are."""
+    """Return signals with times divided by 1000, if gravity shows that their unit is us, not ms."""
     if not is_too_slow({name: data.in_seconds(0) for name, data in raw.items()}):
         return raw, []
     quick = {name: replace(data, time=data.time // 1000) for name, data in raw.items()}
@@ -308,13 +308,13 @@ def _clean(raw: Mapping[str, RawSignal]) -> tuple[dict[str, Series], int, list[N
 
 
 MIN_COMMAND_RANGE = 0.05
-"""Of the commands of a flight: less may be a hover, in whole microseconds."""
+"""A smaller range of commands may be a hover, in whole microseconds of PWM."""
 
 
 def _without_dead_commands(
     series: Mapping[str, Series], topics: Mapping[str, str]
 ) -> tuple[dict[str, Series], tuple[Note, ...]]:
-    """Return signals without commands that never change for one rotor while they do for others."""
+    """Return signals without the commands, if one rotor's never change while others' do."""
     others = dict(series)
     if "command" not in others:
         return others, ()
@@ -333,9 +333,9 @@ def _without_dead_commands(
 def _without_dead_tachometers(
     series: Mapping[str, Series], topics: Mapping[str, str]
 ) -> tuple[dict[str, Series], tuple[Note, ...]]:
-    """Return signals without rotor speeds that are none, and a note on rotors without tachometer.
+    """Return signals without dead rotor speeds, and a note on rotors without tachometer.
 
-    Those are none that never change while others do, or that are all 0.
+    A speed is dead if it is always 0, or never changes while others do.
     """
     others, speeds = dict(series), series.get("rotor_speed")
     if speeds is None:
@@ -401,7 +401,7 @@ def extract(
     Returns
     -------
     tuple
-        Signal -> its raw values, the messages they come from, and what was noticed.
+        Signal -> its raw values, the messages they come from, and notes.
     """
     wanted: dict[str, list[str]] = {}
     for place in places.values():
@@ -417,7 +417,9 @@ def extract(
     times, notes = message_times(contents.samples, receive_only, slow_topics)
     signals: dict[str, RawSignal] = {}
     inferred: list[Note] = []
-    for signal in sorted(places, key=lambda name: name in ATTITUDES):  # which positions may tell
+    for signal in sorted(
+        places, key=lambda name: name in ATTITUDES
+    ):  # positions may show their unit
         place = places[signal]
         samples = contents.samples.get(place.topic)
         if samples is None or not len(samples.receive):
@@ -442,10 +444,7 @@ def extract(
 def _recorded_unit(
     recording: Recording, signal: str, place: Place, recorded: RawSignal, position: RawSignal | None
 ) -> str:
-    """Return the unit of recorded numbers: the map's, or else the one in which they make sense.
-
-    It is empty where they make sense in none.
-    """
+    """Return the unit of recorded numbers: the map's, else the plausible one, empty if none is."""
     if place.source.unit is not None:
         return place.unit
     if signal not in ATTITUDES or place.source.quaternion != "rpy":

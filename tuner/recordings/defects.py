@@ -1,10 +1,8 @@
 """Defects of a signal: order, duplicates, NaN, quaternions, outliers, stale ends; all are counted.
 
-A controller that gives up, after a crash say, leaves its variables as they were, and a logger that
-reads variables goes on writing them; motion capture that has lost its markers may send its last
-pose for good. At the end of such a recording a signal repeats itself to the bit although the
-vehicle moves on, as its position shows or its gyro. One at rest repeats itself too, and is left
-alone.
+After a crash a controller may stop and a logger go on writing its variables; motion capture without
+markers may repeat its last pose for good. At the end of such a recording a signal repeats itself to
+the bit although position or gyro show motion. A vehicle at rest repeats itself too, and is kept.
 """
 
 from __future__ import annotations
@@ -39,28 +37,28 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "rotor_speed": (0.0, 100_000.0),  # in revolutions a minute, if nothing says the unit
     "battery_voltage": (1.0, 100.0),  # nothing flies on less: a meter that was not read
 }
-"""Signals that cannot leave a range; a value beyond it is a corrupt sample."""
+"""Signal -> range; a value beyond it is a corrupt sample."""
 
 MAX_BEYOND_SHARE = 0.5
-"""Share of samples out of range above which a signal is in another unit rather than corrupt."""
+"""With more samples out of range a signal is in another unit rather than corrupt."""
 
 MAX_EQUAL_STAMP_SHARE = 0.5
-"""Share of stamps on which samples differ, above which stamps are too coarse for a flight."""
+"""With more stamps shared by different samples the stamps are too coarse for a flight."""
 
 MAX_RECORDING_S = 43_200.0
-"""No recording lasts longer, in s, to either side of its middle."""
+"""No recording lasts longer to either side of its middle."""
 OUTLIER_THRESHOLD = 6.0
-"""Multiples of how far samples stick out nearby that make an outlier."""
+"""An outlier sticks out by so many times more than samples nearby."""
 MAX_EXCURSION_S = 1.0
-"""Seconds after which a pose that jumped away is not expected back."""
+"""A pose that jumped away for longer does not come back."""
 MIN_STALE_S = 1.0
-"""s for which a signal must not have changed."""
+"""A stale end lasts at least so long,"""
 MIN_MOTION_M = 0.05
-"""m by which the vehicle must have moved meanwhile."""
+"""while the vehicle moves by so much,"""
 MIN_TURN_RATE = 0.2
-"""rad/s of its gyro, root mean square, that show the same."""
+"""or its gyro shows so much, root mean square in rad/s."""
 MIN_TILT_RAD = 0.05
-"""rad, root mean square, of a vehicle that must move."""
+"""A vehicle with a larger tilt, root mean square, must move."""
 MOTION_SIGNALS = ("attitude", "body_rate")
 """Signals that change whenever a vehicle moves."""
 
@@ -96,7 +94,7 @@ def clean(
     if dropped > MAX_BEYOND_SHARE * int((values != 0).any(axis=1).sum()):  # 0 is 0 in each unit
         median = float(np.nanmedian(values))
         note(dropped, NoteCode.UNIT_UNKNOWN, "warning", lower=low, upper=high, median=median)
-        beyond |= True  # what is left would be held for all of it
+        beyond |= True  # the few samples in range are not the signal
     else:
         note(dropped, NoteCode.OUT_OF_RANGE, lower=low, upper=high)
     values = np.where(beyond, np.nan, values)
@@ -142,7 +140,7 @@ def clean(
 def _without_outliers(
     signal: str, time: Array, values: Array, note: Callable[..., None]
 ) -> tuple[Array, Array]:
-    """Drop what cannot be true, and note it."""
+    """Drop repeated poses, excursions and outliers, and note them."""
     limits = LIMITS[signal]
     if signal in ("position", "attitude"):
         stuck = is_repeated(time, values, limits)
@@ -165,7 +163,7 @@ def _without_outliers(
 
 
 def _count_missing(time: Array) -> int:
-    """Return how many samples a steady publisher lost; 0 where the rate is not steady."""
+    """Return the number of samples that a steady publisher lost; 0 if the rate is not steady."""
     if len(time) < 20:
         return 0
     steps = np.diff(time)
@@ -177,12 +175,12 @@ def _count_missing(time: Array) -> int:
 
 
 def _merge_equal_times(time: Array, values: Array) -> tuple[Array, Array, int, int]:
-    """Keep one row of each time; the columns that a row lacks are filled from its twins.
+    """Keep one row of each time; fill its missing columns from the others.
 
     Returns
     -------
     tuple
-        The times, the rows, how many were left out, and how many times have rows that differ.
+        The times, the rows, the number of rows left out, and of times with different rows.
     """
     if len(time) < 2 or np.all(np.diff(time) > 0):
         return time, values, 0, 0
@@ -201,7 +199,7 @@ def _merge_equal_times(time: Array, values: Array) -> tuple[Array, Array, int, i
 
 
 def _unit_quaternions(time: Array, values: Array) -> tuple[Array, Array, int]:
-    """Normalise, drop what has no direction, and let the sign follow the sample before."""
+    """Normalise, drop those near zero, and let the sign follow the sample before."""
     norm = np.linalg.norm(values, axis=1)
     usable = norm > 0.5
     odd = int((np.abs(norm - 1) > 0.01).sum())
@@ -216,19 +214,19 @@ def _unit_quaternions(time: Array, values: Array) -> tuple[Array, Array, int]:
 
 @dataclass(frozen=True)
 class Limits:
-    """How far noise and honest motion take a sample from its neighbours.
+    """Bounds of noise and motion between neighbouring samples.
 
     Attributes
     ----------
     floor
         In the signal's unit.
     share
-        Share of the column's median that the floor is at least: small rotors turn, and change,
+        The floor is at least this share of the column's median: small rotors turn, and change,
         several times faster than large ones.
     curvature
-        Largest second derivative in time of honest motion, unit/s^2.
+        The largest second derivative of true motion, unit/s^2.
     jump
-        Smallest leap from one sample to the next that nothing honest makes.
+        The smallest leap between samples that no true motion makes.
     """
 
     floor: float
@@ -252,11 +250,11 @@ acceleration; a rotor that turns at some 600 rad/s needs tens of ms for 30 up an
 
 
 def is_outlier(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
-    """Return which samples of a signal stick out on one side of all that surrounds them.
+    """Return which samples of a signal stick out on one side of their surroundings.
 
     A sample is compared with the medians of the three samples before and the three after it. Ramps
-    and steps lie between the two, so that fast motion and a motor's jump are kept; one or two
-    samples that leave and come back are not. The bound adapts to the signal's own roughness.
+    and steps lie between the two and are kept; one or two samples that leave and come back are not.
+    The bound adapts to the signal's roughness.
 
     Parameters
     ----------
@@ -287,7 +285,7 @@ def _median_of_three(a: Array, b: Array, c: Array) -> Array:
 
 
 def is_repeated(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
-    """Return which samples of (n, k) values repeat the one before although the vehicle moved on.
+    """Return which samples of (n, k) values repeat the one before although the vehicle moved.
 
     Motion capture that loses its markers goes on sending the last pose. A vehicle at rest in a
     simulator repeats itself too, but does not leap when it starts to move.
@@ -311,7 +309,7 @@ def find_excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray
     Returns
     -------
     tuple
-        (n,) which samples, and how many leaps did not come back within `MAX_EXCURSION_S`.
+        (n,) flags, and the number of leaps that did not come back within `MAX_EXCURSION_S`.
     """
     away = np.zeros(len(values), dtype=np.bool_)
     if len(values) < 12:
@@ -348,7 +346,7 @@ def find_excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray
 
 
 def without_stale_end(series: Mapping[str, Series]) -> tuple[dict[str, Series], list[Note]]:
-    """Return the signals without what repeats itself at their end while the vehicle moves."""
+    """Return the signals without a stale end, and notes."""
     kept, notes = dict(series), []
     for name in MOTION_SIGNALS:
         if name not in series:
@@ -372,9 +370,9 @@ def without_stale_end(series: Mapping[str, Series]) -> tuple[dict[str, Series], 
 
 
 def is_position_frozen(series: Mapping[str, Series]) -> bool:
-    """Return whether a position that was recorded was never measured: a vehicle that tilts moves.
+    """Return whether the position never changes along x and y though the vehicle tilts.
 
-    An estimator without any position repeats its first for good.
+    An estimator without a position sensor repeats its first position.
     """
     if not {"position", "attitude"} <= set(series):
         return False
@@ -383,7 +381,7 @@ def is_position_frozen(series: Mapping[str, Series]) -> bool:
 
 
 def _is_moving(series: Mapping[str, Series], stuck: str, since: float) -> bool:
-    """Return whether the vehicle is seen to move, by its position or, if not stuck, its gyro."""
+    """Return whether position or, if it is not the stuck signal, the gyro shows motion."""
     places = _complete_rows(series["position"], since)
     if len(places) and np.ptp(places, axis=0).max() >= MIN_MOTION_M:
         return True
@@ -394,12 +392,12 @@ def _is_moving(series: Mapping[str, Series], stuck: str, since: float) -> bool:
 
 
 def _complete_rows(samples: Series, since: float) -> Array:
-    """Return the samples (n, k) after a time all of whose columns are known."""
+    """Return the complete samples (n, k) after a time."""
     return samples.values[(samples.time >= since) & np.isfinite(samples.values).all(axis=1)]
 
 
 def has_stale_attitude(series: Mapping[str, Series], notes: Sequence[Note]) -> bool:
-    """Return whether a recorded attitude repeats itself at its end while the vehicle moves."""
+    """Return whether the recorded attitude has a stale end."""
     last = series["attitude"].values[-2:]
     noted = any(n.code is NoteCode.STALE and "attitude" in n.names for n in notes)
     return noted and bool((last[-1] == last[0]).all())

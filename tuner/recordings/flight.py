@@ -1,4 +1,4 @@
-"""What a recording becomes: signals on their own clocks and the same signals on one clock."""
+"""A recorded flight: its signals on their own clocks, and on one uniform clock."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tuner.recordings.notes import Damage, Note
 
 Array = NDArray[np.float64]
 
-#: The signals a flight can hold: name -> (number of columns, unit, how it lives between samples).
+#: The signals a flight can hold: name -> (number of columns, unit, interpolation).
 #: World is ENU, body is FLU, quaternions are (w, x, y, z) body to world.
 SIGNALS: Mapping[str, tuple[int, str, Literal["linear", "arc", "hold"]]] = {
     "position": (3, "m", "linear"),
@@ -104,7 +104,7 @@ class Flight:
     name
         File name without its suffix.
     path, sha256
-        Where it came from, and the digest of that content.
+        The recording's file, and the digest of its content.
     rate
         Hz of the uniform clock.
     time
@@ -124,9 +124,9 @@ class Flight:
     trajectory
         Name and parameters of the trajectory from a side-car, where no reference was recorded.
     notes
-        What was dropped, repaired or doubted.
+        Samples that were dropped or repaired, and signals that are doubted.
     damage
-        What the file has lost, if it is broken; the flight is what was salvaged.
+        What a broken file has lost; the flight holds the rest.
     """
 
     name: str

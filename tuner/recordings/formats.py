@@ -1,7 +1,7 @@
-"""The formats of recordings: a reader each, which knows its files by how they begin.
+"""The formats of recordings: one reader each, which recognises its files by their first bytes.
 
-A format needs two things: a reader here, and a topic map whose ``format`` names it. The first lines
-of a text table tell how it is laid out: encoding, separator, comments, columns and their units.
+A format needs a reader here, and a topic map whose ``format`` names it. The first lines of a text
+table show its layout: encoding, separator, comments, columns and their units.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from tuner.core.errors import RecordingError
 from tuner.recordings.recording import Recording
 
 BINARY_SUFFIXES = (".bag", ".db3", ".mcap", ".ulg")
-"""Suffixes of recordings that no text has."""
+"""Suffixes of binary recordings."""
 
 
 @dataclass(frozen=True)
 class FileStart:
-    """What a recording shows before it is opened.
+    """The beginning of a recording.
 
     Attributes
     ----------
     start
-        The first 4096 bytes; none of a folder.
+        The first 4096 bytes; empty for a folder.
     """
 
     path: Path
@@ -42,14 +42,14 @@ class Reader:
     Attributes
     ----------
     format
-        What the ``format`` of a topic map is compared with.
+        Its name in the ``format`` of a topic map.
     files
-        Its files, as the message that refuses an unknown format lists them.
+        Its files, as the error for an unknown format lists them.
     matches
-        Says whether a recording is of this format.
+        Whether a recording is of this format.
     open
-        Opens a recording, given ``.msg`` files for types that it does not define. It imports what
-        the format needs: together the formats' libraries take half a second.
+        Opens a recording, given ``.msg`` files for types that it does not define. It imports the
+        format's library on demand: all of them together take half a second.
     tabular
         Whether a recording is one table whose columns are named by the topic map alone.
     """
@@ -74,7 +74,7 @@ def _is_table(head: FileStart) -> bool:
 
 
 def _lazy_reader(module: str, name: str) -> Callable[[Path, tuple[Path, ...]], Recording]:
-    """Return what opens a recording with a reader of a module that is then imported."""
+    """Return a function that imports a reader and opens a recording with it."""
 
     def opened(path: Path, messages: tuple[Path, ...]) -> Recording:
         reader = getattr(import_module(f"tuner.recordings.{module}"), name)
@@ -112,7 +112,7 @@ READERS: tuple[Reader, ...] = (
     ),
     Reader("table", ".csv and .parquet", _is_table, _lazy_reader("table", "Table"), tabular=True),
 )
-"""The first that matches reads a recording."""
+"""The first that matches reads the recording."""
 
 
 def is_tabular(name: object) -> bool:
@@ -121,12 +121,12 @@ def is_tabular(name: object) -> bool:
 
 
 def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
-    """Open a recording with the reader of what it begins with, whatever its name says.
+    """Open a recording with the reader for its first bytes, whatever its suffix.
 
     Parameters
     ----------
     path
-        A file, or a folder as ROS 2 writes it.
+        A file, or a folder of ROS 2.
     messages
         ``.msg`` files, or folders of them, for ROS types that the recording does not define.
 
@@ -153,17 +153,17 @@ def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
     raise RecordingError(path, what, f"known formats are {known}")
 
 
-#: A longer line, in bytes, is no row of a table.
+#: A longer line is no row of a table.
 MAX_LINE_BYTES = 1 << 20
 MAX_PREAMBLE_LINES = 1000
-#: Marks at the beginning of a text, and the encodings that they stand for.
+#: Byte order marks and their encodings.
 BOMS = {
     b"\xef\xbb\xbf": "utf-8-sig",
     b"\xff\xfe": "utf-16",
     b"\xfe\xff": "utf-16",
 }
 COMMENT_MARKS = ("#", "%", "//")
-#: Bytes and lines within which a table's rows have begun.
+#: A table's rows begin within so many bytes and lines.
 MAX_PREAMBLE_BYTES = 4 * MAX_LINE_BYTES
 _NUMBER = re.compile(r"^[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?$|^[+-]?(nan|inf(inity)?)$", re.I)
 _UNIT = re.compile(r"^[\[(]?[a-zA-Zµ°%0-9/^*.·\-²³ ]{0,12}[\])]?$")
@@ -171,18 +171,18 @@ _UNIT = re.compile(r"^[\[(]?[a-zA-Zµ°%0-9/^*.·\-²³ ]{0,12}[\])]?$")
 
 @dataclass(frozen=True)
 class Layout:
-    """What the first lines of a text table give away.
+    """The layout of a text table.
 
     Attributes
     ----------
     decimal_comma
         Whether numbers are written as ``1,5``.
     columns
-        Their names, as they stand there without surrounding blanks; each once.
+        Their unique names, without surrounding blanks.
     units
-        Column -> unit, of a row of units under the names.
+        Column -> unit, from a row of units under the names.
     lines_before
-        How many lines come before the first row of numbers.
+        The number of lines before the first row of numbers.
     """
 
     encoding: str
@@ -194,7 +194,7 @@ class Layout:
 
 
 def encoding_of(start: bytes) -> str:
-    """Return the codec of a text by how it begins: latin-1, which reads all, without a mark."""
+    """Return the codec of a text by its byte order mark; latin-1, which reads all, without one."""
     return next((codec for mark, codec in BOMS.items() if start.startswith(mark)), "latin-1")
 
 
@@ -205,7 +205,7 @@ def text_of(start: bytes) -> str:
 
 
 def is_table(start: bytes) -> bool:
-    """Return whether a file begins as a text with cells in its first line that is no comment."""
+    """Return whether a file is a text whose first line that is no comment has cells."""
     wide = encoding_of(start).startswith("utf-16")
     text = text_of(start)
     if not all(ord(letter) >= 32 or letter in "\r\n\t" for letter in text):
@@ -221,7 +221,7 @@ def is_table(start: bytes) -> bool:
 
 
 def layout_of(path: Path) -> Layout:
-    """Return how a text table is laid out.
+    """Return the layout of a text table.
 
     Raises
     ------
@@ -266,7 +266,7 @@ def _is_comment(line: str) -> bool:
 
 
 def _separator(line: str) -> str:
-    """Return what parts the cells of a line."""
+    """Return the separator of a line's cells."""
     best = max(",;\t", key=line.count)
     return best if best in line else " "
 
@@ -299,7 +299,7 @@ def _is_units(line: str, separator: str, count: int) -> bool:
 
 
 def _unique_names(columns: Sequence[str]) -> tuple[str, ...]:
-    """Return names that differ: the empty ones by their place, repeated ones with a number."""
+    """Return unique names: empty ones become their place, repeated ones get a number."""
     seen: dict[str, int] = {}
     names = []
     for place, column in enumerate(columns):

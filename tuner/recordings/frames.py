@@ -1,11 +1,10 @@
-"""Axes and orders that a topic map has wrong, and signals that deny each other.
+"""Frames and element orders that a topic map has wrong, and signals that contradict each other.
 
-A misread frame is noticed because the motion contradicts itself, and is exchanged for the one that
-does not. What is doubted of a recording may still fly, in wind or with a poor gyro. What is a
-contradiction may not: over a whole mission that moves plenty, the attitude turns against the gyro,
-or the position moves against the recorded velocity, as in a recording that runs backwards; or the
-vehicle accelerates against its tilt, or plenty without regard to it, as with an attitude of another
-frame.
+A misread frame shows as motion that contradicts itself, and is replaced by the consistent one. A
+doubted recording may still be fitted: wind or a poor gyro explain a doubt. A contradiction may not.
+It takes a whole mission with much motion in which the attitude turns against the gyro or the
+position moves against the velocity, as in a reversed recording, or in which the acceleration
+opposes the tilt or does not depend on it, as with an attitude of another frame.
 """
 
 from __future__ import annotations
@@ -46,23 +45,22 @@ DOUBTS = (
     NoteCode.AXIS_DOUBTED,
     NoteCode.AXES_TURNED,
 )
-"""Notes of what fits no reading."""
+"""Notes on signals that no reading explains."""
 MIN_ACCELERATION = 0.3
 MIN_TURN_RATE = 0.1
 MIN_SPEED = 0.2
-"""Motion below these, in m/s^2, rad/s and m/s, contradicts nothing."""
+"""Less motion, in m/s^2, rad/s and m/s, contradicts nothing."""
 MAX_MARKER_OFFSET_M = 0.1
-"""m by which markers may sit off the centre of mass: what accelerates them as the vehicle turns
-does not tilt it."""
+"""Markers may sit so far off the centre of mass: turning accelerates them without a tilt."""
 MIN_AGREEMENT = 0.6
 MIN_SCORE_GAIN = 0.3
-"""Agreement that is believed without a look at alternatives, and how much better one must be."""
+"""A larger correlation is accepted as it is; an alternative must score better by so much."""
 READING_PENALTY = 0.05
-"""What a further misreading must bring to be preferred."""
+"""Each further misreading must improve the score by more."""
 
 
 _Judgement = tuple[Reading | None, Note | None]
-"""How else to read what was recorded, or else what is doubted."""
+"""The right reading of a signal, or a doubt."""
 
 
 _DEGREES = np.pi / 180
@@ -72,28 +70,28 @@ _RATES = (
     Reading("in FRD axes and degrees", lambda w: to_enu_flu(w, "body_rate") * _DEGREES),
 )
 OPPOSED_CORRELATION = -0.5
-"""Correlation below which two signals that should be alike are opposites."""
+"""Two signals that should agree are opposites below this."""
 UNRELATED_CORRELATION = 0.2
-"""Correlation, of either sign, of signals that have nothing to do with each other."""
+"""Two signals are unrelated below this, whatever the sign."""
 MAX_SIZE_RATIO = 3.0
-"""Times that one of two unrelated signals may be larger: more of it would be noise."""
+"""Unrelated signals differ in size by at most this factor: the excess would be noise."""
 MIN_AUTOCORRELATION = 0.5
-"""Correlation of an acceleration with that a bin later, which noise of a position has not."""
+"""Autocorrelation of an acceleration over one bin; noise of a position has less."""
 MIN_MISSION_S = 5.0
-"""s that a mission has to last for any of it to be certain."""
+"""A shorter mission is too short for a contradiction."""
 CLEAR_ACCELERATION, CLEAR_TURN_RATE, CLEAR_SPEED = 1.0, 0.3, 0.3
-"""m/s^2, rad/s and m/s, root mean square, that are plenty."""
+"""Much motion: m/s^2, rad/s and m/s, root mean square."""
 
 
 def correct_frames(
     series: Mapping[str, Series], topics: Mapping[str, str]
 ) -> tuple[dict[str, Series], tuple[Note, ...]]:
-    """Return the series with misread attitude, body rate and velocity read rightly.
+    """Return the series with misread attitude, body rate and velocity corrected.
 
-    A multirotor accelerates where its thrust points, so the attitude must tilt towards the
-    acceleration of the position, and carry the accelerometer's reading upwards; its change must be
-    the body rate; the position's change the velocity. A reading that fails is exchanged for the one
-    that passes, with a warning; where none passes, a warning says so.
+    A multirotor accelerates along its thrust: the attitude must tilt towards the acceleration of
+    the position and turn the accelerometer's reading upwards. The attitude's rate of change must be
+    the body rate, the position's the velocity. A reading that fails is replaced by one that passes,
+    with a warning; if none passes, a warning says so.
     """
     fixed = dict(series)
     notes: list[Note] = []
@@ -140,7 +138,7 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     )
 
     def agreement(reading: Callable[[Array], Array]) -> tuple[float, float]:
-        """Return how well a reading fits the motion, and how far thrust carries the vehicle."""
+        """Return the correlation with the motion, and the share of weight that thrust carries."""
         turned = reading(q)
         up = upward(turned)
         scores = []
@@ -181,19 +179,19 @@ def _score(fit: float, upright: float) -> float:
 
 
 def _body_rates(series: Mapping[str, Series], clock: Array) -> tuple[Array, Array]:
-    """Return the attitude's change and the gyro, (n, 3) rad/s each, which should be alike."""
+    """Return the attitude's rate of change and the gyro, (n, 3) rad/s each."""
     turning = body_rate_of(on_clock(series, "attitude", clock))
     return smooth(turning), smooth(on_clock(series, "body_rate", clock))
 
 
 def _velocities(series: Mapping[str, Series], clock: Array) -> tuple[Array, Array]:
-    """Return the position's change and the velocity, (n, 3) m/s each, which should be alike."""
+    """Return the position's rate of change and the velocity, (n, 3) m/s each."""
     moving = derivative(on_clock(series, "position", clock))
     return smooth(moving, 0.1), smooth(on_clock(series, "velocity", clock), 0.1)
 
 
 def _residual_share(motion: Array, recorded: Array) -> float:
-    """Return the share of a motion (n, 3) that is left when a recorded one is taken off."""
+    """Return the share of a motion (n, 3) that is left after subtraction of the recorded one."""
     known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
     return rms((motion - recorded)[known]) / rms(motion[known])
 
@@ -215,13 +213,13 @@ def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
 
 
 MIN_SIZE_RATIO = {"body_rate": 0.93, "velocity": 0.8, "acceleration": 0.7}
-"""How many times what the pose says a measured signal is at least, or its inverse at most: a gyro's
-scale is known to a few percent, what estimates speed smooths it, a second derivative is noise."""
+"""The least ratio, or its inverse, of a measured signal to the pose's derivative: a gyro's scale is
+known to a few percent, estimators smooth velocity, second derivatives are noisy."""
 MIN_SIGN_CORRELATION, MIN_SIZE_CORRELATION = 0.7, 0.97
-"""Correlation from which on the sign, or the ratio of sizes, of two signals is no noise."""
+"""Above these the sign, and the size ratio, of two signals are certain."""
 MIN_AXES_ANGLE_RAD, MIN_SINGULAR_VALUE_RATIO = 0.1, 0.05
-"""rad by which axes may be turned against others, as a marker body was defined; and the least size
-of the second largest motion beside the largest, without which that is not seen."""
+"""Body axes may be turned by less, as markers were defined; and the second singular value must be
+at least so large beside the first for a rotation to show."""
 
 
 def _rate_doubts(series: Mapping[str, Series], clock: Array) -> Iterator[Note]:
@@ -235,9 +233,9 @@ def _rate_doubts(series: Mapping[str, Series], clock: Array) -> Iterator[Note]:
 
 
 def _force_doubts(series: Mapping[str, Series], clock: Array) -> Iterator[Note]:
-    """Yield the axes of the world, or else of the body, along which forces deny the motion.
+    """Yield the axes, of the world or else of the body, along which forces contradict the motion.
 
-    Those of a height that is upside down, and of an accelerometer of its own axes.
+    A flipped height shows in world axes, a turned accelerometer in body axes.
     """
     q, pull = on_clock(series, "attitude", clock), _specific_force(series, clock)
     force = on_clock(series, "acceleration", clock)
@@ -263,14 +261,14 @@ def _smooth_thrice(force: Array) -> Array:
 def _axis_doubts(
     motion: Array, recorded: Array, names: tuple[str, str], least_motion: float
 ) -> Iterator[Note]:
-    """Yield the axes along which a recorded signal is the pose's change with another sign or size.
+    """Yield the axes along which a signal is the pose's derivative with another sign or size.
 
     Parameters
     ----------
     motion, recorded
-        (n, 3) each, which should be alike.
+        (n, 3) each, which should agree.
     names
-        The signal, and whose change it is.
+        The signal, and the one whose derivative it is.
     """
     known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
     least = MIN_SIZE_RATIO[names[0]]
@@ -289,7 +287,7 @@ def _axis_doubts(
 
 
 def _angle_between(motion: Array, recorded: Array) -> float:
-    """Return by which angle, in rad, the axes of two signals are turned; 0 where that is unsure.
+    """Return the angle, in rad, between the axes of two signals; 0 where it is uncertain.
 
     The rotation is that of least squares (Kabsch 1976).
     """
@@ -314,17 +312,17 @@ _AXIS_CHECKS: Mapping[str, Callable[[Mapping[str, Series], Array], Iterable[Note
     ),
     "acceleration": _force_doubts,
 }
-"""Signal that is a change of the pose -> what is doubted of it along single axes."""
+"""Derivative of the pose -> its doubts along single axes."""
 _GENERAL_DOUBTS = {
     "body_rate": (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED),
     "velocity": (NoteCode.VELOCITY_DOUBTED, NoteCode.UNIT_DOUBTED),
     "acceleration": (NoteCode.ATTITUDE_DOUBTED, NoteCode.UNIT_DOUBTED),
 }
-"""Signal -> notes that say more of it."""
+"""Signal -> notes that cover its single axes too."""
 
 
 def _judge_setpoint(series: Mapping[str, Series], clock: Array) -> Reading | None:
-    """Return how else to read rate set-points, which a vehicle's body rate follows."""
+    """Return the right reading of rate set-points, which the body rate follows."""
     rate = smooth(on_clock(series, "body_rate", clock))
     wanted = smooth(on_clock(series, "rate_setpoint", clock))
     if min(rms(rate), rms(wanted)) < MIN_TURN_RATE:
@@ -384,7 +382,7 @@ def contradiction_in(notes: Sequence[Note]) -> Note | None:
 
 
 def _opposition(derived: Array, recorded: Array, min_rms: float) -> float | None:
-    """Return how alike two signals are, if they are opposites and larger than what is plenty."""
+    """Return the correlation of two signals if they are opposites with much motion."""
     agreement = correlation(derived, recorded)
     return (
         agreement
@@ -394,7 +392,7 @@ def _opposition(derived: Array, recorded: Array, min_rms: float) -> float | None
 
 
 def _tilt_contradiction(series: Mapping[str, Series]) -> float | None:
-    """Return how alike tilt and acceleration are, if one does not follow from the other."""
+    """Return the correlation of tilt and acceleration if one does not follow from the other."""
     position, attitude = (
         RawSeries(series[name].time, series[name].values) for name in ("position", "attitude")
     )
@@ -416,4 +414,4 @@ _CONTRADICTION_CHECKS: Mapping[tuple[str, str], Callable[[Mapping[str, Series]],
     ("position", "velocity"): lambda s: _opposition(*_velocities(s, middle_clock(s)), CLEAR_SPEED),
     ("attitude", "position"): _tilt_contradiction,
 }
-"""Signals that deny each other -> how alike they are, None unless that is certain."""
+"""A pair of signals -> their correlation if they contradict each other for certain, else None."""

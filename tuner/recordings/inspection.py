@@ -1,6 +1,6 @@
-"""What `tune inspect` finds in recordings, as plain values, as JSON and as tables for a terminal.
+"""The report of `tune inspect` on recordings: plain values, JSON and tables for a terminal.
 
-A recording that was inspected before is answered from the cache, before numpy is loaded.
+A recording that was inspected before is answered from the cache, without numpy.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
 if TYPE_CHECKING:
     from tuner.recordings.topics import TopicMap
 
-#: Of the JSON that `as_json` writes.
+#: The version of the JSON of `as_json`.
 SCHEMA_VERSION = 2
 _COLOURS = {"yes": "green", "weakly": "yellow", "no": "red"}
 
@@ -99,7 +99,7 @@ class MissionReport:
     height
         m, lowest and highest.
     known
-        Part of the ticks with a pose.
+        Share of the ticks with a pose.
     """
 
     start: float
@@ -126,7 +126,7 @@ class InletReport:
     name
         ``reference``, ``body_rate``, ``actuator``, ``rotor_speed`` or ``attitude``.
     missing
-        What it lacks for that; nothing if it can.
+        The signals it lacks; empty if it can.
     """
 
     name: str
@@ -135,7 +135,7 @@ class InletReport:
 
 @dataclass(frozen=True)
 class CoefficientReport:
-    """Whether a recording could inform a coefficient: ``yes``, ``weakly`` or ``no``, and why."""
+    """Whether a recording can show a coefficient: ``yes``, ``weakly`` or ``no``, and why."""
 
     coefficient: str
     how: str
@@ -144,21 +144,21 @@ class CoefficientReport:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What one recording holds.
+    """The content of one recording.
 
     Attributes
     ----------
     path, format, size
-        The file: its kind, and its bytes.
+        The file, its format, and its bytes.
     started
         UTC, ISO 8601; None where the clock counts from a start-up.
     duration
         s between the first and the last message that was read.
     problem
-        Why no flight can be read from it, in one line; None if one can.
+        Why it holds no flight, in one line; None if it does.
     clock
         Seconds: ``spread`` of the reference's stamps on their ticks, ``drift`` of its clock (s/s),
-        ``pose_offset`` of the pose against the gyro; what is unknown is left out.
+        ``pose_offset`` of the pose against the gyro; unknown ones are left out.
     battery
         V at the start and at the end, None where it was not recorded.
     damage
@@ -195,12 +195,12 @@ def inspect_recordings(
     Parameters
     ----------
     cache
-        Keep what was found in the user's cache, and take it from there.
+        Whether to use the user's cache.
 
     Returns
     -------
     tuple
-        What was found in those that can be read, and an error for each that cannot.
+        The inspections, and an error for each recording that cannot be read.
     """
     inspections, errors = [], []
     for path in map(Path, paths):
@@ -239,7 +239,7 @@ def as_json(
     Parameters
     ----------
     verdicts
-        Path -> what `tune` would do with the recording, if that was asked.
+        Path -> how `tune` would use the recording, if that was asked.
     """
     content = {
         "schema_version": SCHEMA_VERSION,
@@ -257,12 +257,12 @@ def as_json(
 def render(
     inspections: Iterable[Inspection], verdicts: Mapping[str, Sequence[str]] | None = None
 ) -> RenderableType:
-    """Return what was found in recordings, for rich to print.
+    """Return inspections for rich to print.
 
     Parameters
     ----------
     verdicts
-        Path -> lines that say first whether and how it can be fitted.
+        Path -> lines that say whether and how it can be fitted, printed first.
     """
     verdicts = verdicts or {}
     return Group(
@@ -306,7 +306,7 @@ def _table(
     rows: Iterable[tuple[str, Sequence[str | Text]]],
     left: Sequence[str],
 ) -> Table:
-    """Return a table, of style and cells of each row; columns but those to the left are numbers."""
+    """Return a table of rows (style, cells); columns not in `left` are right-aligned."""
     table = Table(title=title, title_justify="left", title_style="bold", box=None)
     for name in columns:
         table.add_column(name, justify="left" if name in left else "right", no_wrap=name == "topic")

@@ -1,8 +1,8 @@
-"""Read a recording to say what it holds, whether or not a flight can be made of it.
+"""Inspect a recording, whether or not it holds a flight, and suggest a topic map for it.
 
-Which inlets it can be fed in at and which coefficients it could show are rules of thumb from what
-was recorded and how hard it was flown; what a fit identified stands in its own report. Of a
-recording that no map reads, a topic map to begin with: the best guess for every column, and why.
+The inlets it can be fed into and the coefficients it can show follow from rules of thumb on its
+signals and their excitation; the report of a fit has the identified ones. A suggested topic map has
+the best guess for every column, and why.
 """
 
 from __future__ import annotations
@@ -50,22 +50,22 @@ from tuner.recordings.topics import Sidecar, Source, TopicMap, shipped_maps
 from tuner.vehicle import COEFFICIENTS
 
 EARLIEST_DATE_NS = 631_152_000_000_000_000
-"""Stamps before 1990 count from a start-up, not from 1970."""
+"""Stamps before 1990 count from a start-up."""
 MAX_INSPECTED_S = 3600.0
-"""Seconds of a mission over which speeds are sought."""
+"""The part of a mission whose speeds are reported."""
 CLEAR_ROLL_PITCH_RATE = 0.2
 CLEAR_YAW_RATE = 0.4
 CLEAR_SPEED = 1.5
 CLEAR_VERTICAL_SPEED = 3.0
 CLEAR_COMMAND_SPREAD = 0.03
-"""Below these a motion shows little of a coefficient, and below a third of them nothing."""
+"""Less motion shows a coefficient weakly, less than a third of it not at all."""
 MIN_LAG_RATE_HZ = 80.0
-"""Hz that a signal needs to show how fast a rotor follows."""
+"""A slower signal does not show a rotor's lag."""
 _POSE = ("position", "attitude")
 _WRENCH = ("commanded_thrust", "commanded_torque")
-"""What a vehicle file's arms and curve turn into motor commands where none were recorded."""
+"""Without motor commands, a vehicle file's arms and curve make them of these."""
 _ROTOR_INPUTS = ("rotor_speed", "command", "thrust_setpoint")
-"""Of which the attitude inlet needs one: what turns the rotors."""
+"""The attitude inlet needs one of these."""
 
 
 def inspect_recording(
@@ -76,7 +76,7 @@ def inspect_recording(
     Parameters
     ----------
     keep
-        Whether its flights are kept in the user's cache, for a fit.
+        Whether to keep its flights in the user's cache, for a fit.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def inspect_recording(
                 return _without_pose(signals)
             content = content_of(signals, options.sidecar)
         except RecordingError as err:
-            # Its topics are listed nevertheless, so that the user sees what to map.
+            # Its topics are listed nevertheless, for a topic map.
             messages = options.topic_map.messages if options.topic_map else ()
             recording = open_recording(path, messages)
             return Inspection(
@@ -114,7 +114,7 @@ def inspect_recording(
 
 
 def _without_pose(signals: Signals) -> Inspection:
-    """Return what a recording of gyro, accelerometer and motor commands alone holds."""
+    """Return the inspection of a recording of gyro, accelerometer and motor commands alone."""
     flown = flying_stretches(signals)
     error = inertial_error(signals, flown)
     seconds = {"seconds": float(sum(end - begin for begin, end in flown))}
@@ -145,7 +145,7 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
 
 
 def _with_signals(read: Signals) -> Inspection:
-    """Return the report of a recording's topics and signals, whatever they make."""
+    """Return the inspection of a recording's topics and signals alone."""
     recording, samples = read.recording, read.samples
     times = [s.receive for s in samples.values() if len(s.receive)]
     first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
@@ -280,14 +280,14 @@ _SIGNALS_OF_INLETS: Mapping[str, Sequence[str]] = {
 def inlet_reports(
     measured: Mapping[str, tuple[int, ...]], *, trajectory: bool
 ) -> tuple[InletReport, ...]:
-    """Return what each inlet lacks.
+    """Return the signals that each inlet lacks.
 
     Parameters
     ----------
     measured
         Signal -> columns that were measured.
     trajectory
-        Whether the trajectory is named, which stands for a recorded reference.
+        Whether a side-car names the trajectory, in place of a recorded reference.
     """
     if all(name in measured for name in _WRENCH):
         measured = {"command": (0, 1, 2, 3), **measured}
@@ -314,7 +314,7 @@ def coefficient_reports(
     measured: Mapping[str, tuple[int, ...]],
     missions: Sequence[MissionReport],
 ) -> tuple[CoefficientReport, ...]:
-    """Return how well a recording could show each coefficient, by the rule that its row names.
+    """Return how well a recording can show each coefficient, by the rule in its row.
 
     Parameters
     ----------
@@ -403,9 +403,9 @@ def _values_during(series: Series, missions: Sequence[MissionReport]) -> Array:
 
 
 def _spread(series: Mapping[str, Series], name: str, missions: Sequence[MissionReport]) -> Array:
-    """Return how much each column varies during the missions; zeros without samples.
+    """Return the variation of each column during the missions; zeros without samples.
 
-    The standard deviation, or what a single step to the largest value is worth.
+    It is the standard deviation or, if larger, a quarter of the largest value, for single steps.
     """
     if name not in series:
         return np.zeros(4)
@@ -417,11 +417,11 @@ def _spread(series: Mapping[str, Series], name: str, missions: Sequence[MissionR
 
 
 SUGGESTED_SIGNALS = "position", "attitude", "command", "rotor_speed", "body_rate"
-"""Signals that are asked for where no column seems to hold them."""
+"""Signals for which a suggested map leaves a line to fill in."""
 
 
 def suggested_map(path: Path) -> str:
-    """Return the text of a topic map for a recording, to be checked and completed.
+    """Return the text of a topic map for a recording, for the user to check and complete.
 
     Raises
     ------
@@ -459,7 +459,7 @@ def suggested_map(path: Path) -> str:
 
 
 def _inferred_units(path: Path) -> dict[str, str]:
-    """Return in which units signals are by their numbers: signal -> words."""
+    """Return signal -> its unit or frame in words, as inferred from its numbers."""
     with contextlib.suppress(RecordingError):
         notes = read_content(ReadOptions(path)).notes
         codes = (NoteCode.UNIT_READ, NoteCode.FRAME_TURNED)

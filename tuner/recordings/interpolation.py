@@ -1,4 +1,4 @@
-"""Signals on one uniform clock, and the motion derived from them to hold one against another."""
+"""Signals resampled on a uniform clock, and kinematics to compare them with each other."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from tuner.core.numerics import Array
 from tuner.recordings.flight import SIGNALS, Series
 
-#: Beyond this gap between two samples, in s, nothing is known; slower signals get three periods.
+#: A signal is unknown in gaps longer than this, or than three periods of a slower signal.
 GAP_S = 0.25
-#: Seconds after their last sample for which counters hold.
+#: Counters hold for good after their last sample.
 COUNTER_GAP_S = np.inf
-#: Periods of a regular publisher between two samples beyond which one is missing.
+#: A gap of more periods of a regular publisher lacks a sample.
 MIN_GAP_PERIODS = 1.5
-#: Hz and seconds of the stretch that is looked at.
+#: The rate and length of the stretch whose frames and clocks are checked.
 RATE_HZ = 100.0
 MAX_STRETCH_S = 60.0
 
@@ -48,12 +48,12 @@ def resample(signal: str, series: Series, clock: Array) -> Array:
 
 
 def with_gaps_filled(series: Series) -> Series:
-    """Return a signal that is published at a steady rate with the samples that were not recorded.
+    """Return a signal of a steady publisher with its missing samples interpolated.
 
     Recorders drop messages that the flight controller received. Held through such a gap, a
-    reference at 4 m/s would lag by 4 cm for 10 ms and kick the vehicle. The missing samples lie on
-    a monotone cubic through their neighbours (Fritsch and Butland 1984), so that a step stays one.
-    Longer gaps than are bridged anywhere (`GAP_S`) are left.
+    reference at 4 m/s would lag by 4 cm for 10 ms and kick the vehicle. The missing samples are
+    put on a monotone cubic through their neighbours (Fritsch and Butland 1984), which keeps steps.
+    Gaps longer than `max_gap` stay.
     """
     known = np.isfinite(series.values).all(axis=1)
     time, values = series.time[known], series.values[known]
@@ -80,18 +80,18 @@ def with_gaps_filled(series: Series) -> Series:
 
 
 def max_gap(time: Array) -> float:
-    """Return the s between samples beyond which nothing is known."""
+    """Return the s between samples beyond which a signal is unknown."""
     return max(GAP_S, 3 * float(np.median(np.diff(time)))) if len(time) > 1 else GAP_S
 
 
 def runs(flags: ArrayLike) -> list[tuple[int, int]]:
-    """Return where each run of true flags begins, and behind its end."""
+    """Return the first index of each run of true flags, and the one after its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(flags, np.int8), [0]])))
     return [(int(first), int(behind)) for first, behind in edges.reshape(-1, 2)]
 
 
 def _covered(time: Array, clock: Array) -> NDArray[np.bool_]:
-    """Return for which instants samples lie on both sides, not too far apart."""
+    """Return which instants have samples on both sides, not too far apart."""
     after = np.clip(np.searchsorted(time, clock, side="left"), 0, len(time) - 1)
     before = np.clip(np.searchsorted(time, clock, side="right") - 1, 0, len(time) - 1)
     inside = (clock >= time[0]) & (clock <= time[-1])
@@ -100,7 +100,7 @@ def _covered(time: Array, clock: Array) -> NDArray[np.bool_]:
 
 
 def _slerp(series: Series, clock: Array) -> Array:
-    """Turn from each sample to the next at constant speed along the shorter arc (slerp)."""
+    """Interpolate quaternions at constant angular speed along the shorter arc."""
     result = np.full((len(clock), 4), np.nan)
     known = _covered(series.time, clock)
     if len(series.time) < 2 or not known.any():
@@ -112,7 +112,7 @@ def _slerp(series: Series, clock: Array) -> Array:
     cosine = (start * end).sum(axis=1)
     end = np.where(cosine[:, None] < 0, -end, end)
     angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
-    # Below this angle the arc is a line to machine precision, and its sine divides badly.
+    # A smaller arc is a line to machine precision.
     tiny = angle < 1e-6
     sine = np.where(tiny, 1.0, np.sin(angle))
     from_start = np.where(tiny, 1 - part, np.sin((1 - part) * angle) / sine)
@@ -139,7 +139,7 @@ def on_clock(series: Mapping[str, Series], name: str, clock: Array) -> Array:
 
 
 def smooth(values: Array, seconds: float = 0.05) -> Array:
-    """Return (n, k) values averaged over a window around each; NaN where it is not all known."""
+    """Return the moving average of (n, k) values; NaN where the window is incomplete."""
     width = max(1, round(seconds * RATE_HZ) | 1)
     result = np.full(values.shape, np.nan)
     if len(values) >= width:
@@ -162,7 +162,7 @@ def rotate(q: Array, v: Array) -> Array:
 
 
 def upward(q: Array) -> Array:
-    """Return (n, 3) where the body's z axis points in world axes."""
+    """Return the body's z axis (n, 3) in world axes."""
     return rotate(q, np.tile([0.0, 0.0, 1.0], (len(q), 1)))
 
 
@@ -172,7 +172,7 @@ def body_rate_of(q: Array) -> Array:
 
 
 def body_rate_from(q: Array, q_dot: Array) -> Array:
-    """Return the (n, 3) body rate, rad/s, of (n, 4) attitudes that turn so: 2 q* ⊗ dq/dt."""
+    """Return (n, 3) body rates, rad/s, of (n, 4) attitudes and their derivatives: 2 q* ⊗ dq/dt."""
     w, x, y, z = q.T
     dw, dx, dy, dz = q_dot.T
     return 2.0 * np.column_stack(

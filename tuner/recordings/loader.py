@@ -1,7 +1,7 @@
-"""A recording file into `Flight`s: each mission on its uniform clock, kept in the cache.
+"""Load the `Flight`s of a recording, each mission on its uniform clock, with a cache.
 
-Without motion capture it becomes an `InertialFlight` of gyro, accelerometer and motor commands: a
-pose is what a simulation is held against; body rate and specific force remain, which need none.
+A recording without a pose becomes an `InertialFlight` of gyro, accelerometer and motor commands:
+body rate and specific force can be predicted without one.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from tuner.recordings.states import initial_state
 from tuner.recordings.topics import TopicMap
 from tuner.recordings.unit_detection import MAX_TURN_RATE
 
-#: Seconds before the mission that the series keep.
+#: The series begin so long before the mission.
 PRE_MISSION_S = 2.0
-#: Seconds after it within which samples still help to interpolate its end.
+#: Samples up to so long after the mission help to interpolate its end.
 POST_MISSION_S = 0.2
-#: Longer missions, on the uniform clock, come of broken stamps.
+#: Longer missions on the uniform clock have broken stamps.
 MAX_TICKS = 2_000_000
 
 logger = logging.getLogger(__name__)
@@ -71,7 +71,6 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
         what = f"its mission lasts {(mission.end - start) / 3600:.0f} h"
         raise RecordingError(path, what, "give 'start' and 'end' in a side-car")
     clock = np.arange(count) / rate
-    # Beyond the last tick, so that it has a sample on either side.
     kept = (start - PRE_MISSION_S, mission.end + POST_MISSION_S + 1e-6)
     near = {name: data.between(*kept) for name, data in series.items()}
     nearby = {name: Series(data.time - start, data.values) for name, data in near.items()}
@@ -110,7 +109,7 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
 def gap_notes(
     signals: Mapping[str, Array], series: Mapping[str, Series], rate: float
 ) -> list[Note]:
-    """Say where a signal is unknown for longer than at the ends of its recording."""
+    """Return notes on signals with gaps."""
     notes = []
     for name, values in signals.items():
         if SIGNALS[name][2] == "hold":
@@ -133,13 +132,13 @@ def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> A
 
 
 def _cache_file(options: ReadOptions) -> Path:
-    """Return the file of the cache for the flights of a recording, read so."""
+    """Return the cache's file for the flights of a recording."""
     path = options.path
     return cache_file("flights", digest(path), path.name, *reading_key(options))
 
 
 def reading_key(options: ReadOptions) -> tuple[str, ...]:
-    """Return all that decides how a recording's content is read but this program."""
+    """Return all that decides how a recording's content is read, except this program."""
     given = options.topic_map
     messages = [digest(file) for file in given.messages if file.exists()] if given else []
     inputs = (options.namespace, options.rate, options.sidecar, given, messages)
@@ -168,7 +167,6 @@ def load_flights(
         raise RecordingError(path, "no such file", "check the path")
     options = ReadOptions.of(path, topics, namespace, rate)
     if cache and (flights := from_npz(load(_cache_file(options)))) is not None:
-        # The same content may lie elsewhere now.
         return tuple(dataclasses.replace(flight, path=str(path)) for flight in flights)
     with readable(path):
         content = read_content(options)
@@ -182,19 +180,19 @@ def load_flights(
 
 
 def flights_of(content: Content, options: ReadOptions, *, keep: bool) -> tuple[Flight, ...]:
-    """Return the flights of a recording, whatever it was read for.
+    """Return the flights of a recording that was read.
 
     Parameters
     ----------
     content, options
-        What it holds, and how it was read.
+        Its content, and the options of reading it.
     keep
-        Whether they are kept in the user's cache: a long recording takes a while.
+        Whether to keep them in the user's cache.
 
     Raises
     ------
     RecordingError
-        A mission is shorter than two ticks, or longer than any.
+        A mission is shorter than two ticks, or too long.
     """
     sha256, missions = digest(options.path), range(len(content.missions))
     flights = tuple(make_flight(content, options, i, sha256=sha256) for i in missions)
@@ -226,9 +224,9 @@ def load_flight(
     rate
         Hz of the uniform clock.
     mission
-        Which mission, from 1, of a recording that holds several.
+        The number of the mission, from 1.
     cache
-        Keep what was read in the user's cache, and take it from there.
+        Whether to use the user's cache.
 
     Raises
     ------
@@ -261,7 +259,7 @@ def to_npz(flights: Sequence[Flight]) -> bytes:
 
 
 def from_npz(content: bytes | None) -> tuple[Flight, ...] | None:
-    """Return the flights that `to_npz` made bytes of; None if there are none, or damaged ones."""
+    """Return the flights of an ``.npz`` by `to_npz`; None without content, or if it is damaged."""
     if content is None:
         return None
     try:
@@ -273,31 +271,31 @@ def from_npz(content: bytes | None) -> tuple[Flight, ...] | None:
             known = json.loads(file["about"].tobytes(), object_hook=restored)
         config = ConfigDict(arbitrary_types_allowed=True)
         return TypeAdapter(tuple[Flight, ...], config=config).validate_python(known)
-    except Exception as err:  # a damaged cache is read anew, whatever is wrong with it
+    except Exception as err:  # whatever is wrong with it, the recording is read again
         logger.info("a cached flight is damaged: %s", err)
         return None
 
 
-#: What a recording must hold.
+#: Signals of a recording without a pose that are needed for a fit.
 INERTIAL_SIGNALS = ("body_rate", "acceleration", "command")
-#: Hz below which a log does not show how a vehicle turns.
+#: A slower log does not show angular accelerations.
 MIN_RATE_HZ = 120.0
-#: s below which a stretch in the air shows nothing.
+#: A shorter stretch in the air is left out.
 MIN_STRETCH_S = 2.0
-#: rad/s, or less, at which a vehicle turns through nine tenths of a gentle flight.
+#: rad/s. A gentle flight turns slower for nine tenths of its time.
 GENTLE_TURN_RATE = 3.0
 
 
 @dataclass(frozen=True)
 class InertialFlight:
-    """What gyro, accelerometer and motor commands say of one flight.
+    """One flight without a pose: gyro, accelerometer and motor commands.
 
     Attributes
     ----------
     series
         `INERTIAL_SIGNALS` and, if recorded, the battery's voltage; in s since the first sample.
     flying
-        Stretches, in s, in which the motors turn faster than idle.
+        Stretches, in s, with motors above idle.
     """
 
     name: str
@@ -308,13 +306,13 @@ class InertialFlight:
 
 
 def is_inertial(signals: Signals) -> bool:
-    """Return whether a recording lacks a pose, but has what a flight can be judged by without."""
+    """Return whether a recording lacks a pose, but has all `INERTIAL_SIGNALS`."""
     has_pose = {"position", "attitude"} <= set(signals.series)
     return not has_pose and set(INERTIAL_SIGNALS) <= set(signals.series)
 
 
 def flying_stretches(signals: Signals) -> tuple[tuple[float, float], ...]:
-    """Return the stretches, in s, in which the motors turn faster than idle."""
+    """Return the stretches, in s, with motors above idle."""
     commands = signals.series["command"]
     turns = np.asarray(commands.values.mean(axis=1) > MAX_IDLE_COMMAND, dtype=np.bool_)
     runs = stretches(commands.time, turns)
@@ -324,12 +322,12 @@ def flying_stretches(signals: Signals) -> tuple[tuple[float, float], ...]:
 def inertial_error(
     signals: Signals, flown: tuple[tuple[float, float], ...]
 ) -> RecordingError | None:
-    """Return why nothing can be fitted to a recording without a pose; None if it can.
+    """Return why a recording without a pose cannot be fitted; None if it can.
 
     Parameters
     ----------
     flown
-        The stretches in which its motors turn.
+        The stretches with motors above idle.
     """
     path, series = signals.recording.path, signals.series
     slow = {name: series[name].rate for name in INERTIAL_SIGNALS if series[name].rate < MIN_RATE_HZ}
@@ -364,7 +362,7 @@ def inertial_error(
 def read_inertial(
     path: Path, *, topics: str | Path | None = None, namespace: str = ""
 ) -> InertialFlight | None:
-    """Read a recording that holds no pose; None of one that does, whose flights are kept.
+    """Read a recording without a pose; None for one with a pose, whose flights are cached.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """MATLAB files: arrays, and structures of arrays, as the columns of a table.
 
-``mocap.t``, ``mocap.pos`` (n x 3) and ``imu.t``, ``imu.gyro`` make the columns ``mocap.pos[0]`` and
-so on, each with the time of its own structure: the table has a row for every stamp of each. scipy
-reads what ``save`` writes by default, h5py the files of version 7.3.
+``mocap.t``, ``mocap.pos`` (n x 3) and ``imu.t``, ``imu.gyro`` become the columns ``mocap.pos[0]``
+and so on, each with the time of its own structure: the table has a row for every stamp of each.
+scipy reads files up to version 7, h5py those of version 7.3.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from tuner.recordings.sources import column_meaning
 from tuner.recordings.table import NO_TIME, read_times
 
 MAGIC, MAGIC_7_3 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
-#: Bytes of all arrays together, and how many arrays: scipy recurses into those inside others.
+#: All arrays together have no more bytes, and are no more: scipy recurses into nested ones.
 MAX_BYTES, MAX_ARRAYS = 1 << 30, 4000
-#: Columns of a matrix that is taken for signals side by side.
+#: A matrix with more columns holds no signals side by side.
 MAX_MATRIX_COLUMNS = 32
-#: Structures inside structures.
+#: Structures may be nested so deep.
 MAX_DEPTH = 8
-#: The column that stands for the time of every structure, where several have one of their own.
+#: The column that stands for the time of each structure, if several have their own.
 ANY_TIME = "*.time"
 
 
@@ -144,11 +144,11 @@ def _unreadable(path: Path, err: Exception) -> RecordingError:
 
 
 _COMPRESSED_ELEMENT = 15
-"""Kind of an element."""
+"""The type of a compressed element."""
 
 
 def _decompressed(data: bytes) -> Iterator[bytes]:
-    """Yield what the elements of a file hold, unpacked, a megabyte of packed ones at a time."""
+    """Yield the decompressed elements of a file, about a megabyte at a time."""
     order: Literal["little", "big"] = "little" if data[126:128] == b"IM" else "big"
     at = 128
     while at + 8 <= len(data):
@@ -186,7 +186,7 @@ def _load_hdf5(path: Path) -> Mapping[str, Any]:
 
 
 def _group_arrays(h5py: Any, group: Any, read: list[int], depth: int) -> dict[str, Any]:
-    """Return the arrays of a group that lie in the file itself."""
+    """Return the arrays of a group, without links to other files."""
     held: dict[str, Any] = {}
     for name in list(group)[:MAX_ARRAYS] if depth < MAX_DEPTH else ():
         if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
@@ -212,7 +212,7 @@ def _columns(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, Array]]
         label = value.get("label")
         for name, of in value.items() if depth < MAX_DEPTH else ():
             if not str(name).startswith("__"):
-                # what Simulink calls a signal stands beside its values
+                # Simulink has a signal's name beside its values
                 own = label if name == "values" and isinstance(label, str) and label else name
                 yield from _columns(f"{prefix}.{own}" if prefix else str(own), of, depth + 1)
     elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
@@ -239,7 +239,7 @@ def _is_matrix(value: object) -> bool:
 
 
 def _time_of(name: str, columns: Mapping[str, Array]) -> str | None:
-    """Return the time column of the same length in a column's structure, or in the next around."""
+    """Return the time column of a column's length in its structure, or in the nearest around it."""
     count = len(columns[name])
     times = [
         time

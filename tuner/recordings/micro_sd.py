@@ -26,9 +26,9 @@ MAGIC = 0xBC
 MAX_LOG_BYTES = 128 << 20
 #: Bytes of the CRC at the end.
 CHECKSUM_BYTES = 4
-#: No firmware logs more at once.
+#: No firmware logs more.
 MAX_EVENTS, MAX_VARIABLES, MAX_NAME_BYTES = 256, 512, 256
-#: Code of a type -> NumPy's.
+#: Code of a type -> NumPy's code.
 TYPES = {
     "b": "<i1",
     "B": "<u1",
@@ -43,15 +43,15 @@ TYPES = {
     "d": "<f8",
 }
 _STAMPS = {1: ("<u4", NS_PER_UNIT["ms"]), 2: ("<u8", NS_PER_UNIT["us"])}
-#: Fields of every record that are no variables; a space is in no variable's name.
+#: Fields of every record beside its variables, whose names have no space.
 _NUMBER, _STAMP = " number", " stamp"
-#: Size and places of an event that the header does not know.
+#: Record size and positions of an event that the header lacks.
 _UNKNOWN_EVENT = (MAX_LOG_BYTES + 1, array("I"))
 
 
 @dataclass(frozen=True)
 class _Event:
-    """One event type: its name, how its records lie in the file, and where they begin."""
+    """One event type: its name, the layout of its records, and their positions in the file."""
 
     name: str
     layout: np.dtype[np.void]
@@ -95,7 +95,7 @@ class MicroSdRecording(Recording):
         return ReadResult(samples, damage=self._damage())
 
     def _damage(self) -> tuple[Damage, ...]:
-        """Return what the checksum and the end of the file give away."""
+        """Return the damage that checksum and end of the file show."""
         if self._crc_matches and not self._lost:
             return ()
         if (
@@ -177,7 +177,7 @@ class _Header:
 
 
 def _find_records(data: bytes, at: int, end: int, events: Mapping[int, _Event]) -> int:
-    """Note where the records of each event begin; return the place behind the last whole one."""
+    """Add the positions of each event's records; return the position after the last whole one."""
     found = {n: (event.layout.itemsize, event.places) for n, event in events.items()}
     while at + 2 <= end:
         size, places = found.get(data[at] | data[at + 1] << 8, _UNKNOWN_EVENT)

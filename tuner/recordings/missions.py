@@ -1,7 +1,7 @@
-"""The missions in a recording: where each starts and ends, how it spins, and what is fitted.
+"""The missions in a recording: their start and end, their yaw spin, and which are fitted.
 
-Half an hour in the air is mostly hover, from which little is learnt, and too much to simulate in
-one piece: long missions are taken as their manoeuvres, those that show most are fitted.
+Half an hour in the air is mostly hover, which excites little, and too long for one simulation: long
+missions are split into manoeuvres, and those with most motion are fitted.
 """
 
 from __future__ import annotations
@@ -18,44 +18,44 @@ from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import runs
 
 MAX_REST_MOTION = 1e-5
-"""Reference motion below this, in m or m/s, is a reference at rest."""
+"""A reference with less motion, in m or m/s, is at rest."""
 MAX_PAUSE_S = 1.0
-"""Set-points that pause for longer, in s, begin another mission."""
+"""Set-points that pause for longer begin another mission."""
 MAX_POSE_PAUSE_S = 10.0
-"""A pose that pauses for longer, in s, as where a clock was set, ends a mission."""
+"""A pose that pauses for longer, as where a clock was set, ends a mission."""
 MIN_LANDING_S = 0.2
-"""A flight that leaves the air for less, in s, only seems to: a bounce at landing takes longer."""
+"""A shorter time on the ground is no landing: a bounce takes longer."""
 MIN_MISSION_S = 2.0
-"""A shorter stretch, in s, is no mission."""
+"""A shorter stretch is no mission."""
 MAX_IDLE_COMMAND = 0.12
 MAX_IDLE_SPEED = 80.0
 MAX_IDLE_SHARE = 0.5
 MAX_OFF_COMMAND = 0.02
 MAX_OFF_SPEED = 20.0
-"""A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s; but
-not above `MAX_IDLE_SHARE` of what carries the vehicle in the air, nor below what is off."""
+"""A mean motor command or thrust, and a rotor speed in rad/s, below these is idle; but not above
+`MAX_IDLE_SHARE` of their median in the air, nor below those of stopped motors."""
 MIN_FLYING_HEIGHT_M = 0.12
-"""Higher above the ground than this, in m, the vehicle flies."""
+"""The vehicle flies if it is higher above the ground."""
 MAX_RESTING_RANGE_M = 0.01
-"""What stays within this, in m, for a second rests."""
+"""A position that stays within this for a second rests."""
 BIN_S = 0.1
-"""s of which one mean position is taken."""
+"""Positions are averaged over bins."""
 MAX_SETPOINT_DELAY_S = 0.5
-"""Set-points that begin this soon after the pose, in s, ran all the time."""
+"""Set-points that begin so soon after the pose ran all the time."""
 MAX_WHOLE_MISSION_S = 120.0
-"""s beyond which a mission is taken apart."""
+"""A longer mission is split into manoeuvres."""
 MAX_MANOEUVRE_S = 60.0
-"""s of a manoeuvre, at most."""
+"""A longer manoeuvre is split."""
 MAX_FITTED_S = 180.0
-"""s of a long recording that are fitted, at most."""
+"""At most so much of a long recording is fitted."""
 MIN_MANOEUVRE_S = 5.0
-"""s of a manoeuvre, at least."""
+"""A shorter stretch is no manoeuvre."""
 MIN_HOVER_PAUSE_S = 3.0
-"""s of hover that end a manoeuvre."""
+"""A longer hover ends a manoeuvre."""
 HOVER_LEAD_S = 1.0
-"""s of hover before it that belong to it: what is simulated begins at rest."""
+"""A manoeuvre begins with so much hover, so that its simulation begins at rest."""
 MAX_HOVER_SPEED, MAX_HOVER_TURN_RATE = 0.3, 0.3
-"""m/s and rad/s above which a vehicle does more than hover."""
+"""m/s and rad/s. A vehicle that moves or turns faster does not hover."""
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,10 @@ class Mission:
 def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
     """Return the missions in the order of flight; empty where nothing flies.
 
-    A mission starts where the attitude set-points begin. Where they run from the start, or where
-    there are none, it starts where the reference begins to move or, without a reference, in the
-    air. What stands on the ground, take-off's first and landing's last centimetres are cut, and
-    so is what follows the last attitude.
+    A mission starts where the attitude set-points begin. Without set-points, or if they run from
+    the start, it starts where the reference begins to move or, without one, in the air. Time on the
+    ground, the first centimetres of take-off and the last of landing, and all after the last
+    attitude are cut.
     """
     pose = series["position"].time
     first, last = float(pose[0]), float(pose[-1])
@@ -112,7 +112,7 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
 
 
 def _split_at_pose_pauses(mission: Mission, pose: Array) -> list[Mission]:
-    """Return a mission without the pauses of its pose, in which nobody knows what flew."""
+    """Return a mission without the pauses of its pose."""
     inside = pose[(pose >= mission.start) & (pose <= mission.end)]
     pieces = stretches(inside, np.ones(len(inside), np.bool_), max_break=MAX_POSE_PAUSE_S)
     if len(pieces) < 2:
@@ -125,7 +125,7 @@ def _split_at_pose_pauses(mission: Mission, pose: Array) -> list[Mission]:
 
 
 def _first_motion(series: Mapping[str, Series], start: float, end: float) -> float:
-    """Return when the reference begins to move within a stretch; its start if it does not."""
+    """Return the time at which the reference begins to move; the start if it does not."""
     firsts: list[float] = []
     for name in ("reference_position", "reference_velocity"):
         if name in series:
@@ -139,10 +139,9 @@ def _first_motion(series: Mapping[str, Series], start: float, end: float) -> flo
 def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
     """Return the stretches in which the rotors carry the vehicle.
 
-    The ground is known where motors were seen idle, or where the recording begins or ends at rest
-    and the vehicle climbs away from there; a recording that shows no ground is all in the air. One
-    that comes as low in flight as where it only seemed to stand, or whose motors stop for a moment,
-    flies on.
+    The ground is known where motors idle, or where the recording begins or ends at rest and the
+    vehicle climbs from there; a recording that shows no ground is all in the air. A vehicle that
+    passes a guessed ground without rest, or whose motors stop for a moment, flies on.
     """
     position = series["position"]
     time, height = position.time, position.values[:, 2]
@@ -160,7 +159,7 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
 
 
 def _is_still(time: Array, positions: Array) -> NDArray[np.bool_]:
-    """Return at which of n times the (n, 3) positions of a second around stay where they are."""
+    """Return at which of n times the (n, 3) positions rest for a second around."""
     from scipy import ndimage  # noqa: PLC0415 (slow to import, seldom needed)
 
     bins = ((time - time[0]) / BIN_S).astype(np.int64)
@@ -179,7 +178,7 @@ def _is_still(time: Array, positions: Array) -> NDArray[np.bool_]:
 def _lasting_idle(
     time: Array, idle: NDArray[np.bool_], rests: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return where motors idle, but for moments inside a flight in which the vehicle moves on."""
+    """Return where motors idle, without brief moments in flight."""
     lasting = idle.copy()
     for first, last in runs(idle):
         inside = first > 0 and last < len(time)
@@ -191,7 +190,7 @@ def _lasting_idle(
 def _idle(
     series: Mapping[str, Series], time: Array, height: Array
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return at which times the motors idle, and at which times that was recorded."""
+    """Return at which times the motors idle, and at which times they were recorded."""
     clear = height > float(np.quantile(height, 0.02)) + 3 * MIN_FLYING_HEIGHT_M
     for name, limit, off in (
         ("command", MAX_IDLE_COMMAND, MAX_OFF_COMMAND),
@@ -216,7 +215,7 @@ def _idle(
 
 
 def _is_on_ground(time: Array, height: Array) -> NDArray[np.bool_]:
-    """Return when the vehicle lies on the ground from which, or to which, it flies."""
+    """Return when the vehicle is on the ground at the start or the end of the recording."""
     resting = np.zeros(len(time), dtype=np.bool_)
     for near in (time < time[0] + 1.0, time > time[-1] - 1.0):
         level = float(np.median(height[near]))
@@ -228,7 +227,7 @@ def _is_on_ground(time: Array, height: Array) -> NDArray[np.bool_]:
 
 
 def _ground_height(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
-    """Return the height of the ground at each time: where the vehicle last stood, or will stand."""
+    """Return the ground's height at each time, from the last, or else the next, time on it."""
     where = np.flatnonzero(idle)
     before = np.clip(np.searchsorted(where, np.arange(len(time)), side="right") - 1, 0, None)
     gaps = np.diff(where) > 1
@@ -240,7 +239,7 @@ def _ground_height(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array
 def stretches(
     time: Array, flags: NDArray[np.bool_], *, max_break: float = MIN_LANDING_S
 ) -> list[tuple[float, float]]:
-    """Return the stretches in which a condition holds, breaks of up to some s bridged."""
+    """Return the stretches of time with true flags, across breaks of up to `max_break` s."""
     holds = time[flags]
     if len(holds) == 0:
         return []
@@ -266,7 +265,7 @@ class YawSpin:
 
 
 def yaw_spin(rate_setpoint: Series | None, start: float, end: float) -> YawSpin | None:
-    """Return how a mission spins, by its rate set-points; None for one that does not."""
+    """Return the yaw spin of a mission by its rate set-points; None if it does not spin."""
     if rate_setpoint is None:
         return None
     during = (rate_setpoint.time >= start - 1e-3) & (rate_setpoint.time <= end)
@@ -279,7 +278,7 @@ def yaw_spin(rate_setpoint: Series | None, start: float, end: float) -> YawSpin 
         return None
     if _nearly_always(constant & (np.abs(rates[:, :2]) < 1e-6).all(axis=1)):
         return YawSpin(yaw, level_held=False)
-    # what a controller corrects changes from one set-point to the next
+    # a controller's corrections change from one set-point to the next
     corrected = np.ptp(rates[constant, :2], axis=0) > 1e-6
     return YawSpin(yaw, level_held=True) if corrected.all() else None
 
@@ -291,7 +290,7 @@ def _nearly_always(flags: NDArray[np.bool_]) -> bool:
 def split_into_manoeuvres(
     series: Mapping[str, Series], missions: Sequence[Mission]
 ) -> tuple[Mission, ...]:
-    """Return missions, the long ones as manoeuvres, those that show most marked as fitted.
+    """Return missions, long ones as manoeuvres, of which those with most motion are fitted.
 
     Parameters
     ----------
@@ -325,7 +324,7 @@ def split_into_manoeuvres(
 
 
 def _manoeuvres_of(mission: Mission, time: Array, active: NDArray[np.bool_]) -> list[Mission]:
-    """Return the manoeuvres of a mission; its beginning where there are none."""
+    """Return the manoeuvres of a mission; its beginning if it has none."""
     inside = active & (time >= mission.start) & (time <= mission.end)
     parts = []
     for first, last in stretches(time, inside, max_break=MIN_HOVER_PAUSE_S):
@@ -355,7 +354,7 @@ def _motion(series: Mapping[str, Series]) -> tuple[Array, Array, Array]:
 
 
 def _bin_means(samples: Series, time: Array, column: int) -> Array:
-    """Return (n,) means of a column over bins, between those where there is none."""
+    """Return (n,) means of a column over bins, interpolated over empty ones."""
     bins = ((samples.time - time[0]) / BIN_S + 0.5).astype(np.int64)
     there = (bins >= 0) & (bins < len(time)) & np.isfinite(samples.values[:, column])
     count = np.bincount(bins[there], minlength=len(time))

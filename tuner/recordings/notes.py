@@ -1,4 +1,4 @@
-"""What reading a recording found, changed or lost: codes with numbers, and the texts of each."""
+"""Notes and damage of a recording: codes with numbers, and their texts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Kind = Literal["info", "warning"]
 
 
 class NoteCode(Worded):
-    """What was found or changed; a comment says what its names are.
+    """Codes of notes; a comment lists the names of each.
 
     A text has the note's count and numbers in braces; ``first`` and ``second`` for one of its
     names, ``others`` for all but the first, ``samples`` for the count with all signals,
@@ -213,18 +213,18 @@ class NoteCode(Worded):
 
 @dataclass(frozen=True)
 class Note:
-    """Something that reading found or changed.
+    """A remark on a recording, or a repair.
 
     Attributes
     ----------
     kind
-        ``info`` for what was done, ``warning`` for what a user should look at.
+        ``info`` for a repair, ``warning`` for something that the user should check.
     topic
         The topic or signal concerned; empty for the whole recording.
     count
-        How many samples, or whatever else the code counts, it concerns.
+        The number of samples, or of other things that the code counts.
     numbers, names
-        What `NoteCode` lists beside the code.
+        As `NoteCode` lists them beside the code.
     """
 
     code: NoteCode
@@ -236,10 +236,10 @@ class Note:
 
 
 class Cause(Worded):
-    """How a recording is broken.
+    """Causes of damage.
 
-    A text has the damage's ``subject`` in braces, ``chunks`` and ``times`` for how many it sums up,
-    and ``lost`` for the time without messages.
+    A text has the damage's ``subject`` in braces, its occurrences as ``chunks`` or ``times``, and
+    ``lost`` for the time without messages.
     """
 
     NOT_CLOSED = "not_closed", "the recording was not closed and has no index"
@@ -260,25 +260,25 @@ class Cause(Worded):
 
 @dataclass(frozen=True)
 class Damage:
-    """One way in which a recording is broken, and what that cost; None where it is unknown.
+    """Damage of a recording, and its extent; None where it is unknown.
 
     Attributes
     ----------
     subject
         The topic or file concerned; empty for the whole recording.
     salvaged
-        Messages that were read nevertheless.
+        Messages that were still read.
     lost
         Messages, or rows of a table, that were lost.
     bytes_lost
         Bytes of the file that could not be read.
     occurrences
-        How many chunks, pages, drop-outs or files this sums up.
+        The number of chunks, pages, drop-outs or files.
     seconds_lost
-        s of which messages are missing altogether.
+        s without any message.
     start, end
-        When the loss began and ended, in s: since the start of the mission in a `Flight`, since
-        1970 by the recorder's clock in what a reader returns.
+        Begin and end of the loss, in s: since the start of the mission in a `Flight`, since 1970
+        by the recorder's clock in a `ReadResult`.
     """
 
     cause: Cause
@@ -302,7 +302,7 @@ REJECTED_SOURCE_CODES = (NoteCode.LAYOUT_UNKNOWN, NoteCode.FIELD_MISSING)
 
 
 def reason_in_words(note: Note) -> str:
-    """Return what was found or changed."""
+    """Return the text of a note."""
     first, second, alike, *_ = (*note.names, "", "", "")
     return str(note.code.text).format(
         **note.numbers,
@@ -323,7 +323,7 @@ def reason_in_words(note: Note) -> str:
 
 
 def note_in_words(note: Note) -> str:
-    """Return the same, and that a source was passed over for it where it was."""
+    """Return the text of a note, which says if a source was passed over."""
     reason = reason_in_words(note)
     return f"passed over: {reason}" if note.code in REJECTED_SOURCE_CODES else reason
 
@@ -333,10 +333,7 @@ def _count(number: int, noun: str) -> str:
 
 
 def damage_sentence(damage: Damage) -> str:
-    """Return how a recording is broken, what was lost, what was salvaged and when.
-
-    Times count from the start of the mission, or as those of the damage do.
-    """
+    """Return a sentence on cause, loss, salvage and times of a damage."""
     how = damage.cause.text.format(
         subject=damage.subject,
         chunks=_count(damage.occurrences, "chunk"),

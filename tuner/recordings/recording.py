@@ -1,4 +1,4 @@
-"""What every reader hands over: the topics of a file, and the wanted fields as arrays."""
+"""The interface of readers: the topics of a recording, and requested fields as arrays."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NS_PER_UNIT = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 
 def short_reason(err: Exception) -> str:
-    """Return what a library says of a file in one line, short enough for a message."""
+    """Return a library's error in one line, short enough for a message."""
     return " ".join(str(err).split())[:120]
 
 
@@ -48,7 +48,7 @@ class Clock(Section):
     field
         Its path or column.
     unit
-        Key of `NS_PER_UNIT`; None is seconds in messages, and told by the step in tables.
+        Key of `NS_PER_UNIT`; None means seconds in messages; tables infer it from the step.
     """
 
     field: str
@@ -56,7 +56,7 @@ class Clock(Section):
 
     @property
     def nanoseconds(self) -> int:
-        """How many ns make its unit."""
+        """The ns in its unit."""
         return NS_PER_UNIT[self.unit or "s"]
 
     @model_validator(mode="before")
@@ -67,14 +67,14 @@ class Clock(Section):
 
 @dataclass(frozen=True)
 class Request:
-    """What is wanted of a topic.
+    """The fields to read of a topic.
 
     Attributes
     ----------
     fields
         Paths of numbers.
     clocks
-        Fields that may hold the time, the preferred one first; none means the usual header.
+        Fields that may hold the time, the preferred one first; empty means the message's header.
     """
 
     fields: tuple[str, ...]
@@ -118,7 +118,7 @@ class ReadResult:
     samples
         Topic -> its messages.
     notes
-        What was left out while reading.
+        Which data were left out while reading.
     damage
         What the recording has lost, with times in s since 1970 by the recorder's clock.
     """
@@ -138,9 +138,9 @@ class Recording(ABC):
     parameters
         Of the flight controller, where its log holds them: name -> value.
     units
-        Column of a table -> what a row of units says of it.
+        Column of a table -> its unit, where the table has a row of units.
     naming_problem
-        Why its fields say nothing by themselves, and what to do; None where they may.
+        Why its columns cannot be matched by name, and the remedy; None where they can.
     """
 
     path: Path
@@ -159,7 +159,7 @@ class Recording(ABC):
         """Return the names of a topic's fields, for hints; structures by their first part."""
 
     def missing_fields(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
-        """Return those of some fields that messages of a topic do not have."""
+        """Return the fields that messages of a topic do not have."""
         known = self.fields(topic)
         return tuple(name for name in fields if name not in known)
 
@@ -169,7 +169,7 @@ class Recording(ABC):
 
     @abstractmethod
     def read(self, wanted: Mapping[str, Request]) -> ReadResult:
-        """Read some topics: topic -> what is wanted of it.
+        """Read the requested fields: topic -> request.
 
         Raises
         ------
@@ -179,7 +179,7 @@ class Recording(ABC):
 
 
 class TabularRecording(Recording):
-    """A recording with one row a time and one number a column; the base of tabular formats.
+    """A table with one row per time and one number per column; the base of tabular formats.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ class TabularRecording(Recording):
         Raises
         ------
         RecordingError
-            None of those requested is there.
+            It has no requested time column.
         """
         for clock in request.clocks:
             if clock.field in self.columns:

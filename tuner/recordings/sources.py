@@ -1,9 +1,8 @@
-"""Find each signal's source in a recording, and name the near misses of those not there.
+"""Find each signal's source in a recording, and suggest similar names for those missing.
 
-A table's columns are also known by their names, which are taken apart into words:
-``pose.position.x [mm]``, ``/vrpn/quad/pose/position/x``, ``posX_mm`` and ``field.pose.position.x``
-all say position, x, and some a unit. Only what the words say is taken; what they leave open is
-found by physics later, or asked for.
+A table's columns are also recognised by the words of their names: ``pose.position.x [mm]``,
+``/vrpn/quad/pose/position/x``, ``posX_mm`` and ``field.pose.position.x`` all mean position, x, and
+some a unit. Units that the words leave open are inferred from physics later, or asked for.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ UNIT_SPELLINGS: Mapping[str, str] = {
 }  # fmt: skip
 TIME_UNITS = {"s", "ms", "us", "ns"}
 
-#: Word -> the quantities that it may speak of.
+#: Words that mean each quantity.
 _POSITION = {"position", "pos", "p", "translation", "xyz"}
 _ATTITUDE = {"orientation", "quaternion", "quat", "q", "rotation", "attitude", "att", "rot"}
 _VELOCITY = {"velocity", "vel", "v", "linear_velocity"}
@@ -49,7 +48,7 @@ _COMMAND = {"command", "cmd", "pwm", "motor", "mot", "throttle", "motors", "actu
 _BATTERY = {"battery_voltage", "vbat", "voltage", "battery", "bat", "batt", "voltage_v"}
 _TIME = {"time", "t", "timestamp", "stamp", "time_s", "seconds", "__time", "%time",
          "datetime", "date", "rosbagtimestamp", "clock", "elapsed"}  # fmt: skip
-#: Signal -> words that speak of it where its columns are numbered.
+#: Signal -> words that mean it where its columns are numbered.
 _NUMBERED_WORDS = {
     "attitude": _ATTITUDE,
     "position": _POSITION - {"xyz"},
@@ -76,19 +75,18 @@ _ESTIMATE_WORDS = {"est", "estimate", "estimated", "kalman", "ekf", "filtered"}
 
 @dataclass(frozen=True)
 class ColumnMeaning:
-    """What a column's name says.
+    """The meaning of a column's name.
 
     Attributes
     ----------
     signal
         Of `SIGNALS`, or ``time``, or ``angles``: an attitude in roll, pitch and yaw.
     axis
-        Which of its columns: ``x``, ``w``, ``roll`` or the number of a rotor from 1; empty where
-        there is one only.
+        Its column: ``x``, ``w``, ``roll`` or the number of a rotor from 1; empty of a single one.
     unit
-        Of a topic map or of time; None where the name does not say.
+        Of a topic map or of time; None if the name has none.
     group
-        The words before, which the columns of a signal share.
+        The words before, which the signal's columns share.
     """
 
     signal: str
@@ -98,7 +96,7 @@ class ColumnMeaning:
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """Return a name without the unit behind it, in brackets or a last word, and the unit."""
+    """Return a name without its unit, in brackets or as the last word, and the unit."""
     match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*)\s*[\])]", name)
     if match and not match[2].isdecimal():
         unit = UNIT_SPELLINGS.get(match[2].strip().lower().replace(" ", "").replace("_", "/"))
@@ -111,12 +109,12 @@ def split_unit(name: str) -> tuple[str, str | None]:
 
 
 def column_meaning(name: str, written: str | None = None) -> ColumnMeaning | None:
-    """Return what a column's name says; None where it says nothing that a flight needs.
+    """Return the meaning of a column's name; None if it names no signal of a flight.
 
     Parameters
     ----------
     written
-        What a row of units says of it.
+        Its unit in a row of units.
     """
     bare, unit = split_unit(name)
     if written is not None:
@@ -141,7 +139,7 @@ def column_meaning(name: str, written: str | None = None) -> ColumnMeaning | Non
 
 
 def _meaning_of_axis(axis: str, rest: list[str], unit: str | None) -> ColumnMeaning | None:
-    """Return the signal that the words before an axis or a rotor's number mean."""
+    """Return the meaning of the words before an axis or a rotor's number."""
     joined = set(rest) | {"_".join(rest[i : i + 2]) for i in range(len(rest) - 1)}
     signal = _signal_of_numbered(joined, unit) if axis.isdecimal() else _signal_along(axis, joined)
     if signal is None:
@@ -161,7 +159,7 @@ def _signal_of_numbered(words: set[str], unit: str | None) -> str | None:
 
 
 def _signal_along(axis: str, words: set[str]) -> str | None:
-    """Return the signal of a column that is called by an axis."""
+    """Return the signal of a column with an axis."""
     single = {word for word in words if "_" not in word}
     turning = bool(words & {"ang", "angular"})
     moving = bool(words & (_VELOCITY | {"twist"}))
@@ -176,7 +174,7 @@ def _signal_along(axis: str, words: set[str]) -> str | None:
 
 
 def _words(name: str) -> list[str]:
-    """Return a name's words in small letters, without what containers put before them."""
+    """Return a name's words in lower case, without the prefixes of containers."""
     text = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.strip())
     text = re.sub(r"\[(\d+)\]", r"_\1", text)
     words = [word for word in re.split(r"[^0-9a-zA-Z%°]+", text.lower()) if word]
@@ -220,12 +218,12 @@ AXES: Mapping[str, Sequence[str]] = {
 def sources_by_name(
     columns: Sequence[str], units: Mapping[str, str]
 ) -> tuple[Clock | None, dict[str, Source]]:
-    """Return the time, and the signals, that a table's columns hold by their names.
+    """Return the time, and the signals, of a table's columns by their names.
 
     Parameters
     ----------
     units
-        Column -> unit, of a row of units.
+        Column -> unit, from a row of units.
     """
     guesses = {
         name: g for name in columns if (g := column_meaning(name, units.get(name))) is not None
@@ -261,17 +259,17 @@ def sources_by_name(
 
 
 def _group_rank(group: str) -> tuple[bool, int]:
-    """Return the order in which the groups that hold a signal are preferred: measured, short."""
+    """Return the sort key of groups of columns: measured before estimated, short before long."""
     return bool(_ESTIMATE_WORDS & set(group.split("_"))), len(group)
 
 
 MAX_NAMED = 12
-"""Columns that a note names, at most."""
+"""A note names at most so many columns."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a signal will be read: its source, with topic, fields, unit and axes filled in.
+    """The source of a signal with topic, fields, unit and axes filled in.
 
     The fields are in the order of the signal's columns.
     """
@@ -289,7 +287,7 @@ def choose_map(recording: Recording, candidates: Iterable[TopicMap]) -> TopicMap
     Raises
     ------
     RecordingError
-        None is for its format.
+        No map is for its format.
     """
     suited = [topic_map for topic_map in candidates if topic_map.format == recording.format]
     if not suited:
@@ -311,13 +309,13 @@ def locate(
     Parameters
     ----------
     strict
-        Whether a user wrote the map, so that a topic without the fields named is an error;
-        otherwise such a topic is passed over with a note.
+        Whether a topic without the named fields is an error, as in a user's map, rather than
+        passed over with a note.
 
     Raises
     ------
     RecordingError
-        If `strict`: a topic is there, but not what the map says of it.
+        If `strict`: a topic lacks the named fields.
     """
     times = [recording.missing_fields("", (clock.field,)) for clock in topics.time]
     if is_tabular(recording.format) and all(times):
@@ -345,7 +343,7 @@ def locate(
 
 
 def _matching(recording: Recording, source: Source) -> list[str]:
-    """Return the recorded topics of a name or pattern, the one with most messages first."""
+    """Return the topics of a name or pattern, the one with most messages first."""
     pattern = source.topic
     alike = fnmatchcase if "*" in pattern else str.__eq__
     known = [topic for topic in recording.topics if topic.count and alike(topic.name, pattern)]
@@ -353,7 +351,7 @@ def _matching(recording: Recording, source: Source) -> list[str]:
 
 
 def _place(recording: Recording, signal: str, source: Source, topic: str) -> Place | Note | None:
-    """Return where a topic holds a signal, or why it does not: None if nobody expects it to."""
+    """Return a signal's place in a topic, or a note on a missing one; None if none is expected."""
     usual = recording.field_layout(topic, signal)
     fields = source.fields or (usual.fields if usual else None)
     if fields is None:
@@ -362,7 +360,7 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
         return None if wild else Note(NoteCode.LAYOUT_UNKNOWN, topic=topic, names=(kind, signal))
     missing = recording.missing_fields(topic, fields)
     if missing:
-        # nobody expects a table, or any topic whatsoever, to hold all that a map knows
+        # a table, or any topic at all, need not hold every signal of a map
         anywhere = is_tabular(recording.format) or source.topic == "*"
         absent = anywhere and len(missing) == len(fields)
         near = difflib.get_close_matches(missing[0], recording.fields(topic), n=1)
@@ -377,10 +375,7 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
 def unread_columns(
     recording: Recording, topics: TopicMap, places: Mapping[str, Place]
 ) -> tuple[Note, ...]:
-    """Return a note on the columns of a table that hold no signal and no time, if there are any.
-
-    A column under another name than the map's would be missed in silence otherwise.
-    """
+    """Return a note on the columns of a table that the map does not name, if there are any."""
     if not is_tabular(recording.format):
         return ()
     read = {field for place in places.values() for field in place.fields}
@@ -394,7 +389,7 @@ def unread_columns(
 def with_columns_by_name(
     recording: Recording, topics: TopicMap
 ) -> tuple[TopicMap, tuple[Note, ...]]:
-    """Return a map of a table with the columns that it lacks and whose names say what they hold.
+    """Return a table's map with the columns that it lacks, recognised by their names.
 
     Returns
     -------
@@ -457,7 +452,7 @@ def _table_problem(
 
 
 def _type_error(recording: Recording, signals: Iterable[str]) -> RecordingError | None:
-    """Return the error of topics that hold some signals, if their types are defined nowhere."""
+    """Return the error of a topic with some signals whose type is defined nowhere."""
     for topic in recording.topics:
         holds = topic.count and any(
             recording.field_layout(topic.name, signal) for signal in signals
@@ -476,7 +471,7 @@ def _type_error(recording: Recording, signals: Iterable[str]) -> RecordingError 
 def pose_error(
     recording: Recording, topics: TopicMap, places: Mapping[str, Place], *, by_user: bool = False
 ) -> RecordingError | None:
-    """Return why no pose was found, with the nearest topic names; None where one was.
+    """Return why no pose was found, with similar topic names; None if one was.
 
     Parameters
     ----------
@@ -499,7 +494,7 @@ def pose_error(
 
 
 def _topic_error(recording: Recording, what: str, sources: Sequence[Source]) -> RecordingError:
-    """Return the error that no topic holds a pose, with the nearest names."""
+    """Return the error that no topic holds a pose, with similar names."""
     path, names = recording.path, [topic.name for topic in recording.topics if topic.count]
     if all(source.topic == "*" for source in sources):
         held = [field for name in names for field in recording.fields(name)]

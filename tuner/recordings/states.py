@@ -1,10 +1,9 @@
-"""The vehicle's state at some times of a flight, and at its start, from a recording of it.
+"""The vehicle's recorded state at some times of a flight, and at its start.
 
-At any time a signal is read as the parabola through its samples within a few hundredths of a second
-(Savitzky and Golay 1964, on stamps that need not be even). That keeps the motion of a small drone
-and takes off most of the noise. Velocity, where it was not recorded, is the slope of position's
-parabola, and body rate follows from attitude's. At the start of a mission a steady hover before it
-is averaged.
+A signal is filtered by the parabola through its samples within a few hundredths of a second
+(Savitzky and Golay 1964, for uneven stamps), which keeps the motion of a small drone and removes
+most of the noise. If not recorded, velocity is the slope of position's parabola, and body rate
+follows from attitude's. A steady hover before a mission is averaged.
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ from tuner.recordings.flight import SIGNALS, InitialState, Series
 from tuner.recordings.interpolation import body_rate_from
 
 MIN_HALF_WIDTH_S = 0.03
-"""s on either side of a time from which its state is filtered."""
+"""The filter's window reaches at least so far to either side,"""
 MIN_SAMPLES_EACH_SIDE = 3
-"""Samples on either side that it is filtered from at least, where they follow each other slowly."""
+"""and to so many samples of a slow signal."""
 MAX_SAMPLE_DISTANCE_S = 0.5
-"""s beyond which no sample says anything of a time."""
+"""A state is unknown if no sample is nearer."""
 HOVER_WINDOW_S = 1.0
-"""Seconds before the mission in which a steady hover is looked for."""
+"""The window before the mission that may be a steady hover."""
 HALF_WINDOW_S = 0.1
-"""Seconds on each side of the start for the polynomial of a vehicle in motion."""
+"""The polynomial of a vehicle in motion takes so much on each side of the start."""
 MAX_HOVER_SPEED = 0.05
 MAX_HOVER_TURN_RATE = 0.1
-"""A hover moves slower than this, in m/s, and turns slower than this, in rad/s."""
+"""m/s and rad/s. A hover moves and turns slower."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class States(InitialState):
     time: Array
 
     def at(self, number: int) -> InitialState:
-        """Return one of them."""
+        """Return one state."""
         names = [field.name for field in fields(InitialState)]
         return InitialState(**{name: getattr(self, name)[number] for name in names})
 
@@ -91,7 +90,7 @@ def states_at(series: Mapping[str, Series], times: Array) -> States:
 
 
 def half_width(series: Series) -> float:
-    """Return the s on either side of a time from which a signal is filtered."""
+    """Return half the window, in s, of the filter of a signal."""
     gap = float(np.median(np.diff(series.time))) if len(series.time) > 1 else 0.0
     return max(MIN_HALF_WIDTH_S, (MIN_SAMPLES_EACH_SIDE + 0.5) * gap)
 
@@ -112,12 +111,12 @@ def local_parabolas(series: Series, times: Array, *, derivative: int = 0) -> Arr
 def _local_parabola(
     time: Array, values: Array, times: Array, half: float, derivative: int
 ) -> Array:
-    """Return the parabolas' values, or slopes, at some times; lines where samples are few."""
+    """Return the values, or slopes, of local parabolas, or of lines through few samples."""
     if len(time) < 2:
         return np.full(len(times), np.nan)
     first = np.searchsorted(time, times - half - 1e-9)
     behind = np.searchsorted(time, times + half + 1e-9)
-    # at the ends of a recording, and in its gaps, the nearest two
+    # at the ends of a recording and in gaps, the nearest two samples
     nearest = np.clip(np.searchsorted(time, times) - 1, 0, len(time) - 2)
     few = behind - first < 2
     first, behind = np.where(few, nearest, first), np.where(few, nearest + 2, behind)
@@ -140,8 +139,8 @@ def _local_parabola(
 def initial_state(series: Mapping[str, Series]) -> InitialState:
     """Estimate the state at time 0.
 
-    In a steady hover before the start the last second is averaged robustly (position by a line,
-    evaluated at 0, since a hover may still creep); otherwise a parabola is fitted around 0.
+    The last second of a steady hover is averaged robustly (position by a line, evaluated at 0,
+    since a hover may creep); otherwise a parabola is fitted around 0.
     """
     hover = in_hover(series)
 
@@ -169,8 +168,7 @@ def initial_state(series: Mapping[str, Series]) -> InitialState:
 def initial_position_error(series: Mapping[str, Series], noise: float) -> float:
     """Return the standard error in m of the position (each axis) in `initial_state`.
 
-    That of the end of a line through samples of a second, or of the middle of a parabola through
-    those around the start.
+    It is that of a line's end in a hover, else of a parabola's middle.
 
     Parameters
     ----------
@@ -199,7 +197,7 @@ def in_hover(series: Mapping[str, Series]) -> bool:
 
 
 def _near_start(series: Series, hover: bool) -> Series:
-    """Return the samples that tell of the start."""
+    """Return the samples near the start."""
     return (
         series.between(-HOVER_WINDOW_S, 0.0)
         if hover
@@ -229,7 +227,7 @@ def _at_start(series: Series, column: int, hover: bool, line: bool, derivative: 
 
 
 def _nearest_sample(series: Series, column: int) -> float:
-    """Return the sample nearest to the start, if there is one within half a second."""
+    """Return the sample nearest to the start, within half a second; else NaN."""
     measured = np.flatnonzero(np.isfinite(series.values[:, column]))
     if len(measured) == 0:
         return float("nan")

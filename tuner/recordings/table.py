@@ -1,7 +1,7 @@
-"""Tables: CSV and Parquet, one row a time, one column a number; their times as nanoseconds.
+"""Tables: CSV and Parquet, with one row per time; their times in nanoseconds.
 
-Nothing in a table says in which unit its times are. How often a flight is sampled does: between
-`MIN_SAMPLE_RATE_HZ` and `MAX_SAMPLE_RATE_HZ` Hz exactly one of s, ms, µs and ns has any given step.
+The unit of a table's times follows from their step: for sample rates from `MIN_SAMPLE_RATE_HZ` to
+`MAX_SAMPLE_RATE_HZ` any step has exactly one of the units s, ms, µs and ns.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from tuner.recordings.recording import (
 #: Tables with more columns, or more cells to be read, are no flight.
 MAX_COLUMNS = 10_000
 MAX_CELLS = 500_000_000
-#: Nor are those that hold so many cells in each byte, for numbers differ; small ones may.
+#: Nor are files with more cells per byte, unless they have few cells: true numbers differ.
 MAX_CELLS_PER_BYTE, MIN_CELL_LIMIT = 20, 20_000_000
 
 
@@ -55,7 +55,7 @@ class Table(TabularRecording):
     Attributes
     ----------
     units
-        Column -> what a row of units says of it.
+        Column -> unit, from a row of units.
 
     Raises
     ------
@@ -146,7 +146,7 @@ class Table(TabularRecording):
             parse_options=arrow_csv.ParseOptions(
                 delimiter=layout.separator, invalid_row_handler=skip, newlines_in_values=False
             ),
-            # As text first: a stray word must not cost a column, nor a float a time's last digits.
+            # As text first: a stray word must not cost a column, nor a float the digits of a time.
             convert_options=arrow_csv.ConvertOptions(
                 include_columns=names,
                 column_types=dict.fromkeys(names, pyarrow.string()),
@@ -160,7 +160,7 @@ class Table(TabularRecording):
 
 
 def _single_blanks(path: Path) -> io.BytesIO:
-    """Return a text in which cells are apart by one blank."""
+    """Return a text with single blanks between cells."""
     with path.open("rb") as stream:
         return io.BytesIO(b"\n".join(b" ".join(line.split()) for line in stream))
 
@@ -171,11 +171,11 @@ def _unreadable_reason(err: Exception) -> str:
 
 #: Stands for a row without a time.
 NO_TIME = np.iinfo(np.int64).min
-#: Hz at which flights are sampled: a thousand apart, as the units of time are.
+#: A factor of 1000 apart, as the units of time are.
 MIN_SAMPLE_RATE_HZ, MAX_SAMPLE_RATE_HZ = 3.0, 3000.0
-#: Rows that one stamp may be on, before it counts as one of too few digits.
+#: Stamps with more rows each have too few digits.
 MAX_ROWS_PER_STAMP = 10
-#: Fields by whose samples the step is told.
+#: The step is the median over the samples of at most so many fields.
 MAX_FIELDS = 24
 UNIT_NAMES = {
     "s": "in seconds",
@@ -192,21 +192,21 @@ _DAY = 24 * 3600 * NS_PER_UNIT["s"]
 def read_times(
     path: Path, column: pyarrow.ChunkedArray, clock: Clock, fields: Iterable[Array]
 ) -> tuple[Nanoseconds, tuple[Note, ...]]:
-    """Return the times (n,) of a table's rows in ns, `NO_TIME` where there is none.
+    """Return the times (n,) of a table's rows in ns, `NO_TIME` of a row without.
 
     Parameters
     ----------
     column
-        As it stands in the table: whole numbers, floats, time stamps or text.
+        Whole numbers, floats, time stamps or text.
     clock
-        What the topic map says of it; without a unit, that is told by the step.
+        Its clock in the topic map; without a unit, that follows from the step.
     fields
         (n,) of the signals, NaN where a row holds no sample.
 
     Returns
     -------
     tuple
-        The times, and a note on their unit where that was told and is not the usual one.
+        The times, and a note on a unit that was inferred and is not s.
 
     Raises
     ------
@@ -242,7 +242,7 @@ def numbers_of(column: pyarrow.ChunkedArray) -> Array:
 
 
 def array_of(column: pyarrow.ChunkedArray) -> NDArray[Any]:
-    """Return a column's numbers, in a way that leaves pandas asleep (half a second) if it can."""
+    """Return a column's numbers, if possible without the import of pandas (half a second)."""
     whole = column.combine_chunks()
     if whole.null_count:
         return np.asarray(whole.to_numpy(zero_copy_only=False))
@@ -264,7 +264,7 @@ def _number(cell: object) -> float:
 def _unit_by_step(
     path: Path, field: str, numbers: Array, sampled: list[NDArray[np.bool_]]
 ) -> str | None:
-    """Return the unit in which samples follow each other as those of a flight do."""
+    """Return the unit of times whose step is that of a flight."""
     steps = []
     for there in sampled:
         between = np.diff(numbers[there & np.isfinite(numbers)])
@@ -284,7 +284,7 @@ def _unit_by_step(
 
 
 def _whole_nanoseconds(column: pyarrow.ChunkedArray, numbers: Array, unit: int) -> Nanoseconds:
-    """Return a column of numbers in whole ns, with every digit that a text holds."""
+    """Return a column of numbers in whole ns, with all digits of a text."""
     known = np.isfinite(numbers) & (np.abs(numbers) < 9e18 / unit)
     result = np.full(len(numbers), NO_TIME, dtype=np.int64)
     if types.is_integer(column.type) and not column.null_count:
@@ -340,7 +340,7 @@ def _require_fine_stamps(
     times: Nanoseconds,
     sampled: list[NDArray[np.bool_]],
 ) -> None:
-    """Refuse stamps that were written with so few digits that many rows share them."""
+    """Refuse stamps with so few digits that many rows share them."""
     there = times[max(sampled, key=np.count_nonzero)]
     there = there[there != NO_TIME]
     different = len(np.unique(there))

@@ -1,7 +1,7 @@
-"""What users state of recordings: topic maps (``configs/topics``) and side-cars.
+"""Topic maps (``configs/topics``) and side-cars of recordings.
 
-A topic map says which recorded field becomes which signal; a side-car is what a lab notes about one
-recording, in a YAML file of the same name beside it.
+A topic map assigns recorded fields to signals; a side-car is a lab's YAML file about one recording,
+of the same name beside it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tuner.recordings.recording import Clock
 from tuner.recordings.unit_detection import ATTITUDES, UNITS
 from tuner.vehicle.motor_orders import MotorOrder
 
-#: Maps may extend maps this often.
+#: Maps may extend maps to this depth.
 MAX_EXTENSIONS = 3
 
 
@@ -32,16 +32,15 @@ def _as_list(value: object) -> object:
 
 
 class Source(Section):
-    """Where one signal is recorded.
+    """The source of one signal.
 
     Attributes
     ----------
     topic
-        Name of the topic, in which ``*`` stands for anything; empty in a table, which has one set
-        of columns only.
+        Name of the topic, in which ``*`` stands for anything; empty in a table.
     fields
         Paths into the message (``pose.position.x``, ``channels[0]``) or column names, in the
-        order of the signal's columns; None takes those that the message type usually has.
+        order of the signal's columns; None takes the usual ones of the message type.
     rotor
         Field that names the rotor, from 0, of a message; `fields` then names one field.
     unit
@@ -79,27 +78,27 @@ class Source(Section):
 
 
 class TopicMap(Section):
-    """Signals and the sources that may hold them, the preferred one first.
+    """Signals and their possible sources, the preferred one first.
 
     Attributes
     ----------
     name
-        What reports call the map.
+        Its name in reports.
     format
-        Kind of recording that it applies to.
+        Format of its recordings.
     extends
-        Another map, by name or file, for all that this one does not say.
+        Another map, by name or file, for all that this one lacks.
     priority
-        Among maps that find equally many signals in a recording, the highest is taken.
+        Of maps that find equally many signals, the one of highest priority is taken.
     time
         Fields that hold the time, the preferred one first; none means the message's header.
     messages
         ``.msg`` files, or folders of them, for ROS types that a recording does not define.
     motor_order
-        In which the columns of ``command`` and ``rotor_speed`` are listed, of `MOTOR_ORDERS` or
-        four numbers; None where nothing is said.
+        The order of the columns of ``command`` and ``rotor_speed``: of `MOTOR_ORDERS` or four
+        numbers; None for that of the format.
     signals
-        Signal of `SIGNALS` to its sources. In a table, a list of columns says it all.
+        Signal of `SIGNALS` -> its sources; in a table, a list of columns will do.
     """
 
     name: str
@@ -114,7 +113,7 @@ class TopicMap(Section):
     @model_validator(mode="before")
     @classmethod
     def _columns(cls, value: Any) -> Any:
-        """Let a table's signal be a list of columns, or one column."""
+        """Accept a list of columns, or one column, as a table's signal."""
         if not (isinstance(value, Mapping) and is_tabular(value.get("format"))):
             return value
         signals = value.get("signals")
@@ -171,12 +170,12 @@ def load_topic_map(reference: str | Path, *, base: Path | None = None, depth: in
     base
         Folder from which relative paths count; None is the working folder.
     depth
-        How many maps this one is extended by.
+        The number of maps that extend this one.
 
     Raises
     ------
     ConfigError
-        The file is missing, no YAML, or says something that no map can say.
+        The file is missing, no YAML or no valid map.
     """
     path = find_config("topics", str(reference), base or Path())
     ships = path.parent == configs_folder() / "topics"
@@ -204,7 +203,7 @@ def load_topic_map(reference: str | Path, *, base: Path | None = None, depth: in
 
 @cache
 def _shipped(path: Path) -> TopicMap:
-    """Return a map that ships, which others extend, read once."""
+    """Return a shipped map, read once."""
     return read_model(TopicMap, path)
 
 
@@ -217,24 +216,24 @@ def shipped_maps(kind: str) -> tuple[TopicMap, ...]:
 
 
 class Sidecar(Section):
-    """What the file beside a recording states about it.
+    """A lab's remarks about one recording, in the file beside it.
 
     Attributes
     ----------
     trajectory
-        What was flown, for recordings without the reference: name and numbers as in a
-        `TrajectorySettings`, which are checked where the simulator's shapes are known.
+        The flown trajectory, for recordings without the reference: name and numbers as in a
+        `TrajectorySettings`, which validates them.
     start, end
-        Seconds since the first pose between which the mission lies, instead of those found.
+        Seconds since the first pose of the mission's start and end, instead of those found.
     missions
-        Numbers, from 1, of those missions that are fitted, of a recording that holds several; None
-        for all, or of a long one for those that show most.
+        Numbers, from 1, of the missions to fit; None for all, or for those with most motion in a
+        long recording.
     topics
         The topic map of this recording: a file beside it, or a shipped map's name.
     namespace
         Prefix of its topics.
     motor_order
-        In which its motors were recorded, as in a topic map.
+        The order of its motors, as in a topic map.
     """
 
     trajectory: Mapping[str, str | Number] | None = None
@@ -247,7 +246,7 @@ class Sidecar(Section):
 
 
 def sidecar_path(recording: Path) -> Path:
-    """Return where the side-car of a recording lies, if there is one."""
+    """Return the path of a recording's side-car, whether or not it exists."""
     return recording / "flight.yaml" if recording.is_dir() else recording.with_suffix(".yaml")
 
 

@@ -1,11 +1,10 @@
-"""PX4's messages: read from ULog files in its own frames, NED and FRD, which a topic map turns.
+"""PX4's ULog files and messages, in its own frames, NED and FRD, which a topic map turns.
 
-pyulog reads the header and the messages. Between the two formats are checked and messages counted:
-pyulog multiplies out a log's formats, and 77 bytes whose formats nest kept it busy for over 25 s,
-where this refuses them in 0.14 s; it also reports nothing of the bytes behind the last whole
-message of a cut log.
-Messages are alike in logs and in ROS 2: where they hold the signals, and what a log would have to
-hold more of. Source of profiles and default rates: PX4's ``logged_topics.cpp``.
+pyulog reads header and messages. In between, this module checks the formats and counts messages:
+pyulog expands nested formats, 77 bytes of which kept it busy for over 25 s and are refused here in
+0.14 s; nor does it report the bytes after the last whole message of a cut log. The fields of
+signals hold for PX4's messages in ROS 2 too. Source of logging profiles and default rates: PX4's
+``logged_topics.cpp``.
 """
 
 from __future__ import annotations
@@ -36,15 +35,15 @@ from tuner.recordings.recording import (
     short_reason,
 )
 
-#: A ULog message cannot be longer; a format that claims so is no honest one.
+#: No ULog message is longer; a format that claims so is damaged.
 MAX_MESSAGE_BYTES = 65_535
-#: What a log begins with.
+#: The first bytes of a log.
 MAGIC = b"ULog\x01\x12\x35"
 #: Bytes before its first message.
 HEADER_BYTES = 16
 #: Logs are read into memory; PX4 writes some 10 MB a minute.
 MAX_LOG_BYTES = 4 << 30
-#: Bytes that are looked through at once.
+#: Messages are counted in blocks of so many bytes.
 BLOCK_BYTES = 1 << 22
 
 #: Message -> its fields: type, number, name.
@@ -83,7 +82,7 @@ class ULogRecording(Recording):
         )
 
     def field_layout(self, topic: str, signal: str) -> FieldLayout | None:
-        """Return where a message holds a signal."""
+        """Return the fields of a message that hold a signal."""
         return FIELD_LAYOUTS.get(topic.partition("[")[0], {}).get(signal)
 
     def fields(self, topic: str) -> list[str]:
@@ -91,7 +90,7 @@ class ULogRecording(Recording):
         return [name for _, _, name in self._formats.get(topic.partition("[")[0], [])]
 
     def missing_fields(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
-        """Return those of some fields that a message does not have."""
+        """Return the fields that a message does not have."""
         kind = topic.partition("[")[0]
         return tuple(path for path in fields if not _has(self._formats, kind, path.split(".")))
 
@@ -147,7 +146,7 @@ class ULogRecording(Recording):
 
 
 def _blocks(path: Path) -> Iterator[tuple[bytes, list[int]]]:
-    """Yield blocks of a log, each with where its whole messages begin, and the end of the last."""
+    """Yield blocks of a log with the positions of their whole messages, and the last one's end."""
     with path.open("rb") as stream:
         stream.seek(HEADER_BYTES)
         rest = b""
@@ -165,7 +164,7 @@ def _blocks(path: Path) -> Iterator[tuple[bytes, list[int]]]:
 
 
 def _definitions(path: Path) -> tuple[Formats, dict[str, float]]:
-    """Return formats and parameters of a log; formats are checked."""
+    """Return the checked formats and the parameters of a log."""
     with path.open("rb") as stream:
         if len(start := stream.read(HEADER_BYTES)) < HEADER_BYTES or not start.startswith(MAGIC):
             raise RecordingError(path, "is no PX4 log", "give the .ulg file itself")
@@ -182,14 +181,14 @@ def _definitions(path: Path) -> tuple[Formats, dict[str, float]]:
 
 
 def parameters_of(path: Path) -> dict[str, float]:
-    """Return the parameters at the beginning of a PX4 log; none of what is no such log."""
+    """Return the parameters at the beginning of a PX4 log; empty for any other file."""
     with contextlib.suppress(RecordingError), readable(path):
         return _definitions(path)[1]
     return {}
 
 
 def _has(formats: Formats, kind: str, path: list[str]) -> bool:
-    """Return whether a format has a field such as ``esc[0].esc_rpm``, in its parts."""
+    """Return whether a format has a field such as ``esc[0].esc_rpm``, given in its parts."""
     name, _, index = path[0].partition("[")
     for what, count, field in formats.get(kind, []):
         if field == name:
@@ -200,7 +199,7 @@ def _has(formats: Formats, kind: str, path: list[str]) -> bool:
 
 
 def _count_numbers(formats: Formats, name: str, depth: int) -> int:
-    """Return the numbers in a format, at most a little more than a message can hold."""
+    """Return the count of numbers in a format, capped just above that of any message."""
     if depth > 8:
         return MAX_MESSAGE_BYTES + 1
     total = 0
@@ -213,7 +212,7 @@ def _count_numbers(formats: Formats, name: str, depth: int) -> int:
 
 
 def _count_messages(path: Path) -> tuple[dict[int, tuple[str, int]], dict[int, str], int]:
-    """Count the messages of each subscription, and the bytes behind the last whole record."""
+    """Count the messages of each subscription, and the bytes after the last whole one."""
     names: dict[int, str] = {}
     kinds: dict[int, str] = {}
     counts: Counter[int] = Counter()
@@ -255,7 +254,7 @@ SYSTEM_IDENTIFICATION, HIGH_RATE = 8, 16
 """Bits of ``SDLOG_PROFILE``."""
 DEFAULT_PROFILE = 1
 MIN_RATE_SHARE = 0.8
-"""Share of a wanted rate that is enough."""
+"""A smaller share of the needed rate is too slow."""
 
 
 def _fields(*names: str, unit: str = "si") -> FieldLayout:
@@ -314,21 +313,21 @@ FIELD_LAYOUTS: Mapping[str, Mapping[str, FieldLayout]] = {
     },
     "battery_status": {"battery_voltage": _fields("voltage_v")},
 }
-"""Message, named as in a log -> signal -> where it is."""
+"""Message, named as in a log -> signal -> its fields."""
 
 
 @dataclass(frozen=True)
 class LogNeed:
-    """A message that a fit needs.
+    """A message that a fit needs, and its rate.
 
     Attributes
     ----------
     messages
-        Its name, and others that serve as well.
+        Its name, and those of substitutes.
     rate
-        Hz that are enough.
+        Hz that suffice.
     profiles
-        Bits of ``SDLOG_PROFILE`` of which each logs it at full rate.
+        Bits of ``SDLOG_PROFILE``, each of which logs it at full rate.
     """
 
     messages: tuple[str, ...]
@@ -369,7 +368,7 @@ LOG_NEEDS = (
 
 @dataclass(frozen=True)
 class LoggingAdvice:
-    """What to log more of.
+    """A message to log, or to log faster.
 
     Attributes
     ----------
@@ -384,12 +383,12 @@ class LoggingAdvice:
 
 
 def logging_advice(rates: Mapping[str, float]) -> tuple[LoggingAdvice, ...]:
-    """Return which messages are missing, or too slow.
+    """Return the messages that are missing or too slow.
 
     Parameters
     ----------
     rates
-        Message -> Hz at which it was logged.
+        Message -> its logged rate in Hz.
     """
     found = []
     for wanted in LOG_NEEDS:
@@ -401,7 +400,7 @@ def logging_advice(rates: Mapping[str, float]) -> tuple[LoggingAdvice, ...]:
 
 
 def logger_settings(advice: tuple[LoggingAdvice, ...], parameters: Mapping[str, float]) -> str:
-    """Return which logger settings would log what is advised; empty if nothing is."""
+    """Return the logger settings that follow some advice, in words; empty without advice."""
     if not advice:
         return ""
     profile = round(parameters.get("SDLOG_PROFILE", DEFAULT_PROFILE))

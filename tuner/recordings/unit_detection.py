@@ -1,16 +1,15 @@
-"""Recorded numbers into SI, ENU, FLU and (w, x, y, z), and units that no topic map gives.
+"""Convert recorded numbers to SI, ENU, FLU and (w, x, y, z), and infer units from physics.
 
-The latter are inferred from physics and from the range of the numbers. What is certain is read so;
-what is not stays as it is, and is asked for where it matters. The unit
-of lengths follows from gravity: a multirotor is pushed along its thrust and pulled down by gravity,
-so that its recorded attitude alone says how fast it accelerates:
+Units that no topic map gives are inferred from gravity and from the range of the numbers. A certain
+unit is used; an uncertain one is left as it is, or asked for where it matters. The unit of lengths
+follows from gravity. Thrust and gravity alone accelerate a multirotor in hover and slow flight:
 
     a_xy = (g + a_z) t
 
-where t points to where the thrust leans, as long as its tilt's tangent. Lengths in a unit of which
-k make a metre have a_xy and a_z k times as large, but not g, so that a_xy - a_z t is k g t. That
-holds however slow or fast a flight is. Drag, wind and noise of the tilt make k smaller, of slow
-flights by a third, of some hovers by more; nothing makes it larger.
+where t is the horizontal direction of thrust with the tangent of its tilt as length. In a unit of
+which k make a metre, a_xy and a_z are k times as large but g is not, so that a_xy - a_z t = k g t.
+Drag, wind and noise of the tilt make k smaller, by a third in slow flights and more in some hovers;
+nothing makes it larger.
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ UNITS: Mapping[str, tuple[float, float]] = {
     "signed": (0.5, 0.5),
 }
 
-#: Signals whose vectors are written in world or in body axes.
+#: Signals in world, and in body axes.
 WORLD_SIGNALS = {
     "position",
     "velocity",
@@ -100,7 +99,7 @@ def quaternion_of(angles: Array) -> Array:
 
 @dataclass(frozen=True)
 class Reading:
-    """Another way to read recorded numbers, and its name in a sentence."""
+    """Another frame or order of recorded numbers, and its name in a sentence."""
 
     name: str
     read: Callable[[Array], Array]
@@ -110,7 +109,7 @@ def _scalar_last(q: Array) -> Array:
     return q[:, [3, 0, 1, 2]]
 
 
-#: How attitudes are recorded that are not (w, x, y, z) from FLU to ENU; the likelier first.
+#: Other attitudes than (w, x, y, z) from FLU to ENU; the likelier first.
 ATTITUDE_READINGS = (
     Reading("scalar-last", _scalar_last),
     Reading("world to body", lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])),
@@ -120,33 +119,33 @@ ATTITUDE_READINGS = (
 
 
 LENGTH_SIGNALS = {"position": False, "velocity": True}
-"""Signals of lengths that may come in another unit than metres; whether they are speeds."""
+"""Signals that may be in another unit than metres -> whether they are speeds."""
 LENGTH_UNITS = {"cm": "in centimetres", "mm": "in millimetres"}
-"""Units that are recognised, and how a sentence calls them."""
+"""Units of length that are inferred -> their phrase in a sentence."""
 
 BIN_S = 0.1
-"""s of which one median is taken, of noise, bursts of stamps and single corrupt samples."""
+"""Medians over bins remove noise, bursts of stamps and single corrupt samples."""
 HALF_BINS = 3
-"""Bins on either side of a time over which the acceleration there is a mean."""
+"""An acceleration is a mean over so many bins to either side."""
 MAX_DISTANCE_S = 300.0
-"""s to either side of the middle stamp that are looked at; those far off are wrong."""
+"""Stamps farther from the median one are ignored as wrong."""
 MIN_SLOW_STEP_S = 0.03
-"""s from sample to sample, above which times may be a thousand times too long."""
+"""Times with a longer step may be a thousand times too long."""
 MIN_TILT_COSINE = 0.3
-"""Cosine of the tilt below which thrust carries little of the weight."""
+"""Below this the vehicle lies on its side, and thrust carries little of the weight."""
 
 MIN_TILT_RMS = 0.002
-"""rad of tilt, root mean square, of which less is noise."""
+"""rad. A smaller tilt, root mean square, is noise."""
 MIN_AGREEMENT = 0.8
-"""Share of the tilt that has to point as the vehicle accelerates."""
+"""The least share of the tilt that points along the acceleration,"""
 SIGNIFICANCE = 3.0
-"""Standard deviations by which chance would have to err for that."""
+"""which must exceed chance by so many standard deviations."""
 SCALE_RANGE = (0.45, 1.6)
-"""How far the lengths of a unit may seem to be from it."""
+"""The range of a unit's apparent scale: drag and noise shrink it."""
 MIN_OTHER_UNIT_SCALE = 2.0
-"""Units to a metre that no flight in metres seems to have."""
+"""No flight in metres has a larger apparent scale."""
 MAX_SPEED_RATIO = 3.0
-"""Times that a recorded speed may be off the change of a position in its unit."""
+"""The largest ratio of recorded speed to the position's derivative in the same unit."""
 UNIT_PHRASES = {
     "si": "in SI units",
     "deg": "in degrees",
@@ -159,14 +158,13 @@ UNIT_PHRASES = {
     "pwm_16bit": "of 16 bits",
     "signed": "from -1 to 1",
 }
-"""Units that are inferred, and how a sentence calls them."""
+"""Units that are inferred -> their phrase in a sentence."""
 GRAVITY_RANGE = (0.75, 1.4)
-"""How far a steady specific force, as recorded, is from gravity, of a vehicle that flies or
-stands."""
+"""The range of the mean specific force over gravity, in flight or at rest."""
 MAX_TURN_RATE = 40.0
-"""rad/s that no vehicle turns at for a tenth of its flight: gyros end at 35."""
+"""rad/s. No vehicle turns faster for a tenth of its flight: gyros saturate at 35."""
 MIN_SAMPLES = 20
-"""Samples without which a range says nothing of their unit."""
+"""Fewer samples do not show their unit."""
 
 
 @dataclass(frozen=True)
@@ -179,16 +177,16 @@ class RawSeries:
 
 @dataclass(frozen=True)
 class Scale:
-    """How recorded lengths compare with what the recorded tilt says.
+    """The scale of recorded lengths by the recorded tilt.
 
     Attributes
     ----------
     per_metre
-        How many of their unit make a metre.
+        Units per metre.
     agreement
-        Share of the tilt, 0..1, that points as the vehicle accelerates.
+        Share of the tilt, 0..1, that points along the acceleration.
     sure
-        Whether that is enough, and not by chance.
+        Whether the agreement is sufficient, and significant.
     """
 
     per_metre: float = 1.0
@@ -199,7 +197,7 @@ class Scale:
 def scales_of(recorded: Mapping[str, RawSeries]) -> dict[str, Scale]:
     """Return the scale of each signal of `LENGTH_SIGNALS` that a recording holds.
 
-    Position and speed share the better known one where one changes about as the other says.
+    Position and speed share the better known one if the speed is the position's derivative.
 
     Parameters
     ----------
@@ -220,10 +218,9 @@ def scales_of(recorded: Mapping[str, RawSeries]) -> dict[str, Scale]:
 
 
 def is_too_slow(recorded: Mapping[str, RawSeries]) -> bool:
-    """Return whether times are a thousand times too long: lengths make sense only if they are.
+    """Return whether times are a thousand times too long, by gravity.
 
-    A table's unit of time is told by its step, which slow microseconds share with quick
-    milliseconds.
+    The step of a table's times does not tell slow microseconds from quick milliseconds.
     """
     if not {"position", "attitude"} <= set(recorded):
         return False
@@ -242,16 +239,13 @@ def is_too_slow(recorded: Mapping[str, RawSeries]) -> bool:
 def fits_gravity(
     position: RawSeries, attitude: RawSeries, units: Iterable[str] = ("si", *LENGTH_UNITS)
 ) -> bool:
-    """Return whether positions in one of some units accelerate as an attitude says."""
+    """Return whether positions in one of some units accelerate along the tilt."""
     scale, (low, high) = scale_of(position, attitude), SCALE_RANGE
     return scale.sure and any(low < scale.per_metre * UNITS[unit][0] < high for unit in units)
 
 
 def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
-    """Return the unit of `UNITS` that lengths are to be read in, and what to say of it.
-
-    Metres (``si``) where they are, and wherever that cannot be told.
-    """
+    """Return the unit of `UNITS` of recorded lengths, metres (``si``) if unsure, and a note."""
     if not scale.sure or scale.per_metre < MIN_OTHER_UNIT_SCALE:
         return "si", None
     low, high = SCALE_RANGE
@@ -264,7 +258,7 @@ def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
 
 
 def scale_of(lengths: RawSeries, attitude: RawSeries, *, speeds: bool = False) -> Scale:
-    """Return the scale of recorded positions or speeds, of that attitude which fits them best.
+    """Return the scale of recorded positions or speeds, for the best-fitting attitude reading.
 
     Parameters
     ----------
@@ -294,7 +288,7 @@ def force_and_tilt(position: RawSeries, attitude: RawSeries) -> tuple[Array, Arr
 
 
 def _accelerations(lengths: RawSeries, centres: Array, *, speeds: bool = False) -> Array:
-    """Return accelerations, (n, 3), `HALF_BINS` bins from either end of some bins."""
+    """Return accelerations, (n, 3), at all bins but `HALF_BINS` at either end."""
     if len(centres) <= 2 * HALF_BINS:
         return np.empty((0, 3))
     at = _binned(lengths, centres)
@@ -306,7 +300,7 @@ def _accelerations(lengths: RawSeries, centres: Array, *, speeds: bool = False) 
 
 
 def _force_and_tilt(push: Array, attitude: RawSeries, centres: Array) -> tuple[Array, Array]:
-    """Return what `force_and_tilt` does, of accelerations."""
+    """Return the result of `force_and_tilt` from accelerations."""
     if not len(push):
         return np.empty((0, 2)), np.empty((0, 2))
     norm = np.linalg.norm(attitude.values, axis=1, keepdims=True)
@@ -321,10 +315,10 @@ def _force_and_tilt(push: Array, attitude: RawSeries, centres: Array) -> tuple[A
 
 
 def _slope_scale(pull: Array, tilt: Array) -> Scale:
-    """Return the slope of (n, 2) pulls over tilts, by least absolute deviations."""
+    """Return the slope of (n, 2) forces over tilts, by least absolute deviations."""
     if len(tilt) <= 2 * HALF_BINS:
         return Scale()
-    # a tilt that stays is wind, or a marker body that was defined on a slope
+    # a constant tilt is wind, or markers defined on a slope
     pull, tilt = pull - np.median(pull, axis=0), tilt - np.median(tilt, axis=0)
     size = np.linalg.norm(tilt, axis=1)
     pull, tilt, size = pull[size > 0], tilt[size > 0], size[size > 0]
@@ -334,7 +328,7 @@ def _slope_scale(pull: Array, tilt: Array) -> Scale:
     order = np.argsort(slope)
     middle = np.searchsorted(np.cumsum(size[order]), 0.5 * size.sum())
     agreement = float(size[slope > 0].sum() / size.sum())
-    # neighbours share what they are means of: one in REACH of them is a throw of its own
+    # the means overlap: one in HALF_BINS of them is independent
     chance = 0.5 * np.sqrt(HALF_BINS * (size**2).sum()) / size.sum()
     sure = bool(agreement > max(MIN_AGREEMENT, 0.5 + SIGNIFICANCE * chance))
     return Scale(float(slope[order][middle]) / GRAVITY, agreement, sure)
@@ -345,7 +339,7 @@ def _best_known(scales: Iterable[Scale]) -> Scale:
 
 
 def _share_a_unit(position: RawSeries, speed: RawSeries) -> bool:
-    """Return whether the position changes about as fast as a recorded speed says."""
+    """Return whether the position's derivative has about the size of a recorded speed."""
     position, speed = _near_middle(position, speed)
     if not len(position.time) or not len(speed.time):
         return False
@@ -362,14 +356,14 @@ def _share_a_unit(position: RawSeries, speed: RawSeries) -> bool:
 
 
 def _bin_centres(*signals: RawSeries) -> Array:
-    """Return the s in the middle of all bins that hold samples of some signals."""
+    """Return the centres, in s, of bins over all samples of some signals."""
     first = min(samples.time.min() for samples in signals)
     last = max(samples.time.max() for samples in signals)
     return np.asarray(first + BIN_S * (np.arange(int((last - first) / BIN_S) + 1) + 0.5))
 
 
 def _near_middle(*signals: RawSeries) -> list[RawSeries]:
-    """Return signals' samples about the middle stamp of the last; those far off are wrong."""
+    """Return signals' samples near the median stamp of the last; stamps far off are wrong."""
     last = signals[-1].time
     middle = np.median(last) if len(last) else 0.0
     near = [np.abs(samples.time - middle) < MAX_DISTANCE_S for samples in signals]
@@ -377,7 +371,7 @@ def _near_middle(*signals: RawSeries) -> list[RawSeries]:
 
 
 def _binned(samples: RawSeries, centres: Array) -> Array:
-    """Return (n, k) values at the centres (n,) of bins, between the medians of those around.
+    """Return (n, k) values at the centres (n,) of bins, interpolated between the bins' medians.
 
     NaN where no bin within `HALF_BINS` to either side holds a sample.
     """
@@ -392,7 +386,7 @@ def _binned(samples: RawSeries, centres: Array) -> Array:
         half = first + count // 2
         when = time[np.lexsort((time, bins))][half]
         column[:] = np.interp(centres, when, value[np.lexsort((value, bins))][half], np.nan, np.nan)
-        # bins before and behind each that hold something
+        # the nearest bins with samples, before and after each
         behind = np.clip(np.searchsorted(held, np.arange(len(centres))), 0, len(held) - 1)
         before = np.where(held[behind] > np.arange(len(centres)), np.maximum(behind - 1, 0), behind)
         column[held[behind] - held[before] > HALF_BINS] = np.nan
@@ -400,13 +394,13 @@ def _binned(samples: RawSeries, centres: Array) -> Array:
 
 
 MAX_TILT_RAD, MIN_TILT_DEG = 0.55 * math.pi, 0.06
-"""rad that are more than a tilt, and less than a vehicle in the air has of them in degrees."""
+"""rad. No tilt is larger; no tilt in degrees stays below so many."""
 
 
 def unit_by_range(signal: str, values: Array, assumed: str) -> str:
-    """Return the unit of `UNITS` in which recorded numbers make sense; the assumed one if unsure.
+    """Return the unit of `UNITS` by the range of recorded numbers; the assumed one if unsure.
 
-    It is empty where that cannot be: of commands that are no pulses, as an ESC's digital steps.
+    It is empty for commands that cannot be pulses, as an ESC's digital steps.
 
     Parameters
     ----------
@@ -424,7 +418,7 @@ def unit_by_range(signal: str, values: Array, assumed: str) -> str:
 
 
 NO_COMMAND_RANGE = (1.02, 850.0)
-"""Between them are no commands from 0 to 1, and no widths of pulses in µs."""
+"""Numbers in between are neither commands from 0 to 1 nor pulse widths in µs."""
 
 
 def _are_no_pulses(values: Array) -> bool:
@@ -449,7 +443,7 @@ def _command_unit(values: Array) -> str | None:
 
 
 def _acceleration_unit(values: Array) -> str | None:
-    """Return the unit in which the mean is gravity, which turns with the body but little."""
+    """Return the unit in which the mean is gravity."""
     low, high = GRAVITY_RANGE
     size = float(np.linalg.norm(np.median(values, axis=0)))
     for unit, factor in (("si", 1.0), ("g", GRAVITY), ("mg", 1e-3 * GRAVITY)):
@@ -462,7 +456,6 @@ _RANGE_RULES: Mapping[str, Callable[[Array], str | None]] = {
     "command": _command_unit,
     "battery_voltage": lambda v: "mV" if 2000 < float(np.median(v)) < 100_000 else None,
     "acceleration": _acceleration_unit,
-    # no gyro measures so many radians
     "body_rate": lambda w: (
         "deg/s" if np.quantile(np.linalg.norm(w, axis=1), 0.9) > MAX_TURN_RATE else None
     ),
@@ -481,12 +474,12 @@ def unit_of_angles(
     position
         As recorded, in any unit of length; None without one.
     required
-        Whether it is an error that neither range nor gravity tells; else it is radians.
+        Whether an uncertain unit is an error; otherwise it is radians.
 
     Raises
     ------
     RecordingError
-        It cannot be told.
+        The unit is uncertain, and `required`.
     """
     angles = np.abs(attitude.values[np.isfinite(attitude.values).all(axis=1)])
     if not len(angles):

@@ -1,10 +1,10 @@
-"""The ROS 1 bag container: read by its index, or walked from the front where that is lost.
+"""The ROS 1 bag container: read by its index, or from the front without one.
 
-rosbags raises on a bag without its end or its index; of the shipped circle bag cut in half 14,002
-of 28,007 messages are salvaged here, and all of one that was never closed. rosbags unpacks whatever
-a chunk claims: 6 kB of bzip2 took 2.1 GB there and take 34 MB here. The fields of a 51 MB bag
-(308,077 messages) are read in 0.27 s and 79 MB, against 6.8 s and 211 MB message by message, since
-chunks are read whole and messages located with array operations.
+rosbags raises on a bag without its end or its index; here 14,002 of 28,007 messages of the shipped
+circle bag cut in half are salvaged, and all of one that was never closed. rosbags unpacks any size
+that a chunk claims: 6 kB of bzip2 took 2.1 GB there and take 34 MB here. The fields of a 51 MB bag
+(308,077 messages) take 0.27 s and 79 MB, against 6.8 s and 211 MB message by message: array
+operations locate the messages of a whole chunk.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ from tuner.recordings.ros.messages import Block, Bytes, Index
 
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
-#: Record headers are some dozens of bytes; a connection's holds its definition beside it.
+#: Record headers are some dozens of bytes; a connection's data hold its definition.
 MAX_HEADER_BYTES = 1 << 16
 MAX_RECORD_BYTES = 1 << 24
 
 
 @dataclass
 class Bag1(ChunkedFile):
-    """A ROS 1 bag, whose chunks' positions are those of their data."""
+    """A ROS 1 bag; the position of a chunk is that of its data."""
 
     aligned: bool = False
 
@@ -69,7 +69,7 @@ class Bag1(ChunkedFile):
         return sum(chunk.held.get(number, 0) for chunk in chunks for number in wanted)
 
     def _read_index(self, data: FileBytes, first: int) -> None:
-        """Learn connections and chunks from the end of the bag."""
+        """Read connections and chunks from the end of the bag."""
         header, _, _ = _record(data, first, BAG)
         at = _number(header, b"index_pos", 8)
         connections = _number(header, b"conn_count", 4)
@@ -133,7 +133,7 @@ Header = dict[bytes, bytes]
 
 
 def _record(data: Content, at: int, op: int | None = None) -> tuple[Header, int, int]:
-    """Return the header of a record, and where its data begin and end, if need be behind all."""
+    """Return a record's header, and where its data begin and end, perhaps after the file's end."""
     begin = at + 8 + _length(data, at)
     if begin > at + 8 + MAX_HEADER_BYTES:
         raise DamagedError("a record header is absurdly long")
@@ -200,7 +200,7 @@ def _connection(header: Header, data: bytes) -> Connection:
 
 
 def _chunk_info(header: Header, data: bytes) -> tuple[int, dict[str, Any]]:
-    """Return where a chunk lies, and its messages, start and end as the index has them."""
+    """Return a chunk's position, and its messages, start and end, from the index."""
     if len(data) % 8:
         raise DamagedError("a chunk's entry in the index makes no sense")
     start, end = (_time(header.get(name, b"")) * 1e-9 for name in (b"start_time", b"end_time"))
@@ -215,7 +215,7 @@ def _chunk(header: Header, begin: int, end: int) -> Chunk:
 
 
 def _entries(content: bytes) -> tuple[Index, Index]:
-    """Return the times and offsets of one connection's messages, of its index in a chunk."""
+    """Return the times and offsets of one connection's messages from its index."""
     if len(content) % 12:
         raise DamagedError("an index makes no sense")
     entries = np.frombuffer(content, dtype="<u4").reshape(-1, 3).astype(np.int64)
@@ -223,7 +223,7 @@ def _entries(content: bytes) -> tuple[Index, Index]:
 
 
 def _is_of(content: Bytes, connection: int, header: Index, size: Index) -> NDArray[np.bool_]:
-    """Return which record headers name a connection; those of one length are laid out alike."""
+    """Return which record headers name a connection; those of one length have one layout."""
     belongs = np.zeros(len(header), dtype=np.bool_)
     if len(header) == 0:
         return belongs

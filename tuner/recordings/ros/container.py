@@ -1,4 +1,4 @@
-"""What the ROS containers have in common: connections, and blocks of their messages."""
+"""The interface of ROS containers: connections, and blocks of their messages."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from rosbags.interfaces import MessageDefinition
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.messages import Block, Bytes, Index
 
-#: The largest chunk that is unpacked: cameras and lidars stay far below it.
+#: A larger chunk is not unpacked: those of cameras and lidars are far smaller.
 MAX_CHUNK_BYTES = 128 << 20
-#: Messages outside of chunks that are read together.
+#: Messages outside of chunks are read in groups of so many.
 LOOSE_PER_CHUNK = 4096
-#: Wanted pieces of an uncompressed chunk that lie this near are read in one go, in bytes.
+#: Pieces of an uncompressed chunk that are this near are read together.
 MAX_READ_GAP_BYTES = 1 << 16
 
 
 class FileBytes:
-    """A file as bytes, of which only those that are asked for are read."""
+    """A file as bytes that are read on demand."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
@@ -43,7 +43,7 @@ class FileBytes:
 
 
 Content = bytes | FileBytes
-"""Where records stand: a file, or a chunk of it unpacked."""
+"""The bytes of records: a file, or an unpacked chunk."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +85,12 @@ class Container(ABC):
 
 
 class DamagedError(Exception):
-    """The container's structure cannot be followed here.
+    """The container is damaged here.
 
     Parameters
     ----------
     cause
-        What that says of the recording, where the error ends the use of its index.
+        The damage of the recording, if the error makes its index unusable.
     """
 
     def __init__(self, text: str, cause: Cause = Cause.INDEX_DAMAGED) -> None:
@@ -99,7 +99,7 @@ class DamagedError(Exception):
 
 
 def unpack(compression: str, packed: bytes, size: int) -> bytes:
-    """Unpack a chunk, or as much of it as is there, never beyond the size it claims.
+    """Unpack a chunk, or its beginning if it is cut, up to the size that it claims.
 
     Raises
     ------
@@ -120,7 +120,7 @@ def unpack(compression: str, packed: bytes, size: int) -> bytes:
         if compression == "zstd":
             content: bytes = zstd().ZstdDecompressor().decompress(packed, max_length=size)
             return content
-    except Exception as err:  # each library has its own, and none is a fault of ours
+    except Exception as err:  # each library has its own errors
         raise DamagedError(f"a chunk cannot be unpacked ({err})") from None
     raise DamagedError(f"unknown compression '{compression[:20]}'")
 
@@ -139,7 +139,7 @@ def unsigned(buffer: Bytes, at: Index, size: int) -> Index:
 
 
 def block_of(times: Sequence[int], payloads: Sequence[bytes]) -> Block:
-    """Return a block of messages that were read one by one."""
+    """Return messages as one block."""
     lengths = np.array([len(payload) for payload in payloads], dtype=np.int64)
     end = np.cumsum(lengths)
     content = np.frombuffer(b"".join(payloads), dtype=np.uint8)
@@ -152,20 +152,20 @@ Entries = Mapping[int, tuple[Index, Index]]
 
 @dataclass(frozen=True)
 class Chunk:
-    """A chunk of a file, in which messages of several connections are packed together.
+    """A chunk of a file with messages of several connections.
 
     Attributes
     ----------
     position, length
-        Where its data lie in the file, and how many bytes.
+        Of its data in the file, in bytes.
     held
-        Connection -> the messages in the chunk, or what else says that there are any.
+        Connection -> its number of messages in the chunk, or another mark of their presence.
     start, end
-        s since 1970 of the first and the last message; None where no index says so.
+        s since 1970 of the first and the last message; None without an index.
     compression, size
-        How its data are packed, and their bytes when unpacked.
+        The compression of its data, and their unpacked bytes.
     entries
-        Its messages, where the chunk was walked; empty leaves them to its index.
+        Its messages, if the chunk was walked; else they are in its index.
     """
 
     position: int
@@ -183,7 +183,7 @@ class Chunk:
         return self.compression not in ("none", "")
 
     def holding(self, rows: Mapping[int, Sequence[tuple[int, int]]]) -> Chunk:
-        """Return the chunk with what walking it found: connection -> times and offsets."""
+        """Return the chunk with the messages of a walk: connection -> times and offsets."""
         tables = {number: np.array(held, dtype=np.int64).T for number, held in rows.items()}
         last = max((int(time.max()) for time, _ in tables.values()), default=None)
         return replace(
@@ -195,37 +195,37 @@ class Chunk:
 
 
 RecordContent = Chunk | tuple[int, int] | None
-"""What a record is: a chunk, a message (its connection, and ns), or something else."""
+"""A chunk, a message (its connection, and ns), or another record."""
 Record = tuple[int, int, RecordContent]
-"""Where a record begins and ends, and what it is."""
+"""Begin, end and content of a record."""
 
 
 @dataclass
 class ChunkedFile(Container):
-    """A container of chunks: read by its indexes, or walked from the front where they are lost.
+    """A container of chunks: read by its indexes, or walked from the front without them.
 
-    Messages outside of chunks count as chunks of some thousands.
+    Messages outside of chunks become chunks of some thousands.
     """
 
     _chunks: list[Chunk] = field(default_factory=list)
 
     @abstractmethod
     def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
-        """Return the messages of a chunk as the index behind it has them."""
+        """Return the messages of a chunk from the index after it."""
 
     @abstractmethod
     def _records(self, data: Content, at: int) -> Iterator[Record]:
-        """Yield records from a place on, as far as they can be followed; the last may be cut.
+        """Yield the records from a position on, up to damage; the last may be cut.
 
-        Connections are learnt from theirs.
+        Connections are read on the way.
         """
 
     @abstractmethod
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
-        """Find the payloads of a connection's messages, whose records begin at some offsets."""
+        """Return the payloads of a connection's messages from the offsets of their records."""
 
     def _count_lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int | None:  # noqa: ARG002
-        """Return how many wanted messages some chunks held, where that is known."""
+        """Return how many wanted messages some chunks held; None if unknown."""
         return None
 
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
@@ -254,7 +254,7 @@ class ChunkedFile(Container):
             )
 
     def _locate(self, data: FileBytes, chunk: Chunk, wanted: list[int]) -> list[tuple[int, Block]]:
-        """Return the blocks of a chunk, by the index behind it or by walking it."""
+        """Return the blocks of a chunk, by the index after it or by a walk."""
         try:
             entries = chunk.entries or self._index(data, chunk)
         except DamagedError:
@@ -266,7 +266,7 @@ class ChunkedFile(Container):
         return [(n, self._block(content, n, *entries[n])) for n in entries if n in wanted]
 
     def _walked(self, data: FileBytes, chunk: Chunk) -> tuple[Chunk, int]:
-        """Return a chunk with what walking it finds in it, and how many bytes make no sense."""
+        """Return a chunk with the messages of a walk, and its number of damaged bytes."""
         content, rows, read = _unpacked(data, chunk), dict[int, list[tuple[int, int]]](), 0
         for at, end, found in self._records(content, 0):
             if end > len(content):
@@ -277,7 +277,7 @@ class ChunkedFile(Container):
         return chunk.holding(rows), len(content) - read
 
     def _walk(self, data: FileBytes, first: int, cause: Cause) -> None:
-        """Learn connections and chunks from front to end, count them, and note the damage."""
+        """Read connections and chunks from the front, count messages, and note the damage."""
         self._chunks, self.connections = [], {}
         loose: dict[int, list[tuple[int, int]]] = {}
         reached, lost = first, 0
@@ -311,7 +311,7 @@ class ChunkedFile(Container):
         )
 
     def _set_counts(self, counts: Mapping[int, int]) -> None:
-        """Tell the connections how many messages each has."""
+        """Set the number of messages of each connection."""
         self.connections = {
             number: replace(known, count=counts.get(number, 0))
             for number, known in self.connections.items()

@@ -1,9 +1,9 @@
-"""The SQLite container of ROS 2, read table by table without trusting it.
+"""The SQLite container of ROS 2, read as untrusted input.
 
-rosbags raises on a database that is cut ("disk image is malformed"); of the shipped circle flight
-cut at 70 % 19,506 of 28,007 messages are salvaged here. A view that answers forever ends after
-a bounded number of the database's steps. The fields of a 48 MB file are read in 0.66 s; rosbags
-only iterates over its raw messages in 0.36 s.
+rosbags raises on a database that is cut ("disk image is malformed"); here 19,506 of 28,007 messages
+of the shipped circle flight cut at 70 % are salvaged. An endless view stops after a bounded number
+of the database's steps. The fields of a 48 MB file take 0.66 s; rosbags takes 0.36 s for the raw
+messages alone.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.container import MAX_CHUNK_BYTES, Connection, Container, block_of
 from tuner.recordings.ros.messages import Block
 
-#: Messages that are decoded together, and their bytes.
+#: Messages and bytes that are decoded together.
 MESSAGES_PER_BLOCK = 16384
 BYTES_PER_BLOCK = 16 << 20
-#: Steps of the database's machine, in millions, after which a query is no honest one.
+#: Millions of steps of SQLite's virtual machine that a query may take.
 MAX_QUERY_STEPS = 5_000
-#: How often reading goes on behind a damaged page, each time twice as far behind it.
+#: Reading resumes so often after a damaged page, each time twice as far behind it.
 MAX_ATTEMPTS = 24
-#: What SQLite makes of a damaged file; it takes absurd sizes for a lack of memory.
+#: Errors of a damaged file; SQLite takes absurd sizes for a lack of memory.
 DAMAGE_ERRORS = (sqlite3.Error, MemoryError, OverflowError)
 
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
@@ -85,8 +85,7 @@ class Db3(Container):
     def _rows(self, query: str, values: tuple[int, ...]) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query in the order of their number.
 
-        Where a page of the database is damaged, reading goes on some rows later, each time twice
-        as many.
+        After a damaged page reading resumes some rows later, each time twice as many.
         """
         done, attempts = 0, 0
         reached: float | None = None
@@ -140,8 +139,8 @@ class Db3(Container):
 
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a database for reading only, in which nothing can act or go on forever."""
-    # A recorder that crashed leaves its last messages in a log beside the database.
+    """Open a database read-only, without triggers and with bounded queries."""
+    # A crashed recorder leaves its last messages in a write-ahead log.
     unfinished = path.with_name(path.name + "-wal").exists()
     how = "mode=ro" if unfinished else "mode=ro&immutable=1"
     steps = count(1)

@@ -1,10 +1,9 @@
-"""The MCAP container of ROS 2: read by its summary, or walked from the front where that is lost.
+"""The MCAP container of ROS 2: read by its summary, or from the front without one.
 
-rosbags raises on a file without its end ("File end magic is invalid"), and so does the mcap
-package's indexed reader; of the shipped circle flight cut in half 14,697 messages are salvaged
-here. The mcap package's stream reader finds as many, but spent over 25 s on a 1.6 MB file whose
-chunk claims 1 GiB, which is refused here in 0.3 s. Iterating over a 49 MB file takes the mcap
-package 2.6 s; its fields are read here in 0.28 s.
+rosbags and the mcap package's indexed reader raise on a file without its end; here 14,697 messages
+of the shipped circle flight cut in half are salvaged. The mcap package's stream reader finds as
+many, but spent over 25 s on a 1.6 MB file whose chunk claims 1 GiB, which is refused here in 0.3 s.
+Iterating over a 49 MB file takes the mcap package 2.6 s; its fields take 0.28 s here.
 """
 
 from __future__ import annotations
@@ -42,8 +41,8 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, CHUNK_INDEX, STATISTICS, DATA_EN
 
 #: Bytes of a message record before its payload: op, length, channel, sequence, two times.
 MESSAGE_HEAD_BYTES = 9 + 22
-#: Channel, sequence and time of a message. No true time is beyond 2^63: read with a sign, as in the
-#: indexes, a damaged one lies centuries before the others, and fits into an array.
+#: Channel, sequence and time of a message. The time is read with a sign, as in the indexes: a
+#: damaged one beyond 2^63 then fits into an array, centuries before the others.
 _HEAD = struct.Struct("<HIq")
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
@@ -57,7 +56,7 @@ _FORMATS = {
 class Mcap(ChunkedFile):
     """An MCAP file with ROS messages.
 
-    In its chunks ``held`` says where the index of a channel's messages lies.
+    The ``held`` of its chunks is the position of the index of a channel's messages.
     """
 
     _schemas: dict[int, tuple[str, MessageDefinition]] = field(default_factory=dict)
@@ -75,7 +74,7 @@ class Mcap(ChunkedFile):
             raise RecordingError(self.path, "holds no ROS messages", "record it again")
 
     def _read_summary(self, data: FileBytes) -> None:
-        """Learn channels and chunks from the end of the file."""
+        """Read channels and chunks from the end of the file."""
         end = max(0, len(data) - 37)
         footer = data[end : len(data)]
         if len(footer) != 37 or footer[-8:] != MAGIC or footer[:9] != b"\x02\x14" + bytes(7):
@@ -116,7 +115,7 @@ class Mcap(ChunkedFile):
             yield begin - 9, end, found
 
     def _read_definitions(self, op: int, content: bytes) -> None:
-        """Take in a schema or a channel."""
+        """Read a schema or a channel."""
         try:
             if op == SCHEMA:
                 (number,) = struct.unpack_from("<H", content)
@@ -167,7 +166,7 @@ def _string(content: bytes, at: int) -> tuple[str, int]:
 
 
 def _chunk(data: Content, begin: int, end: int) -> Chunk:
-    """Return a chunk by the head of its record's content, of which the end may be missing."""
+    """Return a chunk from the head of its record, whose end may be missing."""
     head = data[begin : begin + 40 + 16]
     try:
         (size,) = struct.unpack_from("<Q", head, 16)
@@ -180,7 +179,7 @@ def _chunk(data: Content, begin: int, end: int) -> Chunk:
 
 
 def _chunk_index(content: bytes, size: int) -> Chunk:
-    """Return a chunk by its entry in the summary of a file of some bytes."""
+    """Return a chunk from its entry in the summary of a file of `size` bytes."""
     try:
         start, end, position, length, indexes = struct.unpack_from("<QQQQI", content)
         held = dict(struct.iter_unpack("<HQ", content[36 : 36 + indexes]))

@@ -1,11 +1,10 @@
-"""ROS messages: definitions, where known ones hold the signals, and serialised ones to columns.
+"""ROS messages: their definitions, the fields of signals, and decoding into columns.
 
-rosbags decodes message by message, 5 s for the 308,077 messages of a 51 MB bag. The walk here takes
-0.2 s for all messages of a block at once, the wanted fields only, and gives the same bits. It goes
-through a message's type: numbers of known size, strings and sequences whose length stands before
-them, in CDR (ROS 2) with padding to each number's own size. It is the same for all messages of a
-topic, so it is done once for all of them, with a cursor for each message; where all lengths agree,
-as they nearly always do, the cursor is a single number.
+rosbags decodes message by message, 5 s for the 308,077 messages of a 51 MB bag. The walk here
+decodes the wanted fields of all messages of a block at once, to the same bits, in 0.2 s. It goes
+through the message's type: numbers of known size, and strings and sequences after their length, in
+CDR (ROS 2) with padding to each number's size. All messages of a topic share one walk, with a
+cursor each; where all lengths agree, as nearly always, the cursor is a single number.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.core.files import read_bytes
 from tuner.recordings.recording import FieldLayout, short_reason
 
-#: Fields of a message type in their order: name and rosbags' description of what it holds.
+#: Fields of a message type in their order: name and rosbags' description of its type.
 Fields = list[tuple[str, Any]]
 
-#: The longest honest definition is some 20 kB; beyond this a parser is only kept busy.
+#: The longest true definition is some 20 kB.
 MAX_DEFINITION_CHARS = 200_000
 
-#: Types of motion capture's own packages, which databases of ROS 2 Humble and before do not carry.
+#: Types of motion capture's packages, which databases of ROS 2 Humble and before lack.
 MOTION_CAPTURE = {
     "mocap4r2_msgs/msg/RigidBodies": (
         "std_msgs/Header header\nuint32 frame_number\nmocap4r2_msgs/RigidBody[] rigidbodies\n"
@@ -60,11 +59,11 @@ class Definitions:
     path
         The recording, named in errors.
     texts
-        Message type -> definition as the recording carries it.
+        Message type -> its definition in the recording.
     files
-        ``.msg`` files, or folders of them, for types that the recording does not carry.
+        ``.msg`` files, or folders of them, for types that the recording does not define.
     standard
-        Whether types that are nowhere defined may be taken from ROS 2's own packages.
+        Whether types that are nowhere defined are taken from ROS 2's own packages.
     """
 
     path: Path
@@ -114,14 +113,14 @@ def _parse(path: Path, text: MessageDefinition, kind: str) -> dict[str, Fields]:
         return _types(text.format, text.data, kind)
     except InputError:
         raise
-    except Exception as err:  # the parser meets hostile text and has no common error class
+    except Exception as err:  # the parser has no common error class
         what = f"the definition of {kind} makes no sense ({short_reason(err)})"
         raise RecordingError(path, what, "record it again") from None
 
 
 @lru_cache(maxsize=64)
 def _types(form: MessageDefinitionFormat, text: str, kind: str) -> dict[str, Fields]:
-    """Return the fields of the types in a text; recordings of a day have the same ones."""
+    """Return the fields of the types in a text, cached for further recordings."""
     idl = form is MessageDefinitionFormat.IDL
     types = get_types_from_idl(text) if idl else get_types_from_msg(text, kind)
     return {name: fields for name, (_, fields) in types.items()}
@@ -174,8 +173,8 @@ _VECTOR = {
     "acceleration": _layout("vector"),
 }
 
-#: Message type -> signal -> where it is, fields in the order of the signal's columns. Whether a
-#: twist is written in world or body axes depends on the topic: it is checked against the motion.
+#: Message type -> signal -> its fields, in the order of the signal's columns. The axes of a twist,
+#: world or body, depend on the topic and are checked against the motion.
 FIELD_LAYOUTS: Mapping[str, Mapping[str, FieldLayout]] = {
     "geometry_msgs/msg/PoseStamped": _pose("pose."),
     "geometry_msgs/msg/PoseWithCovarianceStamped": _pose("pose.pose."),
@@ -238,7 +237,7 @@ Bytes = NDArray[np.uint8]
 Index = NDArray[np.int64]
 Cursor = int | Index
 
-#: Nothing honest nests deeper, or holds more structures in an array before a wanted field.
+#: Types nest no deeper, and no array before a wanted field holds more structures.
 MAX_DEPTH = 12
 MAX_ELEMENTS = 256
 
@@ -267,9 +266,9 @@ class Block:
     Attributes
     ----------
     start, end
-        (n,) where each message's payload begins and ends in the buffer.
+        (n,) positions in the buffer at which each message's payload begins and ends.
     time
-        (n,) ns, when each was recorded.
+        (n,) ns, their times of recording.
     """
 
     buffer: Bytes
@@ -279,9 +278,9 @@ class Block:
 
 
 def missing_fields(definitions: Definitions, kind: str, fields: Sequence[str]) -> tuple[str, ...]:
-    """Return those of some fields that messages of a type do not have, or that cannot be reached.
+    """Return the fields that messages of a type do not have, or that cannot be reached.
 
-    A walk through no messages tells.
+    It walks through the type without messages.
 
     Raises
     ------
@@ -299,16 +298,15 @@ def decode(
 ) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
     """Return the wanted fields of a block's messages, (n,) each, and which messages were whole.
 
-    Numbers keep the kind that they were written with, except that elements of sequences become
-    floats, NaN where the sequence is too short. A message that ends before its last wanted field
-    is not whole; its numbers mean nothing.
+    Numbers keep their type; elements of sequences become floats, NaN where the sequence is too
+    short. A message that ends before its last wanted field is not whole; its numbers are invalid.
 
     Parameters
     ----------
     fields
-        Paths that `missing_fields` finds.
+        Paths that are not `missing_fields`.
     aligned
-        Whether numbers are padded to their size, as CDR has it.
+        Whether numbers are padded to their size, as in CDR.
     """
     count = len(block.start)
     whole, little, head = np.ones(count, dtype=np.bool_), np.ones(count, dtype=np.uint8), 0
@@ -336,7 +334,7 @@ def decode(
 
 @dataclass(frozen=True)
 class _Messages:
-    """Where some messages start and end in a buffer, and their rows; (n,) each."""
+    """Start, end and row of some messages in a buffer; (n,) each."""
 
     start: Index
     end: Index
@@ -354,15 +352,15 @@ class _Walker:
     Attributes
     ----------
     wanted
-        Paths that were not come by yet.
+        Paths that are not reached yet.
     whole
-        (n,) whether a message held all that was come by.
+        (n,) whether a message holds all fields so far.
     order
-        Of bytes, as NumPy writes it.
+        Of bytes, in NumPy's code.
     columns
         Path -> (n,) numbers.
     steps_left
-        Values that are walked through at most: types may multiply.
+        Values left to visit: nested types may multiply.
     """
 
     definitions: Definitions
@@ -375,7 +373,7 @@ class _Walker:
     steps_left: int = 100_000
 
     def walk(self, what: Any, path: str, of: _Messages, cursor: Cursor, depth: int) -> Cursor:
-        """Walk through one value from a place behind the messages' starts; return that behind it.
+        """Walk through one value at an offset from the messages' starts; return the next offset.
 
         Parameters
         ----------
@@ -415,14 +413,14 @@ class _Walker:
         return cursor
 
     def _stop(self, of: _Messages) -> None:
-        """Let nothing more be found: what comes next in the type cannot be walked through."""
+        """Stop the walk at a part of the type that cannot be visited."""
         self.steps_left = 0
         self.whole[of.rows] = False
 
     def _numbers(
         self, kind: str, names: Mapping[int, str], count: int, of: _Messages, cursor: Cursor
     ) -> Cursor:
-        """Walk through some numbers of one kind; ``names`` maps places among them to paths."""
+        """Walk through numbers of one kind; ``names`` maps positions among them to paths."""
         size = int(kind[1])
         cursor = self._align(cursor, size)
         for position, path in names.items():
@@ -432,7 +430,7 @@ class _Walker:
         return cursor + count * size
 
     def _sequence(self, kind: str, path: str, of: _Messages, cursor: Cursor) -> Cursor:
-        """Walk through numbers with their count before them; a string is one of bytes."""
+        """Walk through a sequence of numbers after its count; a string is one of bytes."""
         count, cursor = self._length(of, cursor)
         size = int(kind[1])
         # An empty sequence is not padded.
@@ -452,10 +450,10 @@ class _Walker:
     def _structures(
         self, element: Any, path: str, of: _Messages, cursor: Cursor, depth: int
     ) -> Cursor:
-        """Walk through structures or strings with their count before them."""
+        """Walk through a sequence of structures or strings after its count."""
         counts, cursor = self._length(of, cursor)
         at = np.zeros(len(of.rows), dtype=np.int64) + cursor
-        # Each element takes at least a byte, and nobody walks through more than MOST of them.
+        # Each element takes at least a byte, and the walk visits at most MAX_ELEMENTS.
         absurd = counts > np.minimum(of.end - of.start - at, MAX_ELEMENTS)
         self.whole[of.rows[absurd]] = False
         counts = np.where(absurd, 0, counts)
@@ -477,7 +475,7 @@ class _Walker:
         return length, cursor + 4
 
     def _advance(self, cursor: Cursor, by: Index, of: _Messages) -> Cursor:
-        """Move on by a length from the file, one number again if all lengths agree."""
+        """Move the cursor on by lengths from the file; it stays one number if all agree."""
         if len(by) == 0:
             return cursor
         beyond = of.start + cursor + by > of.end
@@ -494,7 +492,7 @@ class _Walker:
         return (cursor + size - 1) // size * size
 
     def _take(self, at: Index, end: Index, kind: str, rows: Index) -> NDArray[Any]:
-        """Read one number of each message; those beyond a message's end make it not whole."""
+        """Read one number of each message; a message that ends before it is not whole."""
         size = int(kind[1])
         inside = (at >= 0) & (at + size <= end) & (at + size <= len(self.buffer))
         if not inside.all():

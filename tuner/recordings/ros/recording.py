@@ -1,4 +1,4 @@
-"""A ROS recording of any container, or a folder of them: topics, and wanted fields as arrays."""
+"""A ROS recording in any container, or a folder of them."""
 
 from __future__ import annotations
 
@@ -52,8 +52,8 @@ from tuner.recordings.ros.messages import (
     missing_fields,
 )
 
-#: Files compressed as a whole are unpacked to so many times their size, and to so many bytes if
-#: they are small: flights do not come to more.
+#: A file compressed as a whole is unpacked to at most so many times its size, or to so many bytes
+#: if it is small: flights need no more.
 MAX_UNPACK_RATIO, MIN_UNPACK_LIMIT = 100, 1 << 30
 
 
@@ -106,7 +106,7 @@ class Folder(Container):
             self.damage += container.damage[known:]
 
     def _metadata(self) -> tuple[list[str], str]:
-        """Return the files and the compression mode, from the metadata or from what lies there."""
+        """Return the files and the compression mode, from the metadata or else the folder."""
         path = self.path / "metadata.yaml"
         try:
             about: Any = read_yaml(path).data
@@ -146,9 +146,9 @@ class Folder(Container):
 
 
 def unpacked_block(block: Block) -> Block:
-    """Unpack messages that were compressed one by one; a damaged one becomes empty.
+    """Unpack messages that were compressed one by one, up to `MAX_CHUNK_BYTES` bytes.
 
-    So do those behind `MAX_CHUNK_BYTES` bytes.
+    A damaged one becomes empty.
     """
     payloads, room = [], MAX_CHUNK_BYTES
     for start, end in zip(block.start, block.end, strict=True):
@@ -161,7 +161,7 @@ def unpacked_block(block: Block) -> Block:
 
 
 def open_file(path: Path) -> Container:
-    """Open one data file of a ROS 2 recording by what it begins with."""
+    """Open one data file of a ROS 2 recording by its first bytes."""
     if not path.is_file():
         raise DamagedError(f"{path.name} is no file")
     with path.open("rb") as stream:
@@ -173,7 +173,7 @@ _SECONDS, _NANOSECONDS = "header.stamp.sec", "header.stamp.nanosec"
 
 
 def open_container(path: Path) -> Container:
-    """Open the container of a ROS recording by what it begins with."""
+    """Open the container of a ROS recording by its first bytes."""
     if path.is_dir():
         return Folder(path)
     with path.open("rb") as stream:
@@ -205,7 +205,7 @@ class RosRecording(Recording):
         )
 
     def field_layout(self, topic: str, signal: str) -> FieldLayout | None:
-        """Return where messages of this topic's type hold a signal."""
+        """Return the fields that hold a signal in messages of this topic's type."""
         kind = self._kind(topic)
         if kind.startswith("px4_msgs/"):
             in_log = re.sub(r"(?<!^)(?=[A-Z])", "_", kind.rpartition("/")[2]).lower()
@@ -217,7 +217,7 @@ class RosRecording(Recording):
         return [name for name, _ in self._type(topic) or ()]
 
     def missing_fields(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
-        """Return those of some fields that a topic's messages do not have."""
+        """Return the fields that a topic's messages do not have."""
         try:
             return self._missing(self._kind(topic), fields)
         except RecordingError:
@@ -262,7 +262,7 @@ class RosRecording(Recording):
         return missing_fields(self._definitions, kind, fields)
 
     def _plan(self, connection: Connection, request: Request) -> tuple[list[str], Clock | None]:
-        """Return the fields to read, those of the time among them, and which one that is."""
+        """Return the fields to read, with those of the time, and the clock (None: the header)."""
         kind, fields = connection.type, list(request.fields)
         clock = next((c for c in request.clocks if not self._missing(kind, (c.field,))), None)
         if clock is not None:
