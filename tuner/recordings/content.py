@@ -47,6 +47,7 @@ from tuner.recordings.unit_detection import (
     unit_by_range,
     unit_of,
     unit_of_angles,
+    units_of_references,
 )
 from tuner.vehicle.motor_orders import columns_of, motor_order_of, order_in_words
 
@@ -290,11 +291,12 @@ def _clean(raw: Mapping[str, RawSignal]) -> tuple[dict[str, Series], int, list[N
     series, units = {}, list[Note]()
     notes: dict[tuple[object, ...], Note] = {}
     recorded = {signal: data.in_seconds(epoch) for signal, data in raw.items()}
-    scales = scales_of(recorded)
+    read = {s: unit_of(s, raw[s].topic, scale) for s, scale in scales_of(recorded).items()}
+    read |= units_of_references(recorded, read)
     for signal, data in raw.items():
         seconds, measured = recorded[signal].time, recorded[signal].values
-        if signal in scales:
-            unit, read_so = unit_of(signal, data.topic, scales[signal])
+        if signal in read:
+            unit, read_so = read[signal]
             measured = to_si(measured, unit)
             units += [] if read_so is None else [replace(read_so, count=len(seconds))]
         time, values, dropped = clean(signal, data.topic, seconds, measured)

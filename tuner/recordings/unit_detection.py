@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,7 @@ UNITS: Mapping[str, tuple[float, float]] = {
     "mg": (9.80665e-3, 0.0),
     "mm": (1e-3, 0.0),
     "cm": (1e-2, 0.0),
+    "ft": (0.3048, 0.0),
     "mV": (1e-3, 0.0),
     "percent": (1e-2, 0.0),
     "pwm_us": (1e-3, -1.0),
@@ -120,7 +121,7 @@ ATTITUDE_READINGS = (
 
 LENGTH_SIGNALS = {"position": False, "velocity": True}
 """Signals that may be in another unit than metres -> whether they are speeds."""
-LENGTH_UNITS = {"cm": "in centimetres", "mm": "in millimetres"}
+LENGTH_UNITS = {"ft": "in feet", "cm": "in centimetres", "mm": "in millimetres"}
 """Units of length that are inferred -> their phrase in a sentence."""
 
 BIN_S = 0.1
@@ -255,6 +256,28 @@ def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
             return unit, Note(NoteCode.UNIT_READ, topic=topic, names=(signal, name))
     numbers = {"times": scale.per_metre}
     return "si", Note(NoteCode.UNIT_DOUBTED, topic=topic, numbers=numbers, names=(signal,))
+
+
+def units_of_references(
+    recorded: Mapping[str, RawSeries], read: Mapping[str, tuple[str, Note | None]]
+) -> dict[str, tuple[str, Note | None]]:
+    """Return the unit of each reference that is in the unit of the position, as of `unit_of`.
+
+    It is where the reference's size is nearer to that of the position as recorded than in metres.
+    """
+    unit, note = read.get("position", ("si", None))
+    if note is None or unit == "si" or "reference_position" not in recorded:
+        return {}
+    names = ("position", "reference_position")
+    flown, wanted = (math.sqrt(np.nanmean(np.square(recorded[name].values))) for name in names)
+    if wanted < flown * math.sqrt(UNITS[unit][0]):
+        return {}
+    lengths = WORLD_SIGNALS - set(LENGTH_SIGNALS)
+    return {
+        name: (unit, replace(note, names=(name, note.names[1])))
+        for name in recorded
+        if name in lengths
+    }
 
 
 def scale_of(lengths: RawSeries, attitude: RawSeries, *, speeds: bool = False) -> Scale:

@@ -26,7 +26,7 @@ from tuner.recordings.unit_detection import (
 
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", Path(__file__).parents[4] / "shared" / "flights"))
 FILES = sorted((REAL / "nanobench").glob("*.csv"))
-PER_METRE = {"si": 1.0, "cm": 100.0, "mm": 1000.0}
+PER_METRE = {"si": 1.0, "ft": 1 / 0.3048, "cm": 100.0, "mm": 1000.0}
 UNITS = pytest.mark.parametrize("unit", PER_METRE)
 
 
@@ -130,7 +130,7 @@ def test_an_attitude_in_another_order_tells_it_too(unit: str, recorded) -> None:
     }
 
 
-@pytest.mark.parametrize("per_metre", [3.28, 39.37])
+@pytest.mark.parametrize("per_metre", [10.0, 39.37])
 def test_a_unit_without_a_name_is_doubted(per_metre: float) -> None:
     signals = flight(1.5)
     position = RawSeries(signals["position"].time, per_metre * signals["position"].values)

@@ -152,6 +152,20 @@ def test_values_of(way: str, tmp_path: Path) -> None:
         assert flight.series[signal].values[0] == pytest.approx(16.4)
 
 
+@pytest.mark.parametrize("unit", [1.0, 0.3048, 0.01])
+def test_a_reference_is_read_in_the_unit_of_the_position(unit: float, tmp_path: Path) -> None:
+    """Where it was written in the same unit; a planner's may be in metres beside it."""
+    metres = ways.flown() | {f"ref_{axis}": ways.flown()[axis] for axis in ways.XYZ}
+    for own in (1.0, unit):
+        lengths = {axis: ways.flown()[axis] / unit for axis in ways.XYZ}
+        wanted = {f"ref_{axis}": ways.flown()[axis] / own for axis in ways.XYZ}
+        flight = read(tmp_path, ways.text(metres | lengths | wanted))
+        position, reference = (
+            flight.series[name].values for name in ("position", "reference_position")
+        )
+        assert reference == pytest.approx(position, abs=1e-6)
+
+
 @pytest.mark.parametrize("change", [lambda u: 47 + 1500 * u, lambda u: 10 * u, lambda u: 1e4 * u])
 def test_commands_in_no_certain_unit_are_dropped_with_a_warning(change, tmp_path: Path) -> None:
     flight = read(tmp_path, ways.changed({"command": change}))

@@ -145,6 +145,10 @@ VALUES: Mapping[str, tuple[Callable[[], str], str, str | None]] = {
         lambda: changed({axis: lambda p: 1000 * p for axis in ("x", "y", "z", "v")}),
         "position", "in millimetres",
     ),
+    "lengths in feet": (
+        lambda: changed({axis: lambda p: p / 0.3048 for axis in (*XYZ, "v")}),
+        "position", "in feet",
+    ),
     "position in centimetres": (
         lambda: changed({axis: lambda p: 100 * p for axis in XYZ}), "position", "in centimetres",
     ),
