@@ -25,6 +25,7 @@ from tuner.ground.rig_data import place_of, read_columns, swing_of
 from tuner.ground.stands import rpm_curve, stand
 from tuner.ground.step_response import step_response
 from tuner.vehicle import VehicleFile
+from tuner.vehicle.vehicle import ARM, size_of
 
 
 def names_of(experiments: Sequence[Experiment]) -> tuple[str, ...]:
@@ -61,16 +62,16 @@ def measure(  # noqa: PLR0911 (one return a kind)
             return yaw_spin(name, experiment, vehicle, folder)
         case Propeller():
             return propeller(name, experiment, folder)
-    path = place_of(folder, experiment.recording)
+    path, arm = place_of(folder, experiment.recording), ARM * size_of(vehicle).arm
     match experiment:
         case Bifilar(axis=axis):
             return bifilar(name, str(path), swing_of(path, axis), experiment, vehicle)
         case ThrustStand() | TorqueStand():
-            samples = read_columns(path, ("rotor_speed", "force"))
+            samples = read_columns(path, ("rotor_speed", "force"), arm=arm)
             return stand(name, str(path), samples, experiment, vehicle)
         case RpmCurve():
-            samples = read_columns(path, ("command", "rotor_speed"), ("voltage",))
+            samples = read_columns(path, ("command", "rotor_speed"), ("voltage",), arm=arm)
             return rpm_curve(name, str(path), samples, experiment)
         case StepResponse():
-            samples = read_columns(path, ("command", "rotor_speed"))
+            samples = read_columns(path, ("command", "rotor_speed"), arm=arm)
             return step_response(name, str(path), samples)

@@ -175,8 +175,8 @@ RPM = 2 * math.pi / 60
 """rad/s per revolution a minute."""
 FASTEST = 4000.0
 """rad/s that no rotor of a multirotor turns: a column beyond it holds revolutions a minute."""
-SLOWEST = 30.0
-"""rad/s below which a rotor that is measured at all does not turn: such rpm are rad/s, or Hz."""
+SLOWEST_TIP = 40.0
+"""m/s at the length of an arm that each propeller's fastest test exceeds: such rpm are rad/s."""
 FULL_COMMAND = 1.5
 VOLTS = (1.0, 100.0)
 """V of a battery."""
@@ -237,7 +237,7 @@ def open_table(path: Path) -> TabularRecording:
 
 
 def read_columns(
-    path: Path, wanted: tuple[str, ...], optional: tuple[str, ...] = ()
+    path: Path, wanted: tuple[str, ...], optional: tuple[str, ...] = (), *, arm: float = math.inf
 ) -> dict[str, Array]:
     """Return quantity -> (n,) samples in SI units, NaN where a cell holds no number.
 
@@ -247,6 +247,8 @@ def read_columns(
         A CSV or Parquet file.
     wanted, optional
         Quantities of `COLUMNS`; those that are optional may lack.
+    arm
+        m from the vehicle's centre to a rotor, which bounds its propeller.
 
     Returns
     -------
@@ -282,12 +284,12 @@ def read_columns(
     samples = {"time": time}
     for quantity, column in chosen.items():
         samples[quantity] = rows.fields[column] * COLUMNS[quantity][column]
-        _check_unit(path, quantity, column, samples[quantity])
+        _check_unit(path, quantity, column, samples[quantity], arm)
     stride = -(-len(time) // MOST)
     return {quantity: values[::stride] for quantity, values in samples.items()}
 
 
-def _check_unit(path: Path, quantity: str, column: str, values: Array) -> None:
+def _check_unit(path: Path, quantity: str, column: str, values: Array, arm: float) -> None:
     known = np.abs(values[np.isfinite(values)])
     if len(known) < FEWEST:
         raise RecordingError(path, f"column {column} holds hardly a number", "check the file")
@@ -296,8 +298,9 @@ def _check_unit(path: Path, quantity: str, column: str, values: Array) -> None:
         "rotor_speed": (
             (top > FASTEST, f"reaches {top:.0f} rad/s, too fast for a rotor",
              "name the column rpm if it holds revolutions a minute"),
-            (top < SLOWEST, f"stays below {top:.1f} rad/s, too slow for a rotor",
-             "name the column rotor_speed if it holds rad/s"),
+            (top * arm < SLOWEST_TIP,
+             f"stays below {top:.1f} rad/s, too slow for a rotor on an arm of {arm:.3g} m",
+             "name the column rotor_speed if it holds rad/s, and check the vehicle's rotors"),
         ),
         "angle": (
             (top > math.pi, f"reaches {top:.1f} rad, more than half a turn",

@@ -134,6 +134,8 @@ def hurried(columns):
         ([PENDULUM | {"wire_distance": 34}], "bifilar_x.csv", first(1500), "wire_distance is 34"),
         ([PENDULUM | {"wire_distance": 3.4}], "bifilar_x.csv", first(1500), "radius of gyration"),
         ([THRUST], "thrust.csv", renamed(rpm="rotor_speed"), "name the column rpm"),
+        ([THRUST], "thrust.csv", scaled(rpm=0.105), "on an arm of 0.25 m; name the column rotor_s"),
+        ([CURVE], "steps.csv", scaled(rpm=0.105), "on an arm of 0.25 m; name the column rotor_s"),
         ([THRUST], "thrust.csv", first(200), "steady levels of rotor speed"),
         ([THRUST | {"lever_ratio": 1423.1}], "thrust.csv", first(900), "the lever ratio"),
         ([STEP], "step.csv", hurried, "too short for a time constant"),
