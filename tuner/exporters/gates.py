@@ -145,12 +145,14 @@ def _on_bounds(run: Run) -> list[str]:
     objections = []
     for name, coefficient in run.result.coefficients.items():
         lower, upper = coefficient.lower, coefficient.upper
-        if not coefficient.fitted or coefficient.best == coefficient.initial:
-            continue  # the run held it at its initial value, which may well be a bound
+        if not coefficient.fitted:
+            continue
         span = upper - lower if lower is not None and upper is not None else None
         for side, bound in (("lower", lower), ("upper", upper)):
             near = ON_BOUND * (abs(bound or 0.0) if span is None else span)
-            if bound is not None and abs(coefficient.best - bound) <= near:
+            if bound is None or abs(coefficient.initial - bound) <= near:
+                continue  # the search began there: a set-up without a delay has a latency of zero
+            if abs(coefficient.best - bound) <= near:
                 untold = coefficient.identifiable is False
                 to_do = f", and no flight tells it: --fix {name}" if untold else ""
                 objections.append(f"{name} {coefficient.best:g} is its {side} bound{to_do}")

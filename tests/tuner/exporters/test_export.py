@@ -177,10 +177,11 @@ def test_a_flight_that_crashed_in_the_run_is_no_better_though_it_flies_again(mak
     assert [objection for gate in gates for objection in gate.objections] == ["held crashes"]
 
 
-def test_a_coefficient_that_the_run_held_may_lie_on_its_bound(make_run):
-    held = {"fitted": True, "identifiable": False, "lower": 0.0, "upper": 0.04}
-    run = make_run(coefficients={"actuator_latency": held})
-    assert run.result.coefficients["actuator_latency"].best == 0.0
+@pytest.mark.parametrize("best", [0.0, 3e-7])
+def test_a_coefficient_may_stay_at_the_bound_where_its_search_began(make_run, best):
+    stayed = {"fitted": True, "lower": 0.0, "upper": 0.04, "best": best}
+    run = make_run(coefficients={"actuator_latency": stayed})
+    assert run.result.coefficients["actuator_latency"].initial == 0.0
     assert all(gate.passed for gate in check(run, run.vehicle, as_the_run_says))
 
 
