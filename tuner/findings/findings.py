@@ -106,6 +106,14 @@ class Code(Worded):
         ),
         GIVE_VEHICLE,
     )
+    DSHOT_OR_PULSES = (
+        "dshot_or_pulses",  # pulses, dshot (times the weight)
+        (
+            "Its commands were taken for pulses of PWM, which lift {pulses:.2g} times the weight; "
+            "as DShot they would lift {dshot:.2g} times."
+        ),
+        "Give command its unit in the topic map: pwm_us or dshot.",
+    )
     LIFTS_OTHERWISE = (
         "lifts_otherwise",  # more (share); names: the signal, battery?
         sentences.lifts_otherwise,
@@ -224,6 +232,11 @@ class Code(Worded):
             "({plausible_lower:g} to {plausible_upper:g})."
         ),
         "Widen them.",
+    )
+    SETTINGS_UNUSED = (
+        "settings_unused",  # the subject: the coefficients
+        "The job file gives bounds, a scale or a prior, which have no effect: it is not fitted.",
+        "Free it (--fit, or free: in the job file), or leave these settings out.",
     )
     START_ON_BOUND = (
         "start_on_bound",  # bound, start

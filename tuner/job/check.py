@@ -16,7 +16,7 @@ from tuner.equation_error.recorded_accelerations import FEWEST, rows_of, steps_w
 from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import VOLTAGE
 from tuner.objective.inlets import INLETS, bypassed_by, sparse
-from tuner.objective.rotor_signals import Source, order_findings, squared_speed
+from tuner.objective.rotor_signals import Source, lifts_as_dshot, order_findings, squared_speed
 from tuner.objective.setpoints import setpoint_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.search.problem import Job
@@ -65,8 +65,10 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
         *_recorded_twice(job),
         *_not_given(job),
         *_wrong_vehicle(job),
+        *_commands_as_dshot(job),
         *_lifting_otherwise(job),
         *_excitation(job),
+        *_unused_settings(job),
         *_bounds(job),
         *_starts_on_bounds(job),
     )
@@ -164,6 +166,14 @@ def _wrong_vehicle(job: Job) -> Iterator[Finding]:
         if idle > IDLE * weight or full < weight:
             numbers = {"idle": idle, "full": full, "weight": weight, "mass": vehicle.mass}
             yield Finding(Code.CANNOT_HOVER, "warning", vehicle.name, numbers)
+
+
+def _commands_as_dshot(job: Job) -> Iterator[Finding]:
+    """Warn of commands that were taken for pulses and carry the vehicle better as DShot."""
+    for flight in job.flights:
+        if lifts := lifts_as_dshot(flight, job.settings.vehicle):
+            numbers = dict(zip(("pulses", "dshot"), lifts, strict=True))
+            yield Finding(Code.DSHOT_OR_PULSES, "warning", flight.name, numbers)
 
 
 def _lift(flight: Flight, vehicle: VehicleFile) -> float:
@@ -290,6 +300,19 @@ def _spread(flight: Flight, axis: str) -> float:
         values = np.degrees(np.arcsin(np.clip(tilt, -1, 1)))
     low, high = np.nanquantile(values, [0.02, 0.98])
     return float(high - low)
+
+
+def _unused_settings(job: Job) -> Iterator[Finding]:
+    """Warn of settings of coefficients that are neither free nor looked for among the terms."""
+    asked = job.given.job
+    unused = [
+        name
+        for name in asked.coefficients
+        if name not in job.space.free
+        and (asked.terms == "none" or not COEFFICIENTS[name].is_optional)
+    ]
+    if unused:
+        yield Finding(Code.SETTINGS_UNUSED, "warning", ", ".join(unused))
 
 
 def _bounds(job: Job) -> Iterator[Finding]:

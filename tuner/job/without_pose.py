@@ -202,6 +202,9 @@ def _left_open(settings: Settings, names: Sequence[str]) -> tuple[Finding, ...]:
         Finding(Code.SCALES_WITH_MASS, "info", "mass", mass, scaled),
         Finding(Code.NO_TACHOMETER, "info", "input_scaling"),
     ]
+    if settings.job.coefficients:
+        unused = ", ".join(settings.job.coefficients)
+        findings.append(Finding(Code.SETTINGS_UNUSED, "warning", unused))
     if "moment_constant" in names:
         findings.append(Finding(Code.YAW_OPEN, "info", "inertia_zz"))
     if settings.origin.get("vehicle", "").startswith("default"):

@@ -25,7 +25,7 @@ from tuner.recordings.content import PER_MOTOR
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.interpolation import resample
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.unit_detection import UNITS
+from tuner.recordings.unit_detection import UNIT_PHRASES, UNITS, to_si
 from tuner.vehicle import VehicleFile
 from tuner.vehicle.motor_orders import columns_of
 
@@ -342,6 +342,29 @@ def commands_of(wrench: Array, vehicle: VehicleFile) -> Array:
     root = np.sqrt(np.maximum(linear * linear + 4.0 * square * speed, 0.0))
     shifted = 2.0 * speed / (linear + root)  # of square·u² + linear·u = speed, stable at 0
     return np.asarray(np.maximum(shifted - motor.input_offset, 0.0))
+
+
+CARRIES = 1.25
+"""Times the weight that commands may lift, or less, in their unit."""
+
+
+def lifts_as_dshot(flight: Flight, vehicle: VehicleFile) -> tuple[float, float] | None:
+    """Return what commands lift as pulses and as DShot, over the weight, where that is in doubt.
+
+    Between 1000 and 2000 nothing else tells the two apart. None where commands were not taken for
+    pulses by their range, or pulses carry the vehicle, or better than DShot does.
+    """
+    read = ("command", UNIT_PHRASES["pwm_us"])
+    if not any(n.code is NoteCode.UNIT_READ and n.names == read for n in flight.notes):
+        return None
+    pulses = flight.signals["command"]
+    force = vehicle.aerodynamics.motor_constant / (vehicle.mass * GRAVITY)
+    lift, other = (
+        force * float(np.nanmean(squared_speed(vehicle, "command", u).sum(axis=1)))
+        for u in (pulses, to_si(1e3 * (1.0 + pulses), "dshot"))
+    )
+    off = abs(math.log(lift))
+    return (lift, other) if off > max(abs(math.log(other)), math.log(CARRIES)) else None
 
 
 SPEED_UNITS = {"si": "in rad/s", "rpm": "in revolutions a minute", "hz": "in revolutions a second"}

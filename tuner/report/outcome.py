@@ -40,7 +40,12 @@ NOT_FLOWN = frozenset(
     }
 )
 """Warnings of vehicles and controllers that did not fly, on which a simulation may fail."""
-OTHER_INPUTS = NOT_FLOWN | {Code.MASS_NOT_GIVEN, Code.SAME_RECORDING, Code.LIFTS_OTHERWISE}
+OTHER_INPUTS = NOT_FLOWN | {
+    Code.MASS_NOT_GIVEN,
+    Code.SAME_RECORDING,
+    Code.LIFTS_OTHERWISE,
+    Code.DSHOT_OR_PULSES,
+}
 """Warnings that what was given is not what flew: all numbers follow from that."""
 CONFLICTS = OTHER_INPUTS | {Code.GROUND_CONFLICT, Code.BENCH_CONFLICT}
 """Warnings that inputs or measurements contradict what flew: the next step is to settle them."""

@@ -118,6 +118,10 @@ MADE = {
         Code.VEHICLE_NOT_GIVEN, "warning", "hovergames", {"mass": 2.079}
     ),
     Code.SAME_RECORDING: Finding(Code.SAME_RECORDING, "warning", "b", names=("a",)),
+    Code.DSHOT_OR_PULSES: Finding(
+        Code.DSHOT_OR_PULSES, "warning", "a", {"pulses": 0.52, "dshot": 0.97}
+    ),
+    Code.SETTINGS_UNUSED: Finding(Code.SETTINGS_UNUSED, "warning", "mass"),
     Code.MASS_NOT_GIVEN: Finding(Code.MASS_NOT_GIVEN, "warning", "crazyflie", {"mass": 0.03}),
     Code.STILL_AXES: Finding(Code.STILL_AXES, "warning", "excitation", names=("x", "roll")),
     Code.NO_YAW: Finding(Code.NO_YAW, "warning", "excitation", {"rate": 0.1}),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.config import JobFile, Options, settle
-from tuner.config.job import FlightSettings, Search
+from tuner.config.job import CoefficientSettings, FlightSettings, Search
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.comparison import Comparison
@@ -14,6 +14,8 @@ from tuner.findings.findings import Code
 from tuner.job.check import check_information, check_recordings
 from tuner.job.listener import Listener
 from tuner.job.run import run
+from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.unit_detection import UNIT_PHRASES, UNITS, to_si
 from tuner.search.estimation import search
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
@@ -126,6 +128,32 @@ def test_a_flight_of_another_payload_is_named(full_flight, full_bag, updated, li
     assert [tuple(one.subject.split(", ")) for one in said] == ([] if named is None else [named])
     for one in said:
         assert one.numbers["more"] == pytest.approx(lifts - 1.0, abs=0.01)
+
+
+def test_settings_of_coefficients_that_are_not_fitted_are_named(full_flight, full_bag, updated):
+    job = job_through("actuator", full_flight, full_bag, updated)
+    bounded = CoefficientSettings(lower=1.0, upper=2.0)
+    given = dict.fromkeys((*FREE, "mass", "fuselage_drag"), bounded)
+    for terms, unused in (("auto", "mass"), ("none", "mass, fuselage_drag")):
+        asked = job.settings.job.replace(coefficients=given, terms=terms)
+        said = check_recordings(replace(job, settings=replace(job.settings, job=asked)))
+        (found,) = (one for one in said if one.code is Code.SETTINGS_UNUSED)
+        assert found.subject == unused
+
+
+@pytest.mark.parametrize("unit", ["dshot", "pwm_us"])
+def test_steps_of_dshot_that_were_taken_for_pulses_are_named(unit, full_flight, full_bag, updated):
+    factor, offset = UNITS[unit]
+    command = (full_flight.signals["command"] - offset) / factor  # as logged
+    taken = to_si(command, "pwm_us")
+    note = Note(NoteCode.UNIT_READ, "warning", names=("command", UNIT_PHRASES["pwm_us"]))
+    signals = full_flight.signals | {"command": taken}
+    read = replace(full_flight, signals=signals, notes=(note,))
+    job = job_through("rotor_speed", read, full_bag, updated)
+    said = [one for one in check_recordings(job) if one.code is Code.DSHOT_OR_PULSES]
+    assert len(said) == (unit == "dshot")
+    for one in said:
+        assert one.numbers["dshot"] == pytest.approx(1.0, abs=0.15)
 
 
 def test_a_mass_that_no_user_gave_is_named(full_flight, full_bag, updated):
