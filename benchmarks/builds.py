@@ -25,7 +25,7 @@ from tuner.recordings.states import initial_state
 from tuner.search.job_flights import read_usable
 from tuner.search.problem import job_of
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
-from tuner.uncertainty.identifiability import with_undetermined_held
+from tuner.uncertainty.identifiability import hold_undetermined
 
 INLET: InletName = "actuator"
 """What the commanded thrust and torque ask of the motors."""
@@ -83,7 +83,7 @@ def _predicted(path: Path, mass: float) -> dict[str, list[Predictions]]:
         selected = search_with_terms(
             job, Path(name), resume=False, on_progress=lambda *_: None, on_message=lambda _: None
         )
-        fitted, _ = with_undetermined_held(
+        fitted, _ = hold_undetermined(
             selected.job, selected.fitted, lambda *_: None, lambda _: None
         )
     best = vehicle_fitted(selected.job, fitted)

@@ -44,7 +44,7 @@ from tuner.search.progress import Fitted, Free, beginning, criterion_of, point_o
 from tuner.search.stages import plan
 from tuner.terms.candidates import with_terms
 from tuner.uncertainty.estimates import uncertainty_of
-from tuner.uncertainty.records import CALIBRATION, COVERAGE_LEVELS, Calibration, Held
+from tuner.uncertainty.records import CALIBRATION, COVERAGE_LEVELS, Calibration, CoverageRecord
 from tuner.vehicle.model import with_terms_computed
 
 DRAWS = int(os.environ.get("TUNE_CALIBRATION_DRAWS", "20"))
@@ -283,9 +283,9 @@ def _converged(sets: Sequence[Ranked]) -> list[Ranked]:
     return [ranked for ranked in sets if ranked.converged]
 
 
-def _held(name: str, sets: Sequence[Ranked]) -> Held:
+def _held(name: str, sets: Sequence[Ranked]) -> CoverageRecord:
     shares = {c: share_within((r.off[c] for r in sets), "95") for c in sets[0].off}
-    return Held(
+    return CoverageRecord(
         flights=name,
         sets=len(sets),
         intervals=sum(len(ranked.off) for ranked in sets),

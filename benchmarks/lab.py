@@ -40,10 +40,10 @@ from tuner.search.explanation import Explanation
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected
-from tuner.terms.refit_with_disturbances import examined
+from tuner.terms.refit_with_disturbances import refit_and_examine
 from tuner.terms.search_with_terms import search_with_terms
-from tuner.uncertainty.estimates import Estimate, Uncertainty, terms_shown
-from tuner.uncertainty.model_error import lack_found
+from tuner.uncertainty.estimates import Estimate, Uncertainty, term_findings
+from tuner.uncertainty.model_error import model_error_findings
 from tuner.vehicle import COEFFICIENTS, values_of
 
 SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))
@@ -275,7 +275,7 @@ def trial_of(seed: int) -> Trial:
         clock = time.process_time()
         selected = searched(job, Path(name))
         explanation = Explanation(lambda _: None)
-        selected, fitted, examination = examined(
+        selected, fitted, examination = refit_and_examine(
             selected, lambda *_: None, lambda _: None, explanation
         )
         seconds = time.process_time() - clock
@@ -292,8 +292,8 @@ def trial_of(seed: int) -> Trial:
         *said,
         *fitted.findings,
         *explanation.findings,
-        *lack_found(examination.lack, examination.uncertainty),
-        *terms_shown(fitted, examination.uncertainty),
+        *model_error_findings(examination.model_errors, examination.uncertainty),
+        *term_findings(fitted, examination.uncertainty),
     )
     trial = Trial(lab, found, free, {}, seconds, reference, said)
     volts = _voltages(selected.job.fitted, fitted.objective.schedule)

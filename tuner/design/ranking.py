@@ -34,7 +34,7 @@ from tuner.objective.segments import Measured, Segments
 from tuner.objective.trajectory import Published, at_speed, published
 from tuner.search.problem import SPIN_CHANNELS
 from tuner.search.progress import plain_criterion
-from tuner.uncertainty.covariance import WIDE
+from tuner.uncertainty.covariance import PRIOR_WIDENING
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.verdict import Verdict
 from tuner.vehicle import COEFFICIENTS
@@ -271,7 +271,7 @@ def rank_next_flights(
         inside = _inside(objective, jacobian.residuals, arena)
         gains += list(information.blocks.sum(axis=(0, 2)))
         flown += list(~information.crashed & inside)
-    now = examination.information.data + examination.information.prior / WIDE**2
+    now = examination.information.data + examination.information.prior / PRIOR_WIDENING**2
     names, fitted = tuple(examination.sensitivity.steps), examination.uncertainty
     count = len(fitted.names)
     verdicts = {name: fitted.estimates[name].verdict for name in fitted.names}

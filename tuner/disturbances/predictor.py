@@ -314,12 +314,12 @@ class Predictor:
         objective: Objective,
         point: Point,
         criterion: Criterion,
-        otherwise: Mapping[str, Objective] = MappingProxyType({}),
+        alternatives: Mapping[str, Objective] = MappingProxyType({}),
         by_strengths: Array | None = None,
     ) -> FisherInformation:
         """Return what the innovations of these flights say at a point, see `with_hidden`.
 
-        Its criterion gives no scales: innovations are whitened. ``otherwise``: what might be
+        Its criterion gives no scales: innovations are whitened. ``alternatives``: what might be
         simulated differently -> the problem so simulated; gains stay. With derivatives by the
         strengths (`Slopes.moved`) those are changes, too: see `with_strengths`.
         """
@@ -337,7 +337,7 @@ class Predictor:
             lambda there: flown(self, objective, there),
         )
         changed = {
-            name: flown(self.stepped(other), other, own) for name, other in otherwise.items()
+            name: flown(self.stepped(other), other, own) for name, other in alternatives.items()
         }
         if by_strengths is not None:
             moves = gathered(by_strengths, self.feed.widths, self.rows)
@@ -346,7 +346,7 @@ class Predictor:
                     channel: residuals + moves[channel][number]
                     for channel, residuals in jacobian.residuals.items()
                 }
-        return information_at(objective, own, unscaled(criterion), jacobian, otherwise=changed)
+        return information_at(objective, own, unscaled(criterion), jacobian, alternatives=changed)
 
     def stepped(self, other: Objective) -> Predictor:
         """Return the predictor of another problem: finer steps, pushed along, other readings."""

@@ -91,14 +91,14 @@ class Unexplained:
         The likeliest first.
     accelerations
         Of each flight (N, 6), m/s² and rad/s², body axes, what all of them make.
-    late
+    speed_lag
         s by which recorded rotor speeds come after the turning that they make: stamped late, or
         filtered; zero if that is chance.
     """
 
     laws: tuple[Law, ...]
     accelerations: tuple[Array, ...]
-    late: float = 0.0
+    speed_lag: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -270,10 +270,10 @@ def _nuisances(part: Steps, motion: _Motion, place: tuple[int, int], of_commands
     """
     number, flights = place
     table = np.zeros((len(motion.v), 6, 6 * flights + 12))
-    every, late = np.arange(6), np.arange(6 if of_commands else 3)
+    every, delayed = np.arange(6), np.arange(6 if of_commands else 3)
     table[:, every, 6 * number + every] = 1.0
     changes = np.gradient(motion.modelled, part.step, axis=0)
-    table[:, late, 6 * flights + late] = changes[:, late]
+    table[:, delayed, 6 * flights + delayed] = changes[:, delayed]
     tilted = np.column_stack([motion.modelled[:, 2], motion.w[:, :2]])
     for axis in (0, 1):
         columns = 6 * flights + 6 + 3 * axis + np.arange(3)

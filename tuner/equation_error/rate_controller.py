@@ -53,7 +53,7 @@ class Signals(NamedTuple):
     torque: Array
 
 
-class Answer(NamedTuple):
+class ControllerEstimate(NamedTuple):
     """How a gain compares with the file's.
 
     ``part`` is of `PARTS`; ``value`` the gain over the file's, or s by which an axis answers its
@@ -68,7 +68,9 @@ class Answer(NamedTuple):
     differs: bool
 
 
-def answers(recorded: Sequence[Signals], simulated: Sequence[Signals]) -> tuple[Answer, ...]:
+def estimate_controller(
+    recorded: Sequence[Signals], simulated: Sequence[Signals]
+) -> tuple[ControllerEstimate, ...]:
     """Return how each gain that flights tell compares with the file's.
 
     Parameters
@@ -80,7 +82,7 @@ def answers(recorded: Sequence[Signals], simulated: Sequence[Signals]) -> tuple[
     _share_lateness(known)
     told = sum(len(parts) for parts in known)
     return tuple(
-        Answer(
+        ControllerEstimate(
             name,
             part,
             one.value,

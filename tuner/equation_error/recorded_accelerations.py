@@ -28,7 +28,7 @@ and vibrations that a step would otherwise fold down to what it tells. A loop an
 it later than that by most of a rotor's lag."""
 GAP = 2.5
 """Gaps between samples beyond which a signal is unknown."""
-FEWEST = 100
+MIN_SAMPLES = 100
 """Known steps below which nothing is said."""
 
 Commands = tuple[Series, ...]
@@ -93,7 +93,7 @@ def steps_of(flight: Flight, *, input_late: float = 0.0, averaged: bool = False)
     if rotors is None:
         return None
     known = np.isfinite(rotors.values).all(axis=1)
-    if known.sum() < FEWEST:
+    if known.sum() < MIN_SAMPLES:
         return None
     rotors = Series(rotors.time[known] - input_late, rotors.values[known])
     return steps_with(flight, rotors, noise=_noise(rotors), averaged=averaged)
@@ -115,7 +115,7 @@ def steps_with(
     begin = max(0.0, gyro.time[0], rotors.time[0])
     end = min(flight.duration, gyro.time[-1], rotors.time[-1])
     count = int((end - begin) * rate)
-    if count < FEWEST:
+    if count < MIN_SAMPLES:
         return None
     edges = begin + np.arange(count + 1) / rate
     middle = 0.5 * (edges[1:] + edges[:-1])
@@ -150,7 +150,7 @@ def steps_with(
         noise=noise,
     )
     part = with_rotors(part, rotors)
-    return part if np.count_nonzero(part.known) >= FEWEST else None
+    return part if np.count_nonzero(part.known) >= MIN_SAMPLES else None
 
 
 def with_rotors(part: Steps, rotors: Series) -> Steps:
@@ -196,7 +196,7 @@ def read_commands(
         every, second = (_held(flight, recorded, rate, count) for count in (1, 2))
         part = steps_with(flight, rotor_response(model, every), noise=0.0)
         part = None if part is None else without_gaps_of(recorded, part)
-        if part is None or np.count_nonzero(part.known) < FEWEST:
+        if part is None or np.count_nonzero(part.known) < MIN_SAMPLES:
             return None
         steps.append(part)
         commands.append(every)

@@ -21,7 +21,7 @@ from tuner.ground.measurement import Curve, Measurement, Remark, error_of, value
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.joint_prior import JointPrior
 
-CONFLICT = 3.0
+CONFLICT_SE = 3.0
 """Standard errors apart beyond which two measurements of one number contradict each other."""
 UNKNOWN = 1e-11
 """Share of the best-known direction's information below which a direction is not measured."""
@@ -176,7 +176,7 @@ def _conflicts(
             expected = float(row @ predicted)
             error = float(np.sqrt(variance + row @ covariance @ row))
             deviation = (float(value) - expected) / error
-            if abs(deviation) > CONFLICT:
+            if abs(deviation) > CONFLICT_SE:
                 members = tuple(n for n, factor in zip(names, row, strict=True) if factor)
                 conflicts.append(
                     Conflict(left_out.experiment, members, float(value), expected, deviation)

@@ -19,7 +19,7 @@ from tuner.equation_error.recorded_accelerations import steps_fed
 from tuner.findings.findings import Code, Finding
 from tuner.objective.space import extended
 from tuner.search.problem import Job, job_of
-from tuner.terms.candidates import candidate_groups, start_of
+from tuner.terms.candidates import candidate_groups, neutral_values_of
 from tuner.vehicle import COEFFICIENTS, initial_values, with_values
 
 ENOUGH = 0.9
@@ -56,7 +56,7 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     if INFLOW not in (*job.space.free, *own.fixed):
         candidates[INFLOW] = (INFLOW,)
     names = [name for group in candidates.values() for name in group]
-    effects = start_of([n for n in (*names, *GAINS) if COEFFICIENTS[n].is_effect])
+    effects = neutral_values_of([n for n in (*names, *GAINS) if COEFFICIENTS[n].is_effect])
     given = initial_values(settings.vehicle, settings.controller, names)
     space = extended(job.space, [*names, *GAINS], settings.job, {**given, **effects})
     candidates.pop(ROTOR_INERTIA, None)

@@ -12,7 +12,7 @@ import numpy as np
 from sim_jax.constants import GRAVITY
 from sim_jax.control.mixer import ROTORS
 from tuner.core.numerics import Array, symmetric_eigen, unit_diagonal
-from tuner.equation_error.recorded_accelerations import FEWEST, rows_of, steps_with
+from tuner.equation_error.recorded_accelerations import MIN_SAMPLES, rows_of, steps_with
 from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import VOLTAGE
 from tuner.objective.inlets import INLETS, bypassed_by, sparse
@@ -235,7 +235,7 @@ def _hovering(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
     for source in get_args(Source):
         series = flight.series.get(source)
         known = None if series is None else np.isfinite(series.values).all(axis=1)
-        if series is None or known is None or known.sum() < FEWEST:
+        if series is None or known is None or known.sum() < MIN_SAMPLES:
             continue
         speeds = np.sqrt(squared_speed(vehicle, source, series.values[known]))
         steps = steps_with(flight, Series(series.time[known], speeds), noise=0.0)
@@ -245,7 +245,7 @@ def _hovering(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
         smooth = np.convolve(pull, np.full(SMOOTHED, 1.0 / SMOOTHED), "same")
         slow = np.linalg.norm(rows_of(steps.motion.velocity), axis=1) < SLOW
         hovers = steps.known & slow & (np.abs(smooth / GRAVITY - 1.0) < LEVEL)
-        if hovers.sum() >= FEWEST:
+        if hovers.sum() >= MIN_SAMPLES:
             squares = np.square(steps.rotor_speed[hovers]).sum()
             found[source] = float(pull[hovers].sum() / squares)
     return found

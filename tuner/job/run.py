@@ -58,17 +58,17 @@ from tuner.search.problem import Job, job_of
 from tuner.search.progress import Fitted, Progress
 from tuner.search.rotor_change import used_up_to_changes
 from tuner.terms.candidates import Selected
-from tuner.terms.refit_with_disturbances import Examined, examined
+from tuner.terms.refit_with_disturbances import ExaminedFit, refit_and_examine
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.uncertainty.estimates import (
-    NOT_WHAT_FLEW,
+    FLIGHTS_REFUTE,
     finer_than_steps,
     flights_refute,
-    terms_shown,
+    term_findings,
 )
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import ground_conflicts, sources_of
-from tuner.uncertainty.model_error import lack_found
+from tuner.uncertainty.model_error import model_error_findings
 from tuner.uncertainty.records import Sources
 from tuner.uncertainty.refits import bootstrap, cross_validate, jackknife_errors
 from tuner.vehicle import VehicleFile, with_values, write_vehicle
@@ -170,7 +170,7 @@ def _fit(
             validation,
             sources=sources,
             command=command,
-            selection=selected.rows_given(fitted.held),
+            selection=selected.rows_after_holding(fitted.held),
             effective=None if effective is None else effective.result,
             next_log=next_log,
         )
@@ -229,7 +229,7 @@ def _fitted(
     *,
     command: str,
     resume: bool,
-) -> tuple[Selected, Validation, Examined]:
+) -> tuple[Selected, Validation, ExaminedFit]:
     """Return where the search of a job ends, how it meets the flights, and how well that is known.
 
     What was found is written before it is examined.
@@ -255,14 +255,18 @@ def _fitted(
         )
         raise
     if found.refuted:
-        listener.on_doubt(NOT_WHAT_FLEW)
+        listener.on_doubt(FLIGHTS_REFUTE)
     vehicle = vehicle_fitted(found.job, found.fitted)
     validation = _flown(found.job, found.fitted, vehicle, listener)
-    rows = found.rows_given(found.fitted.held)
+    rows = found.rows_after_holding(found.fitted.held)
     result = result_of(found.job, found.fitted, None, validation, command=command, selection=rows)
     with span("results"):
         write_folder(folder, result, vehicle, found.job)
-    return found, validation, examined(found, on_progress, listener.on_message, explanation)
+    return (
+        found,
+        validation,
+        refit_and_examine(found, on_progress, listener.on_message, explanation),
+    )
 
 
 def _flown(job: Job, fitted: Fitted, vehicle: VehicleFile, listener: Listener) -> Validation:
@@ -290,8 +294,8 @@ def _known(
     uncertainty, known = examination.uncertainty, examination.known
     explanation.notice(flights_refute(uncertainty))
     explanation.notice(finer_than_steps(uncertainty))
-    explanation.notice(lack_found(examination.lack, uncertainty))
-    explanation.notice(terms_shown(fitted, uncertainty))
+    explanation.notice(model_error_findings(examination.model_errors, uncertainty))
+    explanation.notice(term_findings(fitted, uncertainty))
     sources: dict[str, Sources] = explanation.part(
         "ground measurements", partial(sources_of, fitted, uncertainty, known), {}
     )

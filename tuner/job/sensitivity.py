@@ -127,7 +127,7 @@ def examine_vehicle(
         fitted = replace(fitted, findings=(*logged, *noticed, *fitted.findings))
         on_message("simulating, and differentiating by every coefficient")
         examination = examine(
-            fitted, otherwise=alternatives_of(fitted.objective, fitted.point), at_minimum=False
+            fitted, alternatives=alternatives_of(fitted.objective, fitted.point), at_minimum=False
         )
         forget(out)
         _about(settings, job, fitted, command).write(out)

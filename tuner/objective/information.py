@@ -68,7 +68,7 @@ class FisherInformation:
         (K, K): what flights tell less for nuisances that all of them share; None without.
     changes
         What might be simulated differently -> (F, K) JᵀW times the change of the residuals.
-    in_doubt
+    selection_shifts
         (K,) how far the estimates would move with terms that were left out; None if none was tried.
     astray
         (F,) which segments of a closed loop crashed, or are `ASTRAY`; None where none can be.
@@ -90,7 +90,7 @@ class FisherInformation:
     ground: Array | None = None
     lost: Array | None = None
     changes: Mapping[str, Array] = field(default_factory=dict)
-    in_doubt: Array | None = None
+    selection_shifts: Array | None = None
     astray: NDArray[np.bool_] | None = None
     pull: Array | None = None
     nuisance_pull: Array | None = None
@@ -173,7 +173,7 @@ class FisherInformation:
             ground=None if self.ground is None else self.ground[square],
             lost=None if self.lost is None else self.lost[square],
             changes={name: change[:, indices] for name, change in self.changes.items()},
-            in_doubt=some(self.in_doubt),
+            selection_shifts=some(self.selection_shifts),
             pull=some(self.pull),
             nuisance_pull=some(self.nuisance_pull),
         )
@@ -288,7 +288,7 @@ def information_at(
     jacobian: Jacobian | None = None,
     *,
     offsets_fitted: NDArray[np.bool_] | None = None,
-    otherwise: Mapping[str, Mapping[str, Array]] = MappingProxyType({}),
+    alternatives: Mapping[str, Mapping[str, Array]] = MappingProxyType({}),
 ) -> FisherInformation:
     """Return the information at a point.
 
@@ -300,7 +300,7 @@ def information_at(
         There; it is evaluated by default.
     offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
-    otherwise
+    alternatives
         What might be simulated differently -> channel -> (n, k, F) residuals then.
     """
     jacobian = objective.jacobian(point, criterion) if jacobian is None else jacobian
@@ -314,7 +314,7 @@ def information_at(
     information = np.zeros((len(channels), segments, blocks, size, size))
     score = np.zeros((len(channels), segments, blocks, size))
     spread = np.ones((len(channels), segments))
-    changes = {name: np.zeros((segments, size)) for name in otherwise}
+    changes = {name: np.zeros((segments, size)) for name in alternatives}
     crashed = np.isfinite(np.asarray(jacobian.crash_time))
     for number, channel in enumerate(channels):
         columns = np.asarray(jacobian.columns[channel])
@@ -336,7 +336,7 @@ def information_at(
                     continue
                 information[number, segment, index] = curved
                 score[number, segment, index] = weighted @ error[inside].ravel()
-            for name, others in otherwise.items():
+            for name, others in alternatives.items():
                 change = others[channel][..., segment] / scale - error
                 changes[name][segment] += (robust * change).ravel() @ rows.reshape(-1, size)
             compared = (weight[..., segment] > 0) & np.any(rows != 0, axis=-1)

@@ -1,1 +1,1 @@
-"""Which terms beyond the base model a fit holds: by what they predict of flights left out."""
+"""Selection of terms beyond the base model, by their predictions of held-out flights."""

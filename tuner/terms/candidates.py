@@ -1,4 +1,4 @@
-"""Candidate terms: the groups that a fit may add, problems with them free, and what is selected."""
+"""Candidate terms: the groups that a fit may add, problems with them free, and the selection."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from tuner.objective.space import Space, extended
 from tuner.search.findings import findings_at
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, loop_of, with_loop
-from tuner.terms.score import EARNING
+from tuner.terms.score import ACCEPTED
 from tuner.vehicle import COEFFICIENTS, conditions, term_groups, values_of
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
-PRESENT = 0.5
-"""Probability a priori that a vehicle has an effect in a size that flights could tell."""
-STANDS_IN = 0.1
-"""That it has what one group describes as a whole and others, candidates beside it, one by one."""
+PRIOR_PRESENCE = 0.5
+"""Prior probability that a vehicle has an effect large enough to be seen: no preference."""
+PRIOR_PRESENCE_OF_LUMPED = 0.1
+"""The same for a lumped group: other candidates describe its effect term by term, more likely."""
 
 
 def candidate_groups(job: Job) -> Groups:
-    """Return the groups that may be added: no coefficient of theirs is given, free or fixed."""
+    """Return the groups none of whose coefficients is given, free or fixed."""
     given, groups = values_of(job.settings.vehicle), term_groups()
     taken = {*job.space.free, *job.settings.job.fixed}
     return {
@@ -38,12 +38,12 @@ def candidate_groups(job: Job) -> Groups:
     }
 
 
-def groups_around(objective: Objective, *, closed_loop: bool) -> Groups:
-    """Return the groups of what may surround each flight, that a fit may add.
+def condition_groups(objective: Objective, *, closed_loop: bool) -> Groups:
+    """Return the groups of per-flight conditions (wind, battery) that a fit may add.
 
-    They are nuisances with a value for each flight: the wind of flights that are flown whole in
-    their closed loop (over a window, the start explains as much), and there the decline of a
-    battery where no voltage was recorded.
+    They are nuisance parameters with a value for each flight: wind where flights are simulated
+    whole in closed loop (over a window, the initial state explains as much), and there a battery's
+    decline if no voltage was recorded.
     """
     if not closed_loop:
         return {}
@@ -57,7 +57,7 @@ def groups_around(objective: Objective, *, closed_loop: bool) -> Groups:
     }
 
 
-def groups_in(space: Space, others: Collection[str]) -> Groups:
+def free_groups(space: Space, others: Collection[str]) -> Groups:
     """Return the groups of terms that are wholly free, but for others."""
     return {
         group: names
@@ -66,27 +66,25 @@ def groups_in(space: Space, others: Collection[str]) -> Groups:
     }
 
 
-def names_in(groups: Groups) -> tuple[str, ...]:
-    """Return all that some groups hold: coefficients, and what surrounds each flight."""
+def names_of(groups: Groups) -> tuple[str, ...]:
+    """Return the names in some groups: coefficients and per-flight conditions."""
     return tuple(name for names in groups.values() for name in names)
 
 
-def coefficients_in(groups: Groups) -> tuple[str, ...]:
+def coefficients_of(groups: Groups) -> tuple[str, ...]:
     """Return the coefficients of some groups."""
-    around = conditions()
-    return tuple(name for name in names_in(groups) if name not in around)
+    return tuple(name for name in names_of(groups) if name not in conditions())
 
 
-def conditions_in(groups: Groups) -> tuple[str, ...]:
-    """Return what of some groups surrounds each flight."""
-    around = conditions()
-    return tuple(name for name in names_in(groups) if name in around)
+def conditions_of(groups: Groups) -> tuple[str, ...]:
+    """Return the per-flight conditions of some groups."""
+    return tuple(name for name in names_of(groups) if name in conditions())
 
 
 def groups_named(terms: Sequence[str], space: Space) -> Groups:
     """Return the groups, or coefficients, that a job file names and that are not free yet.
 
-    What surrounds a flight is none of them: it is estimated from the start of the search on.
+    Per-flight conditions are not among them: those are estimated from the start of the search.
     """
     groups = term_groups()
     named: dict[str, tuple[str, ...]] = {}
@@ -100,28 +98,25 @@ def groups_named(terms: Sequence[str], space: Space) -> Groups:
     return named
 
 
-def is_stand_in(group: str) -> bool:
-    """Return whether a group describes as a whole what other terms do one by one."""
+def is_lumped(group: str) -> bool:
+    """Return whether a group lumps effects that other terms describe one by one."""
     return any(COEFFICIENTS[name].stands_in for name in term_groups().get(group, ()))
 
 
-def presence_of(names: Collection[str]) -> float:
-    """Return the probability a priori that a vehicle has a group of these coefficients.
-
-    In a size that flights could tell: from what is as good as absent on.
-    """
+def prior_presence_of(names: Collection[str]) -> float:
+    """Return the prior probability that a vehicle has a group in a size that flights can show."""
     rows = [COEFFICIENTS[name] for name in names if name in COEFFICIENTS]
     if any(row.expected for row in rows):
         return 1.0
-    return STANDS_IN if any(row.stands_in for row in rows) else PRESENT
+    return PRIOR_PRESENCE_OF_LUMPED if any(row.stands_in for row in rows) else PRIOR_PRESENCE
 
 
 def reads_recording(group: str) -> bool:
-    """Return whether a group's law reads a recorded signal, which gusts do not shape."""
+    """Return whether a group's law reads a recorded signal: gusts cannot imitate it."""
     return any(COEFFICIENTS[name].reads for name in term_groups().get(group, ()))
 
 
-def start_of(names: Sequence[str]) -> dict[str, float]:
+def neutral_values_of(names: Sequence[str]) -> dict[str, float]:
     """Return the neutral value of each coefficient of a term."""
     values = {}
     for name in names:
@@ -137,7 +132,7 @@ def with_terms(
     """Return a problem with more coefficients free, and its point with them at neutral values."""
     if not names:
         return objective, point
-    space = extended(objective.space, names, job, start_of(names))
+    space = extended(objective.space, names, job, neutral_values_of(names))
     return replace(objective, space=space), Point(
         np.concatenate([np.asarray(point.coefficients), np.asarray(space.initial[-len(names) :])]),
         point.offsets,
@@ -145,14 +140,14 @@ def with_terms(
 
 
 def with_free(
-    job: Job, fitted: Fitted, names: Sequence[str], *, around: Sequence[str] = ()
+    job: Job, fitted: Fitted, names: Sequence[str], *, conditions_added: Sequence[str] = ()
 ) -> tuple[Job, Fitted]:
-    """Return job and fit with some coefficients free, at their neutral values.
+    """Return job and fit with more coefficients free, at their neutral values.
 
-    ``around`` is what surrounds each flight and is estimated from now on; it begins as nothing.
+    ``conditions_added`` names per-flight conditions to estimate from here on, starting at zero.
     """
     objective, point = with_terms(fitted.objective, fitted.point, names, job.settings.job)
-    objective, point = with_conditions(objective, point, around)
+    objective, point = with_conditions(objective, point, conditions_added)
     return (
         replace(
             job,
@@ -170,27 +165,27 @@ def with_groups(
     groups: Groups,
     fitted: Fitted,
     *,
-    said: Collection[Finding],
+    stale: Collection[Finding],
     vector: Mapping[str, float] | None = None,
 ) -> tuple[Job, Fitted]:
-    """Return a base job with some groups in it, and its fit at the numbers of another one.
+    """Return a base job with some groups added, and its fit at the values of another fit.
 
     Parameters
     ----------
     base
         Job and fit without any groups.
     groups
-        What is free beside the base model.
+        The groups to add.
     fitted
-        Where the fit with the groups is.
-    said
-        What that fit's findings say of its own coefficients.
+        The fit whose values are taken.
+    stale
+        Findings of ``fitted`` to replace: those about its coefficients.
     vector
-        Coefficient -> number of the search vector, where it is not the fit's own.
+        Coefficient -> value in the search vector; that of ``fitted`` by default.
     """
-    job, grown = with_free(*base, coefficients_in(groups), around=conditions_in(groups))
+    job, grown = with_free(*base, coefficients_of(groups), conditions_added=conditions_of(groups))
     vector = fitted.vector if vector is None else vector
-    there = replace(
+    moved = replace(
         fitted,
         objective=with_loop(grown.objective, loop_of(fitted.objective)),
         point=Point(
@@ -198,17 +193,18 @@ def with_groups(
             offsets_of(fitted, grown.objective),
         ),
     )
-    others = [finding for finding in fitted.findings if finding not in said]
-    return job, replace(there, findings=(*others, *findings_at(job, there)))
+    others = [finding for finding in fitted.findings if finding not in stale]
+    return job, replace(moved, findings=(*others, *findings_at(job, moved)))
 
 
-def offsets_of(fitted: Fitted, objective: Objective, *, gone: Collection[str] = ()) -> Array:
-    """Return a fit's offsets, without some, as the rows of another problem of the same flights."""
+def offsets_of(fitted: Fitted, objective: Objective, *, reset: Collection[str] = ()) -> Array:
+    """Return a fit's offsets as rows of another problem of the same flights; some reset to zero."""
     rows = np.asarray(fitted.point.offsets)
     known = dict(zip(fitted.objective.of_flight, rows, strict=True))
-    known = {name: row for name, row in known.items() if name not in gone}
-    nothing = np.zeros(rows.shape[1])
-    return np.asarray(np.stack([known.get(name, nothing) for name in objective.of_flight]))
+    zeros = np.zeros(rows.shape[1])
+    return np.stack(
+        [zeros if name in reset else known.get(name, zeros) for name in objective.of_flight]
+    )
 
 
 @dataclass(frozen=True)
@@ -217,19 +213,19 @@ class Selected:
 
     Attributes
     ----------
-    in_doubt
-        Coefficient -> how far it would move, in the scaled coordinate, with terms that were tried
-        and not kept; empty where none was tried.
+    selection_shifts
+        Coefficient -> its root mean square shift, scaled, by terms that were tried and not kept
+        (`tuner.terms.model_averaging`); empty if none was tried.
     base
-        Job and fit without any of them; None where none was tried.
+        Job and fit without any term; None if none was tried.
     refuted
-        Whether its flights contradict the fit: neither terms nor disturbances explain those.
+        Whether the flights contradict the fit: neither terms nor disturbances explain them.
     """
 
     job: Job
     fitted: Fitted
     rows: tuple[SelectionRow, ...] = ()
-    in_doubt: Mapping[str, float] = field(default_factory=dict)
+    selection_shifts: Mapping[str, float] = field(default_factory=dict)
     base: tuple[Job, Fitted] | None = None
     refuted: bool = False
 
@@ -240,21 +236,21 @@ class Selected:
 
     @property
     def left_out(self) -> tuple[tuple[str, ...], ...]:
-        """Names of each group that was tried and not kept, if the flights say anything of it."""
+        """Names of each group that was tried and not kept, if the flights determine it."""
         return tuple(
             row.names
             for row in self.rows
             if not row.kept and row.reason is not SelectionCode.NO_INFORMATION
         )
 
-    def rows_given(self, held: Mapping[str, str]) -> tuple[SelectionRow, ...]:
-        """Return the table once coefficients are held: a term that was chosen and is, is out.
+    def rows_after_holding(self, held: Mapping[str, str]) -> tuple[SelectionRow, ...]:
+        """Return the table after holding: a chosen term whose coefficients are held is not kept.
 
-        ``held`` is a coefficient -> its stand-in, as of `tuner.search.progress.Fitted`.
+        ``held`` is that of `tuner.search.progress.Fitted`.
         """
         return tuple(
             row.model_copy(update={"kept": False, "reason": SelectionCode.NO_INFORMATION})
-            if row.reason in EARNING and all(held.get(name) == name for name in row.names)
+            if row.reason in ACCEPTED and all(held.get(name) == name for name in row.names)
             else row
             for row in self.rows
         )

@@ -1,8 +1,8 @@
 """Selection of terms by the innovations of a Kalman filter, once disturbances are estimated.
 
-Least squares sees a term through gusts that the loop has turned into a slow wander of all signals,
-and hardly tells it from chance. Innovations are white: they tell the same term up to ten times as
-surely. So all candidates are judged once more, in one linear approximation of the innovations.
+In the residuals of a simulation, gusts are a slow wander of all signals, and a term hardly stands
+out from it. Innovations are white: the same term has up to a tenth of the standard error. So all
+candidates are tested once more, in one linear approximation of the innovations.
 """
 
 from __future__ import annotations
@@ -21,162 +21,174 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import (
     Selected,
-    is_stand_in,
-    names_in,
-    presence_of,
+    is_lumped,
+    names_of,
+    prior_presence_of,
     with_free,
     with_groups,
 )
-from tuner.terms.linearisation import Columns, Linear, linear_of, neutral_of, vector_after
-from tuner.terms.model_averaging import SMALLEST, Evidence, in_doubt
-from tuner.terms.score import EARNING, score, surviving
-from tuner.uncertainty.model_error import Lack
+from tuner.terms.linearisation import (
+    Columns,
+    LinearisedLoss,
+    linearised_from,
+    neutral_of,
+    vector_after,
+)
+from tuner.terms.model_averaging import NEGLIGIBLE_SIZE, Evidence, selection_shifts
+from tuner.terms.score import ACCEPTED, backward_elimination, score
+from tuner.uncertainty.model_error import ModelErrors
 from tuner.vehicle import COEFFICIENTS, conditions
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 Array = NDArray[np.float64]
 
-REFUSED = (
+REJECTED_BY_LEAST_SQUARES = (
     SelectionCode.NOT_SIGNIFICANT,
     SelectionCode.IMMATERIAL,
     SelectionCode.NOT_PREDICTED,
     SelectionCode.WORSE_AFTER_REFIT,
 )
-"""Why least squares may have left out what innovations call for."""
-WORTH_A_FIT = 0.05
+"""Reasons of least squares that innovations may overrule."""
+MAX_CHANCE_OF_LAG = 0.05
 """Chance below which a secant lets a term be tried."""
-SURELY = 4.0
-"""Standard errors by which a coefficient is surely elsewhere."""
+CONTRADICTION_SE = 4.0
+"""Standard errors by which two estimates contradict each other. Those of least squares are known
+from some ten independent stretches: with ten degrees of freedom chance alone takes one of a dozen
+coefficients beyond three in every sixth fit, and beyond four in every thirtieth."""
 
 
 @dataclass(frozen=True)
-class Innovations:
-    """What innovations say of a fit's coefficients and of those of the terms that it lacks.
+class LinearisedInnovations:
+    """The loss of the innovations about a fit, by its coefficients and those of omitted terms.
 
     Attributes
     ----------
     selected
-        The terms of the fit, and those that it lacks.
+        The terms of the fit, and those left out.
     fitted
         The fit to the innovations, in the space of ``selected``.
     space, vector
-        Of all P coefficients, and where they are.
+        Search space of all P coefficients, and their values.
     linear
-        The innovations about it.
+        The loss of the innovations about ``vector``.
     """
 
     selected: Selected
     fitted: Fitted
     space: Space
     vector: Array
-    linear: Linear
+    linear: LinearisedLoss
 
     @staticmethod
     def of(
-        selected: Selected, fitted: Fitted, predictor: Predictor, lack: Lack | None = None
-    ) -> Innovations:
-        """Return what the innovations of a predictor say at a fit, gains as they are.
+        selected: Selected,
+        fitted: Fitted,
+        predictor: Predictor,
+        model_errors: ModelErrors | None = None,
+    ) -> LinearisedInnovations:
+        """Linearise a predictor's innovations at a fit, gains as they are.
 
-        With what the model lacks acting, where that is known.
+        Model errors (``model_errors``) act in the simulation where they are known.
         """
-        names = [name for group in outside(selected).values() for name in group]
+        names = [name for group in groups_left_out(selected).values() for name in group]
         _, wide = with_free(selected.job, fitted, names)
         objective, beside = wide.objective, replace(predictor, schedule=wide.objective.schedule)
-        if lack is not None:
-            objective = lack.acting_on(objective)
+        if model_errors is not None:
+            objective = model_errors.applied_to(objective)
             beside = beside.stepped(objective)
         information = beside.information(objective, wide.point, fitted.criterion)
         space, vector = objective.space, np.asarray(wide.point.coefficients)
         scaled = space.scaled(vector)
-        linear = linear_of(information, scaled, space.prior_mean, predictor.loss)
+        linear = linearised_from(information, scaled, space.prior_mean, predictor.loss)
         linear = replace(linear, names=space.names, neutral=neutral_of(space))
-        return Innovations(selected, fitted, space, vector, linear)
+        return LinearisedInnovations(selected, fitted, space, vector, linear)
 
-    def with_acting(self, lack: Lack | None, predictor: Predictor) -> Innovations:
-        """Return what they say with what the model lacks acting.
+    def with_model_error(
+        self, model_errors: ModelErrors | None, predictor: Predictor
+    ) -> LinearisedInnovations:
+        """Return the same with model errors acting: they hide some terms and imitate others."""
+        if model_errors is None:
+            return self
+        return LinearisedInnovations.of(self.selected, self.fitted, predictor, model_errors)
 
-        What no term explains hides some terms, and passes for others.
+    def selection_shifts(self) -> dict[str, float]:
+        """Return by how much omitted terms would shift each coefficient.
+
+        The shifts of coefficients that set-points hide are those of least squares.
         """
-        return self if lack is None else Innovations.of(self.selected, self.fitted, predictor, lack)
-
-    def in_doubt(self) -> dict[str, float]:
-        """Return how far coefficients would move with terms that were left out.
-
-        Of what set-points hide, by least squares.
-        """
-        left_out = outside(self.selected)
+        left_out = groups_left_out(self.selected)
         groups = [
-            (columns, presence_of(names))
+            (columns, prior_presence_of(names))
             for names in left_out.values()
             if len(columns := self._columns(names))
         ]
         if not groups:
-            return dict(self.selected.in_doubt)
+            return dict(self.selected.selection_shifts)
         model = self._model(self.fitted.objective.space.names)
-        moves = in_doubt(self.linear, model, groups)
+        moves = selection_shifts(self.linear, model, groups)
         return {
-            **self.selected.in_doubt,
+            **self.selected.selection_shifts,
             **{self.space.names[i]: float(moves[i]) for i in model},
         }
 
-    def contradict(self, name: str, value: float) -> bool:
-        """Return whether they surely put a coefficient that was left out elsewhere, from zero."""
+    def contradicts(self, name: str, value: float) -> bool:
+        """Return whether the innovations contradict a value of an omitted coefficient."""
         column = self._columns([name])
         if not len(column) or name in self.fitted.objective.space.names:
             return False
         model = self._model(self.fitted.objective.space.names)
         square = self.linear.information() + self.linear.prior
-        told = Evidence.of(self.linear, square, self.linear.step(model), model, column)
-        apart = told.value - value / self.linear.prior_sd[column]
-        return bool(np.any(apart**2 > SURELY**2 * told.variance))
+        evidence = Evidence.of(self.linear, square, self.linear.step(model), model, column)
+        apart = evidence.value - value / self.linear.prior_sd[column]
+        return bool(np.any(apart**2 > CONTRADICTION_SE**2 * evidence.variance))
 
     def selection(self, had: Collection[str], *, first: bool = False) -> Selected | None:
-        """Return the terms that innovations call for and their fit, one linear step on.
+        """Return the terms that innovations select and their fit, one linear step on.
 
-        From all that describe one thing, and those that are in already, backwards: what chance
-        explains goes first. What is left has to be as large as a term that is not as good as
-        absent. None if no other terms are called for, or none was tried.
+        Backward elimination starts from all terms but lumped ones, and those already in the fit.
+        The survivors must exceed a negligible size. None if the selection stays the same, or none
+        was tried.
 
-        What stands in for other terms least squares may have taken for gusts, and from there
-        the others look as if they were not needed: ``first`` it goes. Of what is left it is judged
-        again, as far as least squares ``had`` it.
+        Least squares may have fitted a lumped term to gusts, and beside it the others seem
+        unnecessary: it is dropped at the ``first`` selection, and may come back at later ones if
+        least squares ``had`` it.
         """
         base, tried = self.selected.base, self._tried()
         within = {name: names for name, names in tried.items() if name in self.selected.kept}
-        without = {name: names for name, names in within.items() if first and is_stand_in(name)}
+        without = {name: names for name, names in within.items() if first and is_lumped(name)}
         begin = {
             name: names
             for name, names in tried.items()
-            if name not in without and (name in within or name in had or not is_stand_in(name))
+            if name not in without and (name in within or name in had or not is_lumped(name))
         }
         if base is None or not (begin or without):
             return None
-        judged = names_in(tried)
+        judged = names_of(tried)
         model = self._model([n for n in self.fitted.objective.space.names if n not in judged])
-        kept, _ = surviving(
+        kept, _ = backward_elimination(
             self.linear,
             model,
             {name: self._columns(names) for name, names in begin.items()},
             candidates=len(tried),
-            without=self._columns(names_in(without)),
-            stand_ins=[name for name in begin if is_stand_in(name)],
-            no_gusts=list(begin),  # they are followed
-            material=0.0,
-            at_once=True,
+            without=self._columns(names_of(without)),
+            lumped=[name for name in begin if is_lumped(name)],
+            excluding_gusts=list(begin),  # the filter estimates them
+            min_gain=0.0,
+            without_refits=True,
         )
         change = self._change(model, tried, kept)
         everywhere = np.arange(len(change))
-        size = np.abs(change - self.linear.away(everywhere)) / self.linear.prior_sd
-        large = [name for name in kept if size[self._columns(tried[name])].max() > SMALLEST]
+        size = np.abs(change - self.linear.to_neutral(everywhere)) / self.linear.prior_sd
+        large = [name for name in kept if size[self._columns(tried[name])].max() > NEGLIGIBLE_SIZE]
         if set(large) == set(within):
             return None
         moved = vector_after(self.space, self.vector, self._change(model, tried, large))
         return self._with(base, tried, large, moved)
 
-    def with_lags(self) -> Selected | None:
-        """Return the terms with those, too, that begin away from their neutral values, from there.
+    def with_lag_terms(self) -> Selected | None:
+        """Return the terms with lags added, which start away from their neutral values.
 
-        No linear approximation judges them, it only tells which are worth a fit. None if none is.
+        No linear approximation tests them; it only shows which are worth a fit. None if none is.
         """
         base = self.selected.base
         model = self._model(self.fitted.objective.space.names)
@@ -184,47 +196,46 @@ class Innovations:
             row.group: row.names
             for row in self.selected.rows
             if not row.kept
-            and row.reason in REFUSED
+            and row.reason in REJECTED_BY_LEAST_SQUARES
             and any(name in COEFFICIENTS and COEFFICIENTS[name].begin for name in row.names)
             and score(
                 self.linear,
                 model,
                 self._columns(row.names),
                 candidates=1,
-                no_gust=True,
-                material=0.0,
+                excludes_gusts=True,
+                min_gain=0.0,
             ).chance
-            < WORTH_A_FIT  # of such innovations if the model did not lack it
+            < MAX_CHANCE_OF_LAG
         }
         if base is None or not lags:
             return None
-        return self._with(base, lags, lags, begun(self.space, self.vector, names_in(lags)))
+        return self._with(base, lags, lags, begun(self.space, self.vector, names_of(lags)))
 
     def _with(
         self, base: tuple[Job, Fitted], judged: Groups, kept: Collection[str], moved: Array
     ) -> Selected:
-        """Return the selection with some of the groups that were judged, at a vector (P,)."""
+        """Return the selection with ``kept`` of the tested groups, at a vector (P,)."""
         rows = [
-            _judged(row, kept=row.group in kept) if row.group in judged else row
+            _row_after(row, kept=row.group in kept) if row.group in judged else row
             for row in self.selected.rows
         ]
         rows.sort(key=lambda row: not row.kept)
-        groups = {row.group: row.names for row in rows if row.kept and row.reason in EARNING}
+        groups = {row.group: row.names for row in rows if row.kept and row.reason in ACCEPTED}
         vector = dict(zip(self.space.names, moved.tolist(), strict=True))
-        said = findings_at(self.selected.job, self.selected.fitted)
-        job, fitted = with_groups(base, groups, self.fitted, said=said, vector=vector)
+        stale = findings_at(self.selected.job, self.selected.fitted)
+        job, fitted = with_groups(base, groups, self.fitted, stale=stale, vector=vector)
         return replace(self.selected, job=job, fitted=fitted, rows=tuple(rows))
 
     def _tried(self) -> dict[str, tuple[str, ...]]:
-        """Return the groups that innovations can judge: all of whose columns they see.
+        """Return the groups that innovations can test: those all of whose columns they see.
 
-        Not one that at its neutral value does what another coefficient does: their derivatives
-        there do not tell it.
+        A group whose derivative at its neutral value is that of another coefficient is not one.
         """
         return {
             row.group: row.names
             for row in self.selected.rows
-            if row.reason in (EARNING if row.kept else REFUSED)
+            if row.reason in (ACCEPTED if row.kept else REJECTED_BY_LEAST_SQUARES)
             and not hidden(row.names).any()
             and not set(row.names) & set(conditions())
             and all(COEFFICIENTS[name].begin is None for name in row.names)
@@ -234,10 +245,12 @@ class Innovations:
         """Return the step (P,) to the minimum with some groups, the others at neutral values."""
         free = np.concatenate([model, *(self._columns(tried[name]) for name in kept)])
         gone = [name for group in set(tried) - set(kept) for name in tried[group]]
-        return self.linear.step(free.astype(np.intp), from_=self.linear.away(self._columns(gone)))
+        return self.linear.step(
+            free.astype(np.intp), from_=self.linear.to_neutral(self._columns(gone))
+        )
 
     def _model(self, names: Sequence[str]) -> Columns:
-        """Return the columns of what the model holds anyway, and innovations see."""
+        """Return the columns of coefficients that are not held and that innovations see."""
         return self._columns([name for name in names if name not in self.fitted.held])
 
     def _columns(self, names: Sequence[str]) -> Columns:
@@ -245,14 +258,13 @@ class Innovations:
         return np.flatnonzero(np.isin(self.space.names, list(names)) & seen)
 
 
-def outside(selected: Selected) -> Groups:
-    """Return what was tried and left out. A steady wind is a disturbance like others."""
-    around = set(conditions())
-    return {names[0]: names for names in selected.left_out if not around & set(names)}
+def groups_left_out(selected: Selected) -> Groups:
+    """Return the groups left out but per-flight conditions: a filter estimates steady wind too."""
+    return {names[0]: names for names in selected.left_out if not {*conditions()} & {*names}}
 
 
-def _judged(row: SelectionRow, *, kept: bool) -> SelectionRow:
-    """Return a group's row after innovations have judged it."""
+def _row_after(row: SelectionRow, *, kept: bool) -> SelectionRow:
+    """Return a group's row after its test by innovations."""
     if row.kept == kept:
         return row
     reason = SelectionCode.PREDICTS_SAMPLES if kept else SelectionCode.NOT_SIGNIFICANT

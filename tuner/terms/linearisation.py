@@ -1,14 +1,14 @@
-"""A fit linearised about its point: what adding a term, freeing or leaving out would change.
+"""A fit linearised about its point, to predict the effect of adding or removing terms and flights.
 
 The loss of each stretch of time is a quadratic in the coefficients, from one Jacobian:
 ``L(x + δ) = L(x) + sᵀδ + ½ δᵀHδ`` in the scaled coordinates, each segment's start and each flight's
-offsets eliminated. A group of coefficients is added by letting its δ move; one in the model is
-taken away by the δ that leads back to its neutral value. What surrounds each flight, as its wind
-does, has a column for each flight, which no other flight sees.
+offsets eliminated. A group of coefficients is added by freeing its δ, and removed by the δ that
+leads back to its neutral value. Per-flight conditions (wind, battery) have a column for each
+flight, which no other flight sees.
 
-Cross-validation by flights (`predicted_losses`): each is simulated with the coefficients that a
-linear step from the joint fit to the fit without it leads to. A flight that is alone is predicted
-section by section, by fits to its other sections.
+Cross-validation by flights (`predicted_losses`) simulates each with the coefficients of a fit to
+the others, one linear step from the joint fit. A single flight is predicted section by section, by
+fits to its other sections.
 """
 
 from __future__ import annotations
@@ -23,12 +23,7 @@ from numpy.typing import NDArray
 from sim_jax.numeric import Array as JaxArray
 from tuner.core.numerics import scaled_solve
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point, SegmentSums, units_of
-from tuner.objective.information import (
-    BLOCK,
-    FisherInformation,
-    information_at,
-    with_secants,
-)
+from tuner.objective.information import BLOCK, FisherInformation, information_at, with_secants
 from tuner.objective.normal_equations import Objective, portions
 from tuner.objective.residuals import robust
 from tuner.objective.space import Space
@@ -41,14 +36,14 @@ from tuner.vehicle.selection_table import Groups
 Array = NDArray[np.float64]
 Columns = NDArray[np.intp]
 
-SECTIONS = 3
-"""Into how many sections in time flights are cut, where sections are left out."""
+SECTIONS_PER_FLIGHT = 3
+"""Sections in time of a flight, each held out in turn where flights cannot be."""
 RIDGE = 1e-12
-"""Added to a Hessian of unit diagonal: what it lets move is what nothing determines."""
+"""Added to a Hessian of unit diagonal: undetermined directions stay where they are."""
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearisedLoss:
     """The loss about a point, stretch by stretch; P columns, S stretches that see L of them each.
 
     Attributes
@@ -65,14 +60,14 @@ class Linear:
         (S,) where each stretch belongs.
     loss
         Half the robust sum of squares of all flights.
-    seen
+    columns_seen
         (S, L) which columns each stretch sees; None where all see all.
-    around
-        How many of the last columns say what surrounds one flight each.
+    condition_columns
+        How many of the last columns are per-flight conditions.
     names
-        (P,) of the columns: a condition's once for each flight; none where nobody asks.
+        (P,) of the columns, a condition's once for each flight; empty if not needed.
     neutral
-        (P,) at which what has columns is not there, scaled; zero by default.
+        (P,) scaled neutral values, at which a term is absent; zero by default.
     """
 
     scaled: Array
@@ -84,13 +79,13 @@ class Linear:
     flight: NDArray[np.intp]
     section: NDArray[np.intp]
     loss: float
-    seen: NDArray[np.intp] | None = None
-    around: int = 0
+    columns_seen: NDArray[np.intp] | None = None
+    condition_columns: int = 0
     names: tuple[str, ...] = ()
     neutral: Array | None = None
 
     @cached_property
-    def _places(self) -> dict[str, list[int]]:
+    def _columns_by_name(self) -> dict[str, list[int]]:
         places: dict[str, list[int]] = {}
         for column, name in enumerate(self.names):
             places.setdefault(name, []).append(column)
@@ -98,9 +93,11 @@ class Linear:
 
     def columns_of(self, names: Iterable[str]) -> Columns:
         """Return the columns of some names, in their order."""
-        return np.array([column for name in names for column in self._places[name]], np.intp)
+        return np.array(
+            [column for name in names for column in self._columns_by_name[name]], np.intp
+        )
 
-    def away(self, gone: Columns) -> Array:
+    def to_neutral(self, gone: Columns) -> Array:
         """Return the change (P,) that leads some columns to their neutral values."""
         change = np.zeros(len(self.scaled))
         change[gone] = ((0.0 if self.neutral is None else self.neutral) - self.scaled)[gone]
@@ -114,15 +111,17 @@ class Linear:
     @property
     def columns(self) -> NDArray[np.intp]:
         """Which columns (S, L) each stretch sees."""
-        if self.seen is not None:
-            return self.seen
+        if self.columns_seen is not None:
+            return self.columns_seen
         return np.broadcast_to(np.arange(len(self.scaled)), self.score.shape)
 
-    def sees_alike(self, group: Columns) -> bool:
-        """Return whether a group is of the vehicle: every flight's stretches see its columns."""
+    def is_shared_by_flights(self, group: Columns) -> bool:
+        """Return whether every flight's stretches see a group's columns: it is the vehicle's."""
         if self.flights == 1:
-            return bool((group < len(self.scaled) - self.around).all())
-        return self.seen is None or bool(np.isin(group, np.intersect1d(*self.seen[[0, -1]])).all())
+            return bool((group < len(self.scaled) - self.condition_columns).all())
+        return self.columns_seen is None or bool(
+            np.isin(group, np.intersect1d(*self.columns_seen[[0, -1]])).all()
+        )
 
     def information(self, inside: NDArray[np.bool_] | None = None) -> Array:
         """Return the information (P, P) of some stretches (S,), of all by default."""
@@ -132,50 +131,50 @@ class Linear:
             total = np.zeros((len(self.scaled), len(self.scaled)))
             for number in np.unique(self.flight[inside]):
                 of_flight = inside & (self.flight == number)
-                seen = self.columns[np.argmax(of_flight)]
-                total[np.ix_(seen, seen)] += self.hessian[of_flight].sum(axis=0)
+                columns_seen = self.columns[np.argmax(of_flight)]
+                total[np.ix_(columns_seen, columns_seen)] += self.hessian[of_flight].sum(axis=0)
             known[key] = total
         return known[key]
 
     @cached_property
     def _informations(self) -> dict[bytes, Array]:
-        """Which stretches, as bytes -> their information: every group is scored in a few folds."""
+        """Stretches, as bytes -> their information: every group is scored in the same folds."""
         return {}
 
-    def slopes(self, change: Array) -> Array:
+    def gradients(self, change: Array) -> Array:
         """Return the gradient (S, P) of each stretch's loss after a change (P,)."""
         local = self.score + np.einsum("spq,sq->sp", self.hessian, change[self.columns])
-        return self._spread(local)
+        return self._expanded(local)
 
     @cached_property
     def _scores(self) -> Array:
-        return self._spread(self.score)
+        return self._expanded(self.score)
 
     @cached_property
     def diagonals(self) -> Array:
         """The information (S, P) of each stretch about each column by itself."""
-        return self._spread(np.einsum("spp->sp", self.hessian))
+        return self._expanded(np.einsum("spp->sp", self.hessian))
 
     def stretches(self, columns: Columns, change: Array, seconds: float) -> Stretches:
-        """Return what longer stretches say of some columns after a change (P,).
+        """Return information and score of some columns in longer stretches, after a change (P,).
 
-        Each flight is cut into stretches alike, as close to so many seconds as they can be.
+        Each flight is cut into equal stretches, as close to ``seconds`` as possible.
         """
-        slopes, information, score = self.slopes(change), [], []
+        gradients, information, score = self.gradients(change), [], []
         for number in np.unique(self.flight):
             of_flight = np.flatnonzero(self.flight == number)
-            seen = self.columns[of_flight[0]]
-            mine = np.flatnonzero(np.isin(columns, seen))
-            local = np.searchsorted(seen, columns[mine])
+            columns_seen = self.columns[of_flight[0]]
+            mine = np.flatnonzero(np.isin(columns, columns_seen))
+            local = np.searchsorted(columns_seen, columns[mine])
             for part in np.array_split(of_flight, max(round(len(of_flight) * BLOCK / seconds), 1)):
                 square = np.zeros((len(columns), len(columns)))
                 square[np.ix_(mine, mine)] = self.hessian[part].sum(axis=0)[np.ix_(local, local)]
                 information.append(square)
-                score.append(slopes[part].sum(axis=0)[columns])
+                score.append(gradients[part].sum(axis=0)[columns])
         return Stretches(np.stack(information), np.stack(score))
 
-    def _spread(self, local: Array) -> Array:
-        """Return rows (S, L) of what stretches see as rows (S, P), zero where they see nothing."""
+    def _expanded(self, local: Array) -> Array:
+        """Return rows (S, L) of the columns seen as rows (S, P), zero elsewhere."""
         rows = np.zeros((len(local), len(self.scaled)))
         np.put_along_axis(rows, self.columns, local, axis=1)
         return rows
@@ -188,11 +187,11 @@ class Linear:
         Parameters
         ----------
         free
-            What may move.
+            Columns that may move.
         inside
             (S,) which stretches are fitted; all by default.
         from_
-            (P,) change that is made anyway; none by default.
+            (P,) change that is given; zero by default.
         """
         change = np.zeros(len(self.scaled)) if from_ is None else from_.copy()
         hessian = self.information(inside) + self.prior
@@ -216,46 +215,46 @@ class Linear:
 
 @dataclass(frozen=True)
 class LinearisedFit:
-    """A fit with some groups in it, seen in linear approximation by all that could be in it.
+    """A fit with some groups added, and its loss linearised by all candidates.
 
     Attributes
     ----------
     fitted
-        The fit; coefficients that only fill its space up stay at their neutral values.
+        The fit; candidates that were not added are in its space at their neutral values.
     added
-        Groups in it.
+        The groups added.
     linear
-        The loss about it, by the base model's coefficients and all candidates.
+        The loss about the fit, by the base model's coefficients and all candidates.
     """
 
     fitted: Fitted
     added: Groups
-    linear: Linear
+    linear: LinearisedLoss
 
 
-def linear_at(
+def linearise(
     objective: Objective,
     point: Point,
     criterion: Criterion,
     *,
     offsets_fitted: NDArray[np.bool_],
-    around: Sequence[str] = (),
-) -> Linear:
+    conditions: Sequence[str] = (),
+) -> LinearisedLoss:
     """Return the linear approximation of a fit, from one Jacobian by all of its parameters.
 
-    Of what at its neutral value does what another does, secants stand for derivatives.
+    Secants replace derivatives of coefficients that act like another at their neutral values.
 
-    Flights whose Jacobian would not fit half of the objective's memory take turns: its columns are
-    put in another order, which copies them.
+    Flights whose Jacobian would not fit half of the objective's memory take turns: reordering its
+    columns copies them.
 
     Parameters
     ----------
     objective, point, criterion
-        The fit. Its last conditions are those of ``around``.
+        The fit. Its last conditions are those of ``conditions``.
     offsets_fitted
         (offsets, N) which offsets move with the others.
-    around
-        Conditions to have columns for, behind those of the coefficients: N for each of them.
+    conditions
+        Names of conditions, whose columns follow those of the coefficients, N for each.
     """
     parts, loss = [], 0.0
     half = replace(objective, memory=objective.memory // 2)
@@ -266,30 +265,27 @@ def linear_at(
             batch[1],
             partial(batch[0].residuals, criterion=batch[2]),
         )
-        fitted = offsets_fitted[: len(offsets_fitted) - len(around), flights]
+        fitted = offsets_fitted[: len(offsets_fitted) - len(conditions), flights]
         parts.append(
             information_at(
-                *_with_coefficients_around(*batch, jacobian, around), offsets_fitted=fitted
+                *_with_free_conditions(*batch, jacobian, conditions), offsets_fitted=fitted
             )
         )
         loss += _loss_of(batch[0], batch[2], jacobian)
     information = FisherInformation.joined(parts)
-    rows = np.asarray(point.offsets)[len(point.offsets) - len(around) :]
+    rows = np.asarray(point.offsets)[len(point.offsets) - len(conditions) :]
     scaled = np.concatenate(
-        [
-            objective.space.scaled(point.coefficients),
-            (rows * units_of(around)[:, None]).ravel(),
-        ]
+        [objective.space.scaled(point.coefficients), (rows * units_of(conditions)[:, None]).ravel()]
     )
     mean = np.concatenate([objective.space.prior_mean, np.zeros(rows.size)])
-    names = (*objective.space.names, *(name for name in around for _ in rows[0]))
+    names = (*objective.space.names, *(name for name in conditions for _ in rows[0]))
     neutral = np.concatenate([neutral_of(objective.space), np.zeros(rows.size)])
-    linear = linear_of(information, scaled, mean, loss, around=len(around))
+    linear = linearised_from(information, scaled, mean, loss, condition_count=len(conditions))
     return replace(linear, names=names, neutral=neutral)
 
 
 def neutral_of(space: Space) -> Array:
-    """Return at which scaled coordinates (K,) coefficients of terms do nothing; zero of others."""
+    """Return the scaled neutral values (K,) of the terms' coefficients; zero for others."""
     rows = [(parameter, COEFFICIENTS[parameter.name].neutral) for parameter in space.parameters]
     return np.array(
         [
@@ -301,21 +297,21 @@ def neutral_of(space: Space) -> Array:
     )
 
 
-def _with_coefficients_around(
+def _with_free_conditions(
     objective: Objective,
     point: Point,
     criterion: Criterion,
     jacobian: Jacobian,
-    around: Sequence[str],
+    conditions: Sequence[str],
 ) -> tuple[Objective, Point, Criterion, Jacobian]:
-    """Return a problem in which some conditions count as coefficients, and its Jacobian.
+    """Return a problem in which some conditions are coefficients, and its Jacobian.
 
-    Only the columns' order and scale are that of such a problem: it is not to be simulated.
+    Only its columns' order and scale are meaningful: do not simulate it.
     """
-    if not around:
+    if not conditions:
         return objective, point, criterion, jacobian
     count, offsets = len(objective.space), len(point.offsets)
-    left = offsets - len(around)
+    left = offsets - len(conditions)
     some = next(iter(jacobian.columns.values()))
     order = np.concatenate(
         [
@@ -325,24 +321,26 @@ def _with_coefficients_around(
             np.arange(count + offsets, len(some)),
         ]
     )
-    beside = [_condition(name, unit) for name, unit in zip(around, units_of(around), strict=True)]
+    beside = [
+        _condition_parameter(name, unit)
+        for name, unit in zip(conditions, units_of(conditions), strict=True)
+    ]
     space = Space((*objective.space.parameters, *beside), objective.space.fixed)
     return (
-        replace(objective, space=space, conditions=objective.conditions[: -len(around)]),
+        replace(objective, space=space, conditions=objective.conditions[: -len(conditions)]),
         Point(
-            np.concatenate([np.asarray(point.coefficients), np.zeros(len(around))]),
+            np.concatenate([np.asarray(point.coefficients), np.zeros(len(conditions))]),
             point.offsets[:left],
         ),
         criterion,
         replace(
-            jacobian,
-            columns={name: np.asarray(c)[order] for name, c in jacobian.columns.items()},
+            jacobian, columns={name: np.asarray(c)[order] for name, c in jacobian.columns.items()}
         ),
     )
 
 
-def _condition(name: str, unit: float) -> Parameter:
-    """Return a condition as a parameter that moves by a unit, its number in a point's rows."""
+def _condition_parameter(name: str, unit: float) -> Parameter:
+    """Return a condition as a parameter whose unit step is that of a point's offsets."""
     row = REGISTRY[name]
     return Parameter(
         name=name,
@@ -358,44 +356,51 @@ def _condition(name: str, unit: float) -> Parameter:
     )
 
 
-def linear_of(
-    information: FisherInformation, scaled: Array, mean: Array, loss: float, *, around: int = 0
-) -> Linear:
+def linearised_from(
+    information: FisherInformation,
+    scaled: Array,
+    mean: Array,
+    loss: float,
+    *,
+    condition_count: int = 0,
+) -> LinearisedLoss:
     """Return the linear approximation from the information at a point and its loss.
 
     Parameters
     ----------
     information
-        The last ``around`` of its coefficients are conditions.
+        The last ``condition_count`` of its coefficients are conditions.
     scaled, mean
         (P,) the point, and the mean of the priors: of K coefficients, then of each condition for
         each flight.
     loss
         Half the robust sum of squares.
-    around
+    condition_count
         How many conditions.
     """
     size = information.score.shape[-1]
-    count, flights = size - around, int(information.flight.max()) + 1
-    # windows that begin in the same stretch are one: their residuals are no more independent than
-    # those of a flight that is flown whole
+    count, flights = size - condition_count, int(information.flight.max()) + 1
+    # windows that begin in the same stretch count as one: their residuals are as dependent as those
+    # of a flight simulated whole
     blocks = information.begins[:, None] / BLOCK + np.arange(information.blocks.shape[2])
     numbers = np.floor(blocks + 1e-9).astype(np.intp)
     hessian, score, flight, number = information.in_stretches(numbers)
-    section = np.minimum(number * SECTIONS // (number.max() + 1), SECTIONS - 1)
+    section = np.minimum(
+        number * SECTIONS_PER_FLIGHT // (number.max() + 1), SECTIONS_PER_FLIGHT - 1
+    )
     flown = np.einsum("spp->s", hessian) > 0
     flight = flight[flown]
     of_prior = np.diag(information.prior)
     own = np.concatenate([of_prior[:count], np.repeat(of_prior[count:], flights)])
     prior = np.diag(own)
     prior[:count, :count] += information.nuisance_prior[:count, :count]
-    seen = np.hstack(
+    columns_seen = np.hstack(
         [
             np.tile(np.arange(count), (len(flight), 1)),
-            count + flights * np.arange(around) + flight[:, None],
+            count + flights * np.arange(condition_count) + flight[:, None],
         ]
     )
-    return Linear(
+    return LinearisedLoss(
         scaled=scaled,
         hessian=hessian[flown],
         score=score[flown],
@@ -405,8 +410,8 @@ def linear_of(
         flight=flight,
         section=section[flown],
         loss=loss,
-        seen=seen if around else None,
-        around=around * flights,
+        columns_seen=columns_seen if condition_count else None,
+        condition_columns=condition_count * flights,
     )
 
 
@@ -419,18 +424,22 @@ def _loss_of(objective: Objective, criterion: Criterion, jacobian: Jacobian) -> 
     )
 
 
-LONGEST_STEP = 1.0
-"""Standard deviations of a prior that a coefficient may move in one linear step."""
+MAX_STEP_PRIOR_SD = 1.0
+"""Prior standard deviations that a coefficient may move in one step: the linear range."""
 
 
 def predicted_losses(
-    fitted: Fitted, linear: Linear, model: Columns, own: Columns, scale: Mapping[str, JaxArray]
+    fitted: Fitted,
+    linear: LinearisedLoss,
+    model: Columns,
+    own: Columns,
+    scale: Mapping[str, JaxArray],
 ) -> NDArray[np.float64]:
-    """Return the loss (N,) of each flight with the coefficients that the others ask for.
+    """Return the loss (N,) of each flight with the coefficients of a fit to the others.
 
     One linear step leads from the joint fit to the fit without the flight; there the flight is
-    simulated. Its own offsets follow. A flight that is alone is simulated with the joint fit; what
-    its sections lose by fits without them is the linear approximation's.
+    simulated, and its own offsets follow. A single flight is simulated with the joint fit; the loss
+    of its sections with fits to the others is that of the linear approximation.
 
     Parameters
     ----------
@@ -459,11 +468,11 @@ def predicted_losses(
         inside = flight == number
         loss = float(np.asarray(sums.loss)[inside].sum())
         losses.append(loss - _gain_of_offsets(sums, inside, movable[:, number]))
-    return np.array(losses) * (lost_by_sections(linear, model) if alone else 1.0)
+    return np.array(losses) * (section_loss_ratio(linear, model) if alone else 1.0)
 
 
-def lost_by_sections(linear: Linear, model: Columns) -> float:
-    """Return the loss of sections by fits without them, over that of the fit to all."""
+def section_loss_ratio(linear: LinearisedLoss, model: Columns) -> float:
+    """Return the held-out loss of sections over their loss in the fit to all."""
     lost = 0.0
     for out in linear.folds(linear.section):
         lost += float(linear.change_of_loss(linear.step(model, inside=~out))[out].sum())
@@ -472,7 +481,7 @@ def lost_by_sections(linear: Linear, model: Columns) -> float:
 
 def vector_after(space: Space, vector: JaxArray, change: Array) -> Array:
     """Return the search vector (K,) after a change of the scaled coordinates, inside the bounds."""
-    far = LONGEST_STEP * space.prior_sd
+    far = MAX_STEP_PRIOR_SD * space.prior_sd
     scaled = space.scaled(vector) + np.clip(change, -far, far)
     return space.vector_at(scaled)
 

@@ -20,65 +20,65 @@ from tuner.search.explanation import Explanation
 from tuner.search.findings import odd_flights
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
-from tuner.terms.candidates import Selected, names_in
-from tuner.terms.innovations import Innovations, outside
+from tuner.terms.candidates import Selected, names_of
+from tuner.terms.innovations import CONTRADICTION_SE, LinearisedInnovations, groups_left_out
 from tuner.terms.search_with_terms import (
-    FILES_GAINS,
+    GAINS_REFUTED,
     candidates_of,
     refuted_by_commands,
     with_refuted,
 )
-from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.estimates import Estimate, Uncertainty
 from tuner.uncertainty.examination import Examination, examine, full_problem_of
-from tuner.uncertainty.identifiability import with_undetermined_held
-from tuner.uncertainty.model_error import Lack, alternatives_of, lack_of
+from tuner.uncertainty.identifiability import hold_undetermined
+from tuner.uncertainty.model_error import ModelErrors, alternatives_of, model_errors_of
 
-CONTRADICTS = 4.0
-"""Standard errors by which no coefficient may move. Those of least squares are known from some ten
-stretches that do not depend on each other: with ten degrees of freedom chance alone takes one of a
-dozen coefficients beyond three in every sixth fit, and beyond four in every thirtieth."""
-
-SELECTIONS = 3
-"""How often innovations may call for other terms, each time beside those of the last."""
-LACKS = "Disturbances cannot be estimated: the model lacks something else."
-ROUGHLY = 2
-"""Steps before they do so first: what is missing would in time be taken for disturbances."""
+MAX_SELECTIONS = 3
+"""How often innovations may change the terms, each time after a refit."""
+FILTER_LOST = "Disturbances cannot be estimated: the model lacks something else."
+ROUGH_STEPS = 2
+"""Steps before the first selection: more would fit missing terms by disturbances."""
 
 
-Examined = tuple[Selected, Fitted, Examination | None]
-"""A job's fit, and how well it is known; None where the examination failed."""
+ExaminedFit = tuple[Selected, Fitted, Examination | None]
+"""A job's selection and fit, and its examination; None where that failed."""
 
 
-def examined(
+def refit_and_examine(
     selected: Selected,
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
     explanation: Explanation,
-) -> Examined:
-    """Return the fit with estimated disturbances, or with what the flights leave open held.
+) -> ExaminedFit:
+    """Return the fit with estimated disturbances, or with undetermined coefficients held.
 
-    And how well each coefficient is known; first the terms, of which innovations may call for
-    others. Where flights contradict the fit, or all but odd ones are matched, nothing is followed.
+    Innovations may change the terms. Disturbances are not estimated where flights contradict the
+    fit, nor by default where only odd flights are not matched.
     """
-    follow = partial(with_disturbances, on_progress=on_progress, on_message=on_message)
-    followed, asked = None, selected.job.settings.job.disturbances
+    refit = partial(with_disturbances, on_progress=on_progress, on_message=on_message)
+    found, asked = None, selected.job.settings.job.disturbances
     if not (selected.refuted or (asked == "auto" and odd_flights(selected.fitted.scales))):
-        followed = explanation.part("disturbances", partial(follow, selected), None)
-    if followed is not None and (
-        refuted := set(refuted_by_commands(*followed[:2])).difference(selected.kept)
+        found = explanation.part("disturbances", partial(refit, selected), None)
+    if found is not None and (
+        refuted := set(refuted_by_commands(*found[:2])).difference(selected.kept)
     ):
-        on_message(FILES_GAINS.format(listed(sorted(refuted))))
+        on_message(GAINS_REFUTED.format(listed(sorted(refuted))))
         less = with_refuted(selected, refuted)
-        followed = explanation.part("disturbances", partial(follow, less), None)
+        found = explanation.part("disturbances", partial(refit, less), None)
     on_message("Examining how well each coefficient is known.")
-    if followed is not None:
-        return followed
+    if found is not None:
+        return found
     job, fitted = selected.job, selected.fitted
     hold = partial(
-        with_undetermined_held, job, fitted, on_progress, on_message, in_doubt=selected.in_doubt
+        hold_undetermined,
+        job,
+        fitted,
+        on_progress,
+        on_message,
+        selection_shifts=selected.selection_shifts,
     )
-    not_known: tuple[Fitted, Examination | None] = fitted, None
-    return selected, *explanation.part("examination", hold, not_known)
+    unexamined: tuple[Fitted, Examination | None] = fitted, None
+    return selected, *explanation.part("examination", hold, unexamined)
 
 
 def with_disturbances(
@@ -88,18 +88,18 @@ def with_disturbances(
 ) -> tuple[Selected, Fitted, Examination] | None:
     """Return the fit in which disturbances are estimated too, and its examination.
 
-    None where the job does not ask for it, where the residuals hold no more than noise, where
-    set-points were not recorded, where flights are too many or too long, where a filter loses them,
-    where nothing would be known better, and where the two fits contradict each other, unless the
-    simulated flights lack a lag that samples call for.
+    None where the job does not ask for it, the residuals are at the noise level, set-points were
+    not recorded, flights are too many or too long, a filter loses them, or the standard errors
+    would not shrink. None, too, where the two fits contradict each other, unless innovations added
+    a lag that the simulated flights lack.
     """
     job, fitted = selected.job, selected.fitted
     asked = job.settings.job.disturbances
-    follows = asked == "follow" or (asked == "auto" and candidates_of(job))
-    if fitted.residuals_at_noise_level or not fitted.polished or not follows:
+    wanted = asked == "follow" or (asked == "auto" and candidates_of(job))
+    if fitted.residuals_at_noise_level or not fitted.polished or not wanted:
         return None
-    full = full_problem_of(fitted.objective, fitted.point)  # as it is examined: compiled once
-    terms = names_in(outside(selected))
+    full = full_problem_of(fitted.objective, fitted.point)  # the examination's: compiled once
+    terms = names_of(groups_left_out(selected))
     predictor = Predictor.of(full.objective, full.point, job.fitted, terms)
     if predictor is None:
         return None
@@ -108,26 +108,26 @@ def with_disturbances(
         return None
     clock = time.perf_counter()
     on_message("The residuals hold more than noise: refitting with estimated disturbances.")
-    there, predictor = _descended(selected, fitted, predictor, steps=ROUGHLY)
+    there, predictor = _fit_innovations(selected, fitted, predictor, steps=ROUGH_STEPS)
     if predictor.is_lost:
-        on_message(LACKS)
+        on_message(FILTER_LOST)
         return None
-    seen = Innovations.of(selected, there, predictor)
+    seen = LinearisedInnovations.of(selected, there, predictor)
     had = selected.kept
-    for number in range(SELECTIONS):
+    for number in range(MAX_SELECTIONS):
         chosen = seen.selection(had, first=number == 0)
         if chosen is None and number > 0:
             break
         if chosen is not None:
-            on_message(_said(seen.selected, chosen))
+            on_message(_changed_terms(seen.selected, chosen))
             selected, there = chosen, chosen.fitted
-        predictor = predictor.without_gains  # their memory is for the next ones
-        there, predictor = _descended(selected, there, predictor)
-        seen = Innovations.of(selected, there, predictor)
+        predictor = predictor.without_gains  # frees their memory
+        there, predictor = _fit_innovations(selected, there, predictor)
+        seen = LinearisedInnovations.of(selected, there, predictor)
     simulated = seen.selected
-    seen, there, predictor = _with_lags(seen, there, predictor, on_message)
+    seen, there, predictor = _with_lag_terms(seen, there, predictor, on_message)
     if not predictor.keeps_track:
-        on_message(LACKS)
+        on_message(FILTER_LOST)
         return None
     job = seen.selected.job
     offsets = free_offsets(job)
@@ -142,23 +142,22 @@ def with_disturbances(
     again = replace(
         again,
         wall_time=fitted.wall_time + time.perf_counter() - clock,
-        findings=(*again.findings, _finding(predictor)),
+        findings=(*again.findings, _disturbance_finding(predictor)),
     )
-    otherwise = alternatives_of(again.objective, again.point, job.fitted)
-    lack = _believed(lack_of(again, job.fitted), seen)
+    alternatives = alternatives_of(again.objective, again.point, job.fitted)
+    model_errors = _without_contradicted_lag(model_errors_of(again, job.fitted), seen)
     examination = examine(
         again,
-        otherwise=otherwise,
+        alternatives=alternatives,
         predictor=predictor,
-        in_doubt=seen.with_acting(lack, predictor).in_doubt(),
-        lack=lack,
+        selection_shifts=seen.with_model_error(model_errors, predictor).selection_shifts(),
+        model_errors=model_errors,
     )
     if seen.selected is not simulated:
-        # without a lag that samples surely call for simulated flights tell nothing of the others
-        better = True
+        better = True  # a fit of simulated flights that lacks a significant lag refutes nothing
     else:
         if set(seen.selected.kept) != set(had):
-            # with other terms it is a fit of another model, which says nothing of this one
+            # the fit with other terms is one of another model: not comparable
             fitted = polished(
                 job,
                 again,
@@ -166,63 +165,73 @@ def with_disturbances(
                 title="simulated",
                 on_progress=partial(on_progress, job),
             )
-        otherwise = alternatives_of(fitted.objective, fitted.point)
-        before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt, lack=lack)
-        agree = _agree(examination.uncertainty, before.uncertainty)
+        alternatives = alternatives_of(fitted.objective, fitted.point)
+        before = examine(
+            fitted,
+            alternatives=alternatives,
+            selection_shifts=selected.selection_shifts,
+            model_errors=model_errors,
+        )
+        agree = _estimates_agree(examination.uncertainty, before.uncertainty)
         if not agree:
             on_message("It contradicts the fit of the simulated flights, which is kept.")
         better = agree and _is_sharper(examination.uncertainty, before.uncertainty)
     return (seen.selected, again, examination) if better else None
 
 
-def _believed(lack: Lack | None, seen: Innovations) -> Lack | None:
-    """Return what the model lacks, without a lateness of rotor speeds that samples contradict.
+def _without_contradicted_lag(
+    model_errors: ModelErrors | None, seen: LinearisedInnovations
+) -> ModelErrors | None:
+    """Return the model errors without a lag of rotor speeds that innovations contradict.
 
-    Accelerations tell it in the few seconds in which rotors change their speed most, and there a
-    gust may pass for it. Every sample of a tachometer tells it.
+    Accelerations show it only while rotors change their speed most, a few seconds in which a gust
+    may imitate it. Innovations of the tachometers show it at every sample.
     """
-    if lack is None or not seen.contradict("tachometer_lag", lack.late):
-        return lack
-    return replace(lack, late=0.0).or_none
+    if model_errors is None or not seen.contradicts("tachometer_lag", model_errors.speed_lag):
+        return model_errors
+    return replace(model_errors, speed_lag=0.0).or_none
 
 
-def _with_lags(
-    seen: Innovations,
+def _with_lag_terms(
+    seen: LinearisedInnovations,
     there: Fitted,
     predictor: Predictor,
     on_message: Callable[[str], None],
-) -> tuple[Innovations, Fitted, Predictor]:
-    """Return the fit with what acts as a latency at its neutral value, if samples call for it.
+) -> tuple[LinearisedInnovations, Fitted, Predictor]:
+    """Return the fit with lag terms, if innovations are likelier with them.
 
-    There a fit has long made up for it, with other lags and stronger disturbances: what it is worth
-    is seen once all of these have followed. Terms are judged once more beside it. A filter that has
-    lost a flight calls for nothing.
+    At its neutral value a lag acts as a latency, and the fit without it has made up for it with
+    other lags and stronger disturbances. So it is judged after a refit, and the other terms are
+    selected once more beside it. A filter that has lost a flight selects nothing.
     """
-    with_lags = seen.with_lags() if predictor.keeps_track else None
-    if with_lags is None:
+    with_lag_terms = seen.with_lag_terms() if predictor.keeps_track else None
+    if with_lag_terms is None:
         return seen, there, predictor
     without, had = predictor.without_gains, seen.selected.kept
     del predictor
-    fitted, beside = _descended(with_lags, with_lags.fitted, without)
+    fitted, beside = _fit_innovations(with_lag_terms, with_lag_terms.fitted, without)
     if not (beside.keeps_track and beside.is_likelier_than(without)):
         full = full_problem_of(there.objective, there.point)
         point = Point(full.point.coefficients, without.feed.offsets)
         return seen, there, without.at(full.objective, point)
-    on_message(_said(seen.selected, with_lags))
-    chosen, selected = Innovations.of(with_lags, fitted, beside).selection(had), with_lags
+    on_message(_changed_terms(seen.selected, with_lag_terms))
+    chosen, selected = (
+        LinearisedInnovations.of(with_lag_terms, fitted, beside).selection(had),
+        with_lag_terms,
+    )
     if chosen is not None:
-        on_message(_said(selected, chosen))
+        on_message(_changed_terms(selected, chosen))
         selected, fitted = chosen, chosen.fitted
-    fitted, beside = _descended(selected, fitted, beside.without_gains)
-    return Innovations.of(selected, fitted, beside), fitted, beside
+    fitted, beside = _fit_innovations(selected, fitted, beside.without_gains)
+    return LinearisedInnovations.of(selected, fitted, beside), fitted, beside
 
 
-def _descended(
+def _fit_innovations(
     selected: Selected, fitted: Fitted, predictor: Predictor, *, steps: int = STEPS
 ) -> tuple[Fitted, Predictor]:
-    """Return the fit to least innovations from a fit on, and what predicts there.
+    """Return the maximum-likelihood fit to innovations, started at a fit, and its predictor.
 
-    The filter goes on from its own strengths and clocks.
+    The filter starts from its own strengths and clocks.
     """
     job, own = selected.job, predictor.feed.offsets
     full = full_problem_of(fitted.objective, fitted.point)
@@ -238,33 +247,32 @@ def _descended(
     return replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)), predictor
 
 
-def _agree(new: Uncertainty, old: Uncertainty) -> bool:
+def _estimates_agree(new: Uncertainty, old: Uncertainty) -> bool:
     """Return whether no coefficient moved by more than the errors of both fits allow.
 
-    A filter knows more where its noise model holds, and something else where it does not. Of the
-    two estimates least squares' is the one that stays right then (Hausman 1978, who needs its
-    error alone: his other estimate is never the less sure one, ours is of what set-points tell).
+    A filter is more efficient where its noise model holds, and inconsistent where it does not;
+    least squares stays consistent (Hausman 1978, who needs its error alone, as his other estimate
+    is always the more efficient one; ours is not for coefficients that set-points hide).
     """
     return all(
-        abs(there.value - estimate.value)
-        <= CONTRADICTS * np.hypot(estimate.std_error, there.std_error)
-        for name, estimate in old.estimates.items()
-        if (there := new.estimates.get(name)) is not None
+        abs(one.value - other.value) <= CONTRADICTION_SE * np.hypot(other.std_error, one.std_error)
+        for one, other in _common_estimates(new, old)
     )
 
 
 def _is_sharper(new: Uncertainty, old: Uncertainty) -> bool:
     """Return whether coefficients are known better, in the mean of their errors' logarithms."""
-    ratios = [
-        there.std_error / estimate.std_error
-        for name, estimate in old.estimates.items()
-        if (there := new.estimates.get(name)) is not None
-    ]
+    ratios = [one.std_error / other.std_error for one, other in _common_estimates(new, old)]
     return bool(np.mean(np.log(ratios)) < 0.0)
 
 
-def _said(before: Selected, after: Selected) -> str:
-    """Return which terms innovations call for, and which they can do without."""
+def _common_estimates(new: Uncertainty, old: Uncertainty) -> list[tuple[Estimate, Estimate]]:
+    both = new.estimates.keys() & old.estimates.keys()
+    return [(new.estimates[name], old.estimates[name]) for name in old.estimates if name in both]
+
+
+def _changed_terms(before: Selected, after: Selected) -> str:
+    """Return the message that names the terms that innovations add and remove."""
     changes = [row for row in after.rows if row not in before.rows]
     groups = [row.group for row in changes if row.kept]
     gone = [row.group for row in changes if not row.kept]
@@ -274,8 +282,8 @@ def _said(before: Selected, after: Selected) -> str:
     return f"Samples are predicted better so: fitting again {' and '.join(changed)}."
 
 
-def _finding(predictor: Predictor) -> Finding:
-    """Return what is said of the disturbances."""
+def _disturbance_finding(predictor: Predictor) -> Finding:
+    """Return the finding with the strengths of the disturbances."""
     gust, _, _, thrust, gust_seconds, thrust_seconds, _ = np.exp(predictor.strengths).tolist()
     numbers = {
         "gust": gust,

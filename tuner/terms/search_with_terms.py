@@ -23,21 +23,32 @@ from tuner.search.estimation import OnProgress, search
 from tuner.search.iteration import PointEstimate
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
-from tuner.terms.candidates import Selected, candidate_groups, groups_around, groups_named, start_of
+from tuner.terms.candidates import (
+    Selected,
+    candidate_groups,
+    condition_groups,
+    groups_named,
+    neutral_values_of,
+)
 from tuner.terms.selection import Selection
-from tuner.uncertainty.model_error import GAINS, gain_told, gains_far_off, lack_of
+from tuner.uncertainty.model_error import (
+    GAIN_AXES,
+    gain_by_commands,
+    gains_far_off,
+    model_errors_of,
+)
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.selection_table import Groups, SelectionCode
 
-MARKERS = ("marker_offset", "marker_tilt")
+MARKER_GROUPS = ("marker_offset", "marker_tilt")
 """The groups of the motion capture's frame."""
-LEAST_TILT = 3e-3
-"""rad of tilt in hover below which markers are not freed for it."""
-SIGNIFICANT = 3.0
-"""Standard errors, over the flights, by which the tilt exceeds zero."""
-SAME_GAIN = 0.02
-"""Share of a gain within which it is the file's."""
-FILES_GAINS = "Recorded commands have the file's gains: fitting again without {}."
+MIN_HOVER_TILT_RAD = 3e-3
+"""Least mean tilt in hover, rad, that frees the markers' frame."""
+MIN_TILT_SE = 3.0
+"""Standard errors over the flights by which the mean tilt must exceed zero."""
+GAIN_TOLERANCE = 0.02
+"""Relative difference below which a gain counts as the controller file's."""
+GAINS_REFUTED = "Recorded commands have the file's gains: fitting again without {}."
 
 
 def with_first_terms(job: Job) -> Job:
@@ -52,9 +63,9 @@ def with_first_terms(job: Job) -> Job:
     tilt = hover_tilt(job.fitted)
     if not isinstance(settings.terms, str):
         groups = groups_named(settings.terms, job.space)
-    elif settings.terms == "auto" and settings.free is None and _tilted(job, tilt):
+    elif settings.terms == "auto" and settings.free is None and _hovers_tilted(job, tilt):
         candidates = candidate_groups(job)
-        groups = {name: candidates[name] for name in MARKERS if name in candidates}
+        groups = {name: candidates[name] for name in MARKER_GROUPS if name in candidates}
     else:
         groups = {}
     names = [name for group in groups.values() for name in group]
@@ -64,7 +75,9 @@ def with_first_terms(job: Job) -> Job:
         require_voltage(job.fitted)
     begin = dict(zip(("marker_tilt_x", "marker_tilt_y"), tilt.mean(axis=0), strict=True))
     begin |= {name: row.begin for name in names if (row := COEFFICIENTS[name]).begin is not None}
-    values = {name: float(begin.get(name, value)) for name, value in start_of(names).items()}
+    values = {
+        name: float(begin.get(name, value)) for name, value in neutral_values_of(names).items()
+    }
     space = extended(job.space, names, settings, values)
     windows = None if job.windows is None else replace(job.windows, space=space)
     return replace(
@@ -87,14 +100,14 @@ def hover_tilt(flights: Sequence[Flight]) -> np.ndarray[tuple[int, int], np.dtyp
     return np.array(tilts or [(0.0, 0.0)])
 
 
-def _tilted(job: Job, tilt: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> bool:
+def _hovers_tilted(job: Job, tilt: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> bool:
     """Return whether the flights of a closed loop agree that their hover is not level."""
     closed = all(INLETS[inlet].closed_loop for inlet in job.inlets)
     if not closed or len(tilt) < 2:
         return False
     mean = np.abs(tilt.mean(axis=0))
     error = tilt.std(axis=0, ddof=1) / np.sqrt(len(tilt))
-    return bool(((mean > LEAST_TILT) & (mean > SIGNIFICANT * error)).any())
+    return bool(((mean > MIN_HOVER_TILT_RAD) & (mean > MIN_TILT_SE * error)).any())
 
 
 def search_with_terms(
@@ -111,9 +124,9 @@ def search_with_terms(
     """Look for the best coefficients of a job, and for the terms that its flights call for.
 
     Where most flights are far off, terms are tried before the base model is polished, and before
-    CMA-ES looks for another beginning; where flights contradict the fit, none is. Arguments and
-    errors are those of `search`; between the two, ``on_estimates`` gets where it ended, or, if it
-    has stopped because the model is far off, ``on_doubt`` what recorded commands say of gains.
+    CMA-ES looks for another start; where flights contradict the fit, none is. Arguments and errors
+    are those of `search`. Before terms are tried, ``on_estimates`` gets the search's estimates; if
+    the search stopped early, ``on_doubt`` gets findings about gains from recorded commands.
     """
 
     def searched(*, resume: bool, provisional: bool) -> Selected:
@@ -152,9 +165,9 @@ def _is_refuted(fitted: Fitted) -> bool:
 def with_terms_selected(
     job: Job, fitted: Fitted, on_progress: OnProgress, on_message: Callable[[str], None]
 ) -> Selected:
-    """Return the fit with the terms that the job names, or that the flights speak for.
+    """Return the fit with the terms that the job names, or that the flights select.
 
-    A job that says exactly what is free names no others, unless its ``terms`` do.
+    A job with a ``free`` list selects none, unless ``terms`` names some.
     """
     clock, candidates = time.perf_counter(), candidates_of(job)
     selection = Selection(job, fitted, candidates, on_progress, on_message)
@@ -163,7 +176,7 @@ def with_terms_selected(
     elif candidates:
         selected = selection.run()
         if refuted := refuted_by_commands(selected, selected.fitted):
-            on_message(FILES_GAINS.format(listed(refuted)))
+            on_message(GAINS_REFUTED.format(listed(refuted)))
             left = {name: names for name, names in candidates.items() if name not in refuted}
             gone = [row for row in with_refuted(selected, refuted).rows if row.group in refuted]
             without = replace(selection, candidates=left).run()
@@ -176,37 +189,34 @@ def with_terms_selected(
 
 
 def refuted_by_commands(selected: Selected, fitted: Fitted) -> tuple[str, ...]:
-    """Return the groups of gains in a selection's fit that recorded commands take back.
+    """Return the groups of fitted gains that recorded commands refute.
 
-    Simulated flights tell gains by all that a loop does, and may want others for what the model
-    lacks; how recorded commands answer the recorded rates says them by itself.
+    In a closed-loop simulation wrong gains may make up for model errors; the regression of recorded
+    commands on recorded rates estimates the gains by themselves.
     """
-    kept = {row.group: row.names for row in selected.rows if row.kept and row.names[0] in GAINS}
-    if not kept or (lack := lack_of(fitted, selected.job.fitted)) is None:
+    kept = {row.group: row.names for row in selected.rows if row.kept and row.names[0] in GAIN_AXES}
+    if not kept or (model_errors := model_errors_of(fitted, selected.job.fitted)) is None:
         return ()
     numbers = fitted.objective.space.numbers(fitted.point.coefficients)
 
-    def are_files(name: str) -> bool:
-        told = gain_told(name, lack.answers)
-        return told is not None and abs(numbers[name] * told[0] - 1.0) < SAME_GAIN
+    def matches_file(name: str) -> bool:
+        told = gain_by_commands(name, model_errors.controller_estimates)
+        return told is not None and abs(numbers[name] * told[0] - 1.0) < GAIN_TOLERANCE
 
-    return tuple(group for group, names in kept.items() if any(map(are_files, names)))
+    return tuple(group for group, names in kept.items() if any(map(matches_file, names)))
 
 
 def with_refuted(selected: Selected, groups: Collection[str]) -> Selected:
-    """Return a selection whose table says that recorded commands refute some groups."""
+    """Return a selection with some groups marked as refuted by recorded commands."""
     found = {"kept": False, "reason": SelectionCode.REFUTED}
     rows = (row.model_copy(update=found if row.group in groups else {}) for row in selected.rows)
     return replace(selected, rows=tuple(rows))
 
 
 def candidates_of(job: Job) -> Groups:
-    """Return the groups among which a job's flights choose: none where it says what is free."""
+    """Return the groups to select from; none where the job has a ``free`` list."""
     settings = job.settings.job
     if settings.terms != "auto" or settings.free is not None:
         return {}
     closed = all(INLETS[inlet].closed_loop for inlet in job.inlets)
-    return {
-        **candidate_groups(job),
-        **groups_around(job.objective, closed_loop=closed),
-    }
+    return {**candidate_groups(job), **condition_groups(job.objective, closed_loop=closed)}

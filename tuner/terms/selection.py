@@ -1,13 +1,12 @@
 """Selection of terms beyond the base model by whole flights, and the fit with them.
 
-One Jacobian scores all candidate groups at the fitted point. If one of them gains by more than
-chance all are fitted together, from where the search began; backward elimination takes away those
-that do not hold their places beside the others. The rest stays if each flight, predicted by a fit
-to the others, is then met better by more than the scatter.
+One Jacobian scores all candidate groups at the fitted point. If the gain of one is significant, all
+are fitted together from the search's start, and backward elimination removes those that are not
+accepted beside the others. The rest stays if fits to the other flights then predict each flight
+better by more than the scatter.
 
-What surrounds each flight (its wind, the decline of its battery) has a column for each flight.
-Other flights cannot predict it, sections of its own can; a flight that is left out keeps it, as it
-keeps its clocks.
+Per-flight conditions (wind, battery) have a column for each flight. Other flights cannot predict
+them, sections of the same flight can; a held-out flight keeps its own, as it keeps its clocks.
 """
 
 from __future__ import annotations
@@ -37,27 +36,27 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress, loop_of, with_loop
 from tuner.terms.candidates import (
     Selected,
-    coefficients_in,
-    conditions_in,
-    groups_in,
-    is_stand_in,
-    names_in,
+    coefficients_of,
+    conditions_of,
+    free_groups,
+    is_lumped,
+    names_of,
+    neutral_values_of,
     offsets_of,
-    presence_of,
+    prior_presence_of,
     reads_recording,
-    start_of,
     with_groups,
     with_terms,
 )
-from tuner.terms.linearisation import LinearisedFit, linear_at, predicted_losses, vector_after
-from tuner.terms.model_averaging import in_doubt
-from tuner.terms.score import Score, row_of, score, surviving
+from tuner.terms.linearisation import LinearisedFit, linearise, predicted_losses, vector_after
+from tuner.terms.model_averaging import selection_shifts
+from tuner.terms.score import Score, backward_elimination, row_of, score
 from tuner.vehicle.model import with_coefficients
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 MAX_ROUNDS = 4
-"""Of additions; each round adds all that gain by more than chance, and prunes."""
-WORTH_FITTING = (
+"""Rounds of additions; each adds all groups with a significant gain, and prunes."""
+GAINS_IN_FIT = (
     SelectionCode.PREDICTS_FLIGHTS,
     SelectionCode.PREDICTS_SECTIONS,
     SelectionCode.NOT_PREDICTED,
@@ -66,11 +65,10 @@ WORTH_FITTING = (
 
 @dataclass(frozen=True)
 class Selection:
-    """A selection among some groups, each round pruned backwards.
+    """Selection among candidate groups: rounds of additions, each followed by elimination.
 
-    Base model and all candidates make up one space, and all terms are computed whichever are in
-    the model, and all that may surround the flights: fits with different terms then share their
-    compiled programs.
+    Every fit computes all candidates, terms and conditions, whichever are in its model: fits with
+    different terms then share their compiled programs.
     """
 
     job: Job
@@ -80,18 +78,18 @@ class Selection:
     on_message: Callable[[str], None]
 
     def run(self) -> Selected:
-        """Add groups until none earns its place."""
+        """Add groups until no other is accepted."""
         state = self.linearised(self.fitted, {})
         dropped: dict[str, SelectionCode] = {}
         if self._worth_fitting(state, dropped) and (pruned := self._with_all(state)):
             state = pruned
-            gone = (name for name in self._worth_fitting(state, {}) if not is_stand_in(name))
+            gone = (name for name in self._worth_fitting(state, {}) if not is_lumped(name))
             dropped = dict.fromkeys(gone, SelectionCode.WORSE_AFTER_REFIT)
         for _ in range(MAX_ROUNDS):
             wanted = self._wanted(state, dropped)
             if not wanted:
                 break
-            grown = self._grown(state, wanted, dropped)
+            grown = self._with_added(state, wanted, dropped)
             if grown is None:
                 continue
             if set(grown.added) <= set(state.added):
@@ -99,58 +97,56 @@ class Selection:
             state = grown
         base, rows = (self.job, self.fitted), self._rows(state, dropped)
         selected = Selected(*base, rows, base=base)
-        doubt = self._in_doubt(state, selected.left_out)
+        doubt = self._selection_shifts(state, selected.left_out)
         if state.added:
             fitted = self._fitted(state, state.added, roughly=False)
-            job, fitted = with_groups(base, state.added, fitted, said=findings_at(*base))
+            job, fitted = with_groups(base, state.added, fitted, stale=findings_at(*base))
             selected = replace(selected, job=job, fitted=fitted)
-        return replace(selected, in_doubt=doubt)
+        return replace(selected, selection_shifts=doubt)
 
-    def _in_doubt(self, state: LinearisedFit, groups: Sequence[Sequence[str]]) -> dict[str, float]:
-        """Return how far each coefficient of the model would move with what is not in it."""
-        names = [*self.job.space.names, *names_in(state.added)]
+    def _selection_shifts(
+        self, state: LinearisedFit, groups: Sequence[Sequence[str]]
+    ) -> dict[str, float]:
+        """Return the shift of each coefficient of the model by omitted groups."""
+        names = [*self.job.space.names, *names_of(state.added)]
         linear = state.linear
-        outside = [(linear.columns_of(group), presence_of(group)) for group in groups]
-        moves = in_doubt(linear, linear.columns_of(names), outside)
-        coefficients = [name for name in names if name not in conditions_in(self.candidates)]
+        outside = [(linear.columns_of(group), prior_presence_of(group)) for group in groups]
+        moves = selection_shifts(linear, linear.columns_of(names), outside)
+        coefficients = [name for name in names if name not in conditions_of(self.candidates)]
         own = linear.columns_of(coefficients)
         return dict(zip(coefficients, moves[own].tolist(), strict=True))
 
     def _wanted(
         self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
     ) -> dict[str, Score]:
-        """Return the groups to fit next: all that gain by more than chance, if one predicts.
+        """Return the groups to fit next: all with significant gains, if one predicts.
 
-        As long as terms are missing, those that are there stand in for them and even what is true
-        may seem not to predict; fitted with all others, each has to.
+        While terms are missing, those in the model make up for them, and even a true one may not
+        seem to predict. After a fit with all others, each has to.
         """
         scores = self._worth_fitting(state, dropped)
-        return scores if any(found.earns_place for found in scores.values()) else {}
+        return scores if any(found.is_accepted for found in scores.values()) else {}
 
     def _worth_fitting(
         self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
     ) -> dict[str, Score]:
-        """Return the groups that gain by more than chance in the fit, whatever they predict."""
+        """Return the groups with a significant gain in the fit, whether they predict or not."""
         return {
             group: found
             for group in self.candidates
             if group not in state.added and group not in dropped
-            if (found := self._score(state, group)).reason in WORTH_FITTING
+            if (found := self._score(state, group)).reason in GAINS_IN_FIT
         }
 
     def _with_all(self, base: LinearisedFit) -> LinearisedFit | None:
-        """Return what backward elimination leaves of all groups, if it predicts better.
+        """Return what backward elimination keeps of all groups, if it predicts better.
 
-        Where something is missing the base fit lies anywhere, and what little it shows of the
-        missing terms picks those that stand in for them, or lets none of them predict by itself. So
-        the search begins again where it began, with every candidate in the model but those that
-        describe as a whole what others do one by one: beside them nothing else would seem needed,
-        and noise would choose. They are added if something is left to explain; the others have had
-        their trial.
+        Where terms are missing the base fit is biased, and selection from there picks the wrong
+        terms, or none predicts by itself. So the search starts again with every candidate in the
+        model but lumped ones: beside these nothing else would seem needed. Lumped ones are tried
+        last, if something is left to explain.
         """
-        groups = {
-            group: names for group, names in self.candidates.items() if not is_stand_in(group)
-        }
+        groups = {group: names for group, names in self.candidates.items() if not is_lumped(group)}
         self.on_message(
             f"The flights call for more than the base model: searching again with all "
             f"{len(groups)} groups of terms, to see which can go."
@@ -160,12 +156,12 @@ class Selection:
             return trial
         return None
 
-    def _grown(
+    def _with_added(
         self, state: LinearisedFit, wanted: Mapping[str, Score], dropped: dict[str, SelectionCode]
     ) -> LinearisedFit | None:
-        """Return the fit with the groups that hold their places in it, if it predicts better.
+        """Return the fit with the wanted groups that survive elimination, if it predicts better.
 
-        Those that do not hold them beside all others are not tried again.
+        Groups that are eliminated are not tried again.
         """
         best, judged = max(wanted, key=lambda name: wanted[name].gain_holdout), list[set[str]]()
         for names in dict.fromkeys([tuple(wanted), (best,)]):
@@ -185,14 +181,14 @@ class Selection:
         return None
 
     def _pruned(self, state: LinearisedFit) -> LinearisedFit:
-        """Return the fit without the groups that do not hold their places beside the others."""
-        kept, taken = surviving(
+        """Return the fit after backward elimination, refitted until every group is accepted."""
+        kept, taken = backward_elimination(
             state.linear,
             state.linear.columns_of(self.job.space.names),
             {group: state.linear.columns_of(names) for group, names in state.added.items()},
             candidates=len(self.candidates),
-            stand_ins=[group for group in state.added if is_stand_in(group)],
-            no_gusts=[group for group in state.added if _no_gust(state, group)],
+            lumped=[group for group in state.added if is_lumped(group)],
+            excluding_gusts=[group for group in state.added if _excludes_gusts(state, group)],
         )
         if not taken or not kept:
             return state if kept else replace(state, added={})
@@ -201,19 +197,18 @@ class Selection:
         return self._pruned(self._refitted(self._without(state, taken), groups))
 
     def _without(self, state: LinearisedFit, taken: Collection[str]) -> LinearisedFit:
-        """Return a fit moved to where, to first order, the others end without some groups.
+        """Return a fit with some groups removed, the others moved to first order to make up for it.
 
-        They have to make up for what is taken away: from where they are, whole flights would lead
-        them astray.
+        Started from their old values, whole flights would diverge.
         """
         space, linear = state.fitted.objective.space, state.linear
-        gone = linear.columns_of(names_in({name: self.candidates[name] for name in taken}))
+        gone = linear.columns_of(names_of({name: self.candidates[name] for name in taken}))
         kept = {name: names for name, names in state.added.items() if name not in taken}
-        free = linear.columns_of([*self.job.space.names, *names_in(kept)])
-        change = linear.step(free, from_=linear.away(gone))
+        free = linear.columns_of([*self.job.space.names, *names_of(kept)])
+        change = linear.step(free, from_=linear.to_neutral(gone))
         of_flight, offsets = state.fitted.objective.of_flight, np.array(state.fitted.point.offsets)
         for name, unit in zip(of_flight, units_of(of_flight), strict=True):
-            if name in conditions_in(kept):
+            if name in conditions_of(kept):
                 offsets[of_flight.index(name)] += change[linear.columns_of([name])] / unit
         moved = vector_after(
             space, state.fitted.point.coefficients, change[linear.columns_of(space.names)]
@@ -224,17 +219,17 @@ class Selection:
     def _refitted(
         self, state: LinearisedFit, groups: Groups, *, anew: bool = False
     ) -> LinearisedFit:
-        """Return a rough fit with exactly these groups: a step that is left is a linear one."""
+        """Return a rough fit with exactly these groups: the rest of the way is a linear step."""
         return self.linearised(self._fitted(state, groups, anew=anew), groups)
 
     def _fitted(
         self, state: LinearisedFit, groups: Groups, *, anew: bool = False, roughly: bool = True
     ) -> Fitted:
-        """Return the fit with exactly these groups, from where the last one ended or anew."""
-        wanted, around = coefficients_in(groups), conditions_in(self.candidates)
-        idle = tuple(name for name in around if name not in conditions_in(groups))
+        """Return the fit with exactly these groups, from the last fit's end or from the start."""
+        wanted, around = coefficients_of(groups), conditions_of(self.candidates)
+        idle = tuple(name for name in around if name not in conditions_of(groups))
         objective, start = self._problem(state.fitted, wanted)
-        names, vector = objective.space.names, _known(state.fitted, objective, start)
+        names, vector = objective.space.names, _start_vector(state.fitted, objective, start)
         new = [group for group in groups if group not in state.added]
         new_ones = [name for group in new for name in groups[group] if name in wanted]
         from_here = replace(
@@ -242,7 +237,7 @@ class Selection:
             objective=objective,
             point=Point(
                 begun(objective.space, vector, new_ones),
-                offsets_of(state.fitted, objective, gone=idle),
+                offsets_of(state.fitted, objective, reset=idle),
             ),
         )
         offsets = free_offsets(self.job)
@@ -273,16 +268,16 @@ class Selection:
         )
 
     def linearised(self, fitted: Fitted, added: Groups) -> LinearisedFit:
-        """Return a fit as all candidates see it."""
-        objective, start = self._problem(fitted, coefficients_in(self.candidates))
-        vector = _known(fitted, objective, start)
+        """Return a fit linearised by all candidates."""
+        objective, start = self._problem(fitted, coefficients_of(self.candidates))
+        vector = _start_vector(fitted, objective, start)
         at = Point(np.asarray(vector), offsets_of(fitted, objective))
-        linear = linear_at(
+        linear = linearise(
             objective,
             at,
             fitted.criterion,
             offsets_fitted=np.asarray(at.offsets) != 0.0,
-            around=conditions_in(self.candidates),
+            conditions=conditions_of(self.candidates),
         )
         return LinearisedFit(fitted, added, linear)
 
@@ -291,25 +286,27 @@ class Selection:
     ) -> tuple[Objective, NDArray[np.float64]]:
         """Return a fit's base problem with some coefficients free, and its start vector (K,).
 
-        All candidates are in the model, at their neutral values, and all that may surround flights.
+        The model has all candidate terms and conditions, at their neutral values.
         """
         objective = with_loop(self.fitted.objective, loop_of(fitted.objective))
-        neutral = start_of(coefficients_in(self.candidates))
+        neutral = neutral_values_of(coefficients_of(self.candidates))
         values = {name: np.asarray(value) for name, value in neutral.items()}
         objective = replace(objective, model=with_coefficients(objective.model, values))
         objective, point = with_terms(objective, self.fitted.point, names, self.job.settings.job)
-        objective, point = with_conditions(objective, point, conditions_in(self.candidates))
+        objective, point = with_conditions(objective, point, conditions_of(self.candidates))
         return objective, np.array(point.coefficients)
 
     def _score(self, state: LinearisedFit, group: str) -> Score:
-        """Return what a group is worth beside the others in the model."""
+        """Return the score of a group beside the others in the model."""
         inside, names = group in state.added, self.candidates[group]
-        return self._worth(state, names, inside=inside, no_gust=_no_gust(state, group))
+        return self._score_of(
+            state, names, inside=inside, excludes_gusts=_excludes_gusts(state, group)
+        )
 
     def _rows(
         self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
     ) -> tuple[SelectionRow, ...]:
-        """Return the table: what is in the model first, by what it predicts."""
+        """Return the table: groups in the model first, then by held-out gain."""
         groups = dict.fromkeys([*state.added, *self.candidates])
         scores = {group: self._score(state, group) for group in groups}
         rows = [
@@ -318,35 +315,35 @@ class Selection:
             else row_of(group, self.candidates[group], found, dropped.get(group), kept=False)
             for group, found in scores.items()
         ]
-        free = groups_in(self.job.space, self.job.first_terms)
-        rows += self._rows_of(state, free, SelectionCode.OPEN_LOOP)
-        rows += self._rows_of(state, self.job.first_terms, SelectionCode.HOVERS_TILTED)
+        free = free_groups(self.job.space, self.job.first_terms)
+        rows += self._base_rows(state, free, SelectionCode.OPEN_LOOP)
+        rows += self._base_rows(state, self.job.first_terms, SelectionCode.HOVERS_TILTED)
         return tuple(sorted(rows, key=lambda row: (not row.kept, -(row.gain_holdout or 0.0))))
 
     def rows_of_named(self) -> tuple[SelectionRow, ...]:
-        """Return the rows of the terms that the job names, with what each is worth in the fit."""
+        """Return the rows of the terms that the job names, with their scores in the fit."""
         state = self.linearised(self.fitted, {})
-        return tuple(self._rows_of(state, self.job.first_terms, SelectionCode.ASKED_FOR))
+        return tuple(self._base_rows(state, self.job.first_terms, SelectionCode.ASKED_FOR))
 
-    def _rows_of(
+    def _base_rows(
         self, state: LinearisedFit, groups: Groups, reason: SelectionCode
     ) -> list[SelectionRow]:
         """Return the rows of groups of the base model."""
         return [
-            row_of(group, names, self._worth(state, names), reason, kept=True)
+            row_of(group, names, self._score_of(state, names), reason, kept=True)
             for group, names in groups.items()
         ]
 
-    def _worth(
+    def _score_of(
         self,
         state: LinearisedFit,
         names: Sequence[str],
         *,
         inside: bool = True,
-        no_gust: bool = False,
+        excludes_gusts: bool = False,
     ) -> Score:
-        """Return what some names are worth beside all else in the model."""
-        others = [*self.job.space.names, *names_in(state.added)]
+        """Return the score of some coefficients beside all others in the model."""
+        others = [*self.job.space.names, *names_of(state.added)]
         linear = state.linear
         return score(
             linear,
@@ -354,16 +351,16 @@ class Selection:
             linear.columns_of(names),
             candidates=len(self.candidates),
             inside=inside,
-            no_gust=no_gust,
+            excludes_gusts=excludes_gusts,
         )
 
     def _predicts_better(
         self, trial: LinearisedFit, state: LinearisedFit, *, by_flight: bool
     ) -> bool:
-        """Return whether a refit predicts flights left out better than the fit before it.
+        """Return whether a refit predicts held-out flights better than the fit before it.
 
-        By more than the standard error over the flights, or, where only sections of flights can
-        show it, not worse by as much.
+        By more than the standard error over flights; if only sections of flights support it, not
+        worse by more than that.
         """
         scale = state.fitted.criterion.scale
         gains = self._predicted(state, scale) - self._predicted(trial, scale)
@@ -373,17 +370,17 @@ class Selection:
         return bool(gains.sum() > (scatter if by_flight else -scatter))
 
     def _predicted(self, state: LinearisedFit, scale: Mapping[str, Array]) -> NDArray[np.float64]:
-        model = state.linear.columns_of([*self.job.space.names, *names_in(state.added)])
+        model = state.linear.columns_of([*self.job.space.names, *names_of(state.added)])
         own = state.linear.columns_of(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)
 
 
-def _known(fitted: Fitted, objective: Objective, start: NDArray[np.float64]) -> list[float]:
-    """Return a start vector (K,) of a problem with a fit's own numbers where it has some."""
+def _start_vector(fitted: Fitted, objective: Objective, start: NDArray[np.float64]) -> list[float]:
+    """Return a start vector (K,) of a problem, with a fit's values where it has them."""
     own, names = fitted.vector, objective.space.names
     return [own.get(name, start[i]) for i, name in enumerate(names)]
 
 
-def _no_gust(state: LinearisedFit, group: str) -> bool:
-    """Return whether no gust can pass for a group: it reads a recording, or noise alone is left."""
+def _excludes_gusts(state: LinearisedFit, group: str) -> bool:
+    """Return whether no gust can imitate a group: it reads a signal, or only noise is left."""
     return reads_recording(group) or state.fitted.residuals_at_noise_level

@@ -1,1 +1,1 @@
-"""What the flights say about each coefficient: how much, how surely, confused with what."""
+"""Uncertainty of each coefficient: standard errors, identifiability, sensitivity, verdicts."""

@@ -1,8 +1,7 @@
-"""The covariance of the fitted coefficients: the sandwich estimate, for residuals that wander.
+"""Covariance of the fitted coefficients: the sandwich estimate for correlated residuals.
 
-What stretches of time, whole flights and residuals show beyond noise is overdispersion:
-`overdispersion_factors` weighs an observed scatter against noise, `IndependentErrors` is what noise
-says, and `Stretches` are the pieces whose scatter is observed.
+`Stretches` of time are the clusters whose scores scatter, `IndependentErrors` are the errors by
+noise alone, and `overdispersion_factors` widens these by the observed scatter.
 """
 
 from __future__ import annotations
@@ -15,14 +14,14 @@ from scipy import special  # scipy.stats takes a quarter of a second to import
 from tuner.core.numerics import Z95, Array, Inverse, scaled_root, symmetric_eigen
 from tuner.objective.information import BLOCK, FisherInformation
 
-WIDE = 100.0
-"""Factor on the priors' widths that leaves practically the information of the flights alone."""
+PRIOR_WIDENING = 100.0
+"""Factor on the priors' widths that leaves the information of the flights alone."""
 FULL_LEVERAGE = 0.5
-"""Leverage of a stretch of time on the fit up to which its score is corrected in full."""
+"""Leverage of a stretch of time on the fit up to which its score is corrected in full: CV3."""
 MAX_LEVERAGE = 0.999
-"""Leverage beyond which it is corrected no further."""
+"""Leverage beyond which the correction stays the same."""
 RIDGE = 1e-13
-"""Of the scaled information: below rounding errors of what flights and priors add up to."""
+"""Added to the scaled information: below its rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +31,8 @@ class Covariance:
     Attributes
     ----------
     matrix
-        (K, K), flights and priors together, inflated where residuals are correlated in time. The
-        errors are those of normal distributions with the 95 % intervals that are meant.
+        (K, K), flights and priors together, inflated where residuals are correlated in time. Each
+        error is the half-width of a 95 % interval over 1.96.
     data_only
         (K, K), the same from the flights alone; huge where they carry no information.
     inflation
@@ -70,7 +69,7 @@ class Covariance:
 
     @property
     def shape(self) -> Array:
-        """``data_only`` (K, K), but widened alike for all: what trades off exactly still does."""
+        """``data_only`` (K, K), widened by one factor: exact trade-offs stay exact."""
         own = np.outer(self.beyond_noise, self.beyond_noise)
         return np.asarray(self.data_only / own * np.median(self.beyond_noise) ** 2)
 
@@ -84,26 +83,25 @@ def covariance_of(information: FisherInformation) -> Covariance:
     """Return the covariance of a fit.
 
     With independent residuals the covariance is H⁻¹ B H⁻¹, B each channel's information times its
-    residuals' mean square. Gusts and model error are no white noise: stretches of time are summed
-    up and their scores' spread takes the place of B (the sandwich estimate). A score is corrected
-    for the stretch's own leverage on the fit, in full as the jackknife has it (CV3): half of that,
-    which is exact for white noise, is too little for what wanders slowly, for a fit of many
-    coefficients takes much of it out (MacKinnon, Nielsen and Webb, "Fast and reliable jackknife and
-    bootstrap methods for cluster-robust inference", 2023). What one stretch alone determines the
-    others tell so little of that the jackknife would multiply white noise without bound: beyond a
-    leverage of one half, half of the correction is for it, and white noise counts no more than
-    twice. Few stretches make that estimate erratic: what is allowed for is weighed against what
-    independent residuals would say, by the degrees of freedom that the stretches amount to
-    (`overdispersion_factors`; Bell and McCaffrey, "Bias reduction in standard errors for linear
-    regression with multi-stage samples", 2002).
+    residuals' mean square. Gusts and model error are not white: the scatter of the scores of
+    stretches of time replaces B (the sandwich estimate). A score is corrected for the stretch's
+    leverage on the fit, in full as in the jackknife (CV3). CV2, exact for white noise, is too
+    little for slow disturbances, much of which a fit of many coefficients absorbs (MacKinnon,
+    Nielsen and Webb, "Fast and reliable jackknife and bootstrap methods for cluster-robust
+    inference", 2023). Where one stretch alone determines a coefficient, CV3 would multiply white
+    noise without bound: beyond a leverage of one half the correction passes over to CV2, and white
+    noise is at most doubled. The estimate from few stretches is erratic, so it is combined with
+    that of independent residuals by its degrees of freedom (`overdispersion_factors`; Bell and
+    McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage samples",
+    2002).
     """
     independent = IndependentErrors.of(information)
     inverse, matrix = independent.inverse, independent.matrix
     meat, freedom = scatter(stretches_of(information), information.total)
     observed = np.diag(inverse.sandwiched(meat, np.zeros_like(meat)))
     inflation = independent.widened(observed, freedom) / np.sqrt(np.diag(matrix))
-    data = information.data + information.prior / WIDE**2
-    data_inverse = Inverse.of(data, information.prior / WIDE**2).matrix
+    data = information.data + information.prior / PRIOR_WIDENING**2
+    data_inverse = Inverse.of(data, information.prior / PRIOR_WIDENING**2).matrix
     matrix = matrix * np.outer(inflation, inflation)
     beyond_noise = np.sqrt(np.diag(matrix) / np.diag(inverse.matrix))
     return Covariance(
@@ -117,9 +115,8 @@ def covariance_of(information: FisherInformation) -> Covariance:
 def scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:
     """Return the sum (K, K) over stretches of the corrected scores' outer products, the "meat".
 
-    And the degrees of freedom (K,) of the variances that it gives: were the scores' covariances
-    the stretches' information, less what the fit takes out, those would be quadratic forms whose
-    first two moments are those of a χ² with so many.
+    And the degrees of freedom (K,) of its variances: those of the χ² with the same first two
+    moments, if the scores' covariances are the stretches' information less the fit's share.
     """
     factor, unit = scaled_root(total, RIDGE)
     scale = np.outer(unit, unit)
@@ -143,54 +140,51 @@ def scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:
 
 
 CENTRE_QUARTILE = 2.0
-"""Of the logarithm of τ, a priori: half of all are between a seventh and seven."""
+"""Quartile of the prior of log τ: half of all τ are between 1/7 and 7."""
 SPREAD_QUARTILE = float(np.log(2.0))
-"""Quartile of how far the logarithms of the τ of one fit's coefficients are from their centre: half
-of them within a factor of two."""
-GRID = 200
-SMALLEST, LARGEST = 1e-3, 1e3
-"""Of the τ that are looked at, and times the observed one."""
-FREEDOM = (1.0, 200.0)
-"""Degrees of freedom, at least and at most."""
-HALVINGS = 40
+"""Quartile of log τ of one fit's coefficients about their centre: half are within a factor of 2."""
+TAU_GRID_POINTS = 200
+TAU_MIN, TAU_MAX = 1e-3, 1e3
+"""Range of the grid of τ; the largest is a factor on the observed one."""
+FREEDOM_RANGE = (1.0, 200.0)
+"""Range to which degrees of freedom are clipped."""
+BISECTIONS = 40
 
 
 def overdispersion_factors(
     ratio: Array, freedom: Array, correlation: Array, expected: Array
 ) -> Array:
-    """Return the factors (K,) on the standard errors that noise says.
+    """Return the factors (K,) on the standard errors by noise alone.
 
     With them, 1.96 standard errors are 95 % intervals of errors whose variance is 1 + τ² times the
-    noise's. A priori log τ is Cauchy about a centre that the coefficients of a fit share, for what
-    disturbs flights disturbs all of them, though not alike (``expected``): a gust is slow, and a
-    latency is told by what is quick. And so is that centre about 1: τ is as likely small as
-    large, and as large as it must be where observations say so. A normal distribution would trust
-    the observed scatter as it is, and few flights scatter less than they should half of the time;
-    Student's t, which knows nothing of τ, makes intervals of noise alone twice as wide as they need
-    be where two flights speak.
+    noise's. The prior of log τ is Cauchy about a centre shared by the fit's coefficients, as
+    disturbances act on all of them, though not equally (``expected``): gusts are slow, and fast
+    signals determine latencies. The centre's prior is Cauchy about 0: small and large τ are equally
+    likely, and the tail yields to observations. A normal distribution would trust the observed
+    scatter, which is too small half of the time for few flights; Student's t, without a prior of τ,
+    doubles the intervals of pure noise for two flights.
 
     Parameters
     ----------
     ratio
         (K,) observed variance over the noise's.
     freedom
-        (K,) degrees of freedom of the χ² that the observation is.
+        (K,) degrees of freedom of the observed variance, taken as χ².
     correlation
-        (K, K) of the estimates: observations that go together are counted once.
+        (K, K) of the estimates: correlated observations count once.
     expected
-        (K,) variances over the noise's by how disturbed what determines each coefficient is: by
-        how much they differ, the τ are expected to; their common size does not matter.
+        (K,) expected ratios up to a common factor, as of `IndependentErrors.disturbance_ratio`.
 
     Notes
     -----
     After Gelman, "Prior distributions for variance parameters in hierarchical models", 2006, whose
-    half-Cauchy leaves intervals too narrow where τ is large: its logarithm has the longer tail.
-    Each coefficient's evidence of the centre is tempered to the share of all that is its own; the
-    squares of two errors are correlated as the square of the errors' correlation.
+    half-Cauchy leaves intervals too narrow where τ is large: log-Cauchy has the longer tail. The
+    likelihood of the centre is tempered for each coefficient by its independent share: the squares
+    of two errors have the squared correlation of the errors.
     """
-    freedom = np.clip(freedom, *FREEDOM)
-    largest = LARGEST * np.sqrt(max(float(ratio.max()), 1.0))
-    log_excess = np.linspace(np.log(SMALLEST), np.log(largest), GRID)
+    freedom = np.clip(freedom, *FREEDOM_RANGE)
+    largest = TAU_MAX * np.sqrt(max(float(ratio.max()), 1.0))
+    log_excess = np.linspace(np.log(TAU_MIN), np.log(largest), TAU_GRID_POINTS)
     variance = 1.0 + np.exp(2.0 * log_excess)
     likelihood = -0.5 * freedom[:, None] * (np.log(variance) + ratio[:, None] / variance)
     likelihood = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
@@ -207,7 +201,7 @@ def overdispersion_factors(
     weight /= weight.sum(axis=1, keepdims=True)
     sd, half = np.sqrt(variance), Z95
     low, high = np.zeros_like(ratio), np.full_like(ratio, np.log(sd[-1]))
-    for _ in range(HALVINGS):
+    for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         tails = special.ndtr(-half * np.exp(middle)[:, None] / sd)
         too_narrow = 2.0 * (weight * tails).sum(axis=1) > 0.05
@@ -215,35 +209,35 @@ def overdispersion_factors(
     return np.asarray(np.exp(0.5 * (low + high)))
 
 
-ROUNDING = 1e-9
-"""Share of a variance that the flights must have in it to say anything of it."""
-LEAST = 1e-3
-"""Of what is expected of a sum of squares: less is chance."""
-HALVED_AT = 0.1
-"""Share of a variance that, if a fit leaves no more of it to be seen, halves what is made of it."""
+MIN_FLIGHT_SHARE = 1e-9
+"""Least share of the flights in a variance: less is rounding of the prior's."""
+MIN_SQUARES_RATIO = 1e-3
+"""Least ratio of a sum of squares to its expectation: less is chance."""
+HALF_WEIGHT_SHARE = 0.1
+"""Share of the variance left in residuals at which a disturbance ratio gets half its weight."""
 
 
 @dataclass(frozen=True)
 class IndependentErrors:
-    """Errors of K estimates with independent residuals, as large as they are seen to be.
+    """Errors of K estimates for independent residuals of their observed size.
 
     Attributes
     ----------
     inverse
-        Of the information.
+        Inverse of the information.
     matrix
         (K, K) covariance H⁻¹ B H⁻¹, B each channel's information times its residuals' mean square.
     from_flights
-        (K,) the flights' share of the variances.
-    disturbed
-        (K,) how many times their share the channels and times that determine each coefficient are
-        disturbed; how much they differ is meant, not how large they are.
+        (K,) the flights' part of the variances.
+    disturbance_ratio
+        (K,) relative size of the disturbances in the channels and times that determine each
+        coefficient; a common factor has no meaning.
     """
 
     inverse: Inverse
     matrix: Array
     from_flights: Array
-    disturbed: Array
+    disturbance_ratio: Array
 
     @staticmethod
     def of(information: FisherInformation) -> IndependentErrors:
@@ -255,27 +249,27 @@ class IndependentErrors:
             inverse=inverse,
             matrix=_positive(inverse.sandwiched(white, information.given), inverse.matrix),
             from_flights=from_flights,
-            disturbed=_disturbed(information, inverse.matrix, from_flights),
+            disturbance_ratio=_disturbance_ratio(information, inverse.matrix, from_flights),
         )
 
     def widened(self, observed: Array, freedom: Array) -> Array:
-        """Return the standard errors (K,) that an observed scatter speaks for.
+        """Return the standard errors (K,) widened by an observed scatter.
 
         Parameters
         ----------
         observed
-            (K,) the variances that the flights are seen to have.
+            (K,) observed variances.
         freedom
-            (K,) degrees of freedom of what was observed; see `overdispersion_factors`.
+            (K,) degrees of freedom of each; see `overdispersion_factors`.
         """
         variance = np.diag(self.matrix)
-        # where the prior alone speaks, what is left of the flights' share is rounding, of any sign
-        speaks = self.from_flights > ROUNDING * variance
+        # where the prior alone determines a coefficient, the flights' part is rounding, of any sign
+        speaks = self.from_flights > MIN_FLIGHT_SHARE * variance
         ratio = np.where(speaks, observed / np.where(speaks, self.from_flights, 1.0), 1.0)
         covariance = self.inverse.matrix
         own = np.sqrt(np.diag(covariance))
         allowed = overdispersion_factors(
-            ratio, freedom, covariance / np.outer(own, own), self.disturbed
+            ratio, freedom, covariance / np.outer(own, own), self.disturbance_ratio
         )
         beyond = np.where(speaks, self.from_flights * (allowed**2 - 1.0), 0.0)
         return np.asarray(np.sqrt(variance + beyond))
@@ -284,21 +278,22 @@ class IndependentErrors:
 def _positive(matrix: Array, inverse: Array) -> Array:
     """Return a covariance (K, K) whose variances are positive.
 
-    What learnt strengths take is no noise and counts as negative in the sandwich. Where it takes
-    all that small residuals leave, residuals are as large as assumed.
+    Estimated strengths of disturbances take information away, which is negative in the sandwich.
+    Where small residuals leave nothing else, the residuals' assumed size is used.
     """
-    left = np.diag(matrix) > LEAST * np.diag(inverse)
+    left = np.diag(matrix) > MIN_SQUARES_RATIO * np.diag(inverse)
     return np.where(np.outer(left, left), matrix, inverse)
 
 
-def _disturbed(information: FisherInformation, inverse: Array, from_flights: Array) -> Array:
-    """Return how disturbed what determines each coefficient (K,) is, over independent residuals.
+def _disturbance_ratio(
+    information: FisherInformation, inverse: Array, from_flights: Array
+) -> Array:
+    """Return the relative size (K,) of the disturbances that act on each coefficient.
 
-    What each channel says of each block of time would move the estimates by so much, each by
-    itself: squares are summed up over what is expected of them. Correlation in time and between
-    channels is not in it, which is what the stretches are for; but each block of each channel is a
-    degree of freedom, and there are many. Of what a block alone determines, the fit leaves nothing
-    to be seen: so much of the expectation as it took out counts as disturbed like the rest.
+    Each block of each channel moves the estimates by itself: the sum of these squares over its
+    expectation for independent residuals. It leaves out correlation in time and between channels,
+    which is in the stretches, but it has many degrees of freedom. A fit leaves no residuals where
+    one block alone determines a coefficient: the ratio is shrunk by the share left.
     """
     scores = information.score - information.blocks @ (inverse @ information.slope)
     seen = np.square(scores @ inverse).sum(axis=(0, 1, 2))
@@ -306,33 +301,32 @@ def _disturbed(information: FisherInformation, inverse: Array, from_flights: Arr
     taken = np.einsum(
         "cf,cfbpk,pq,cfbqk->k", information.spread, follow, inverse, follow, optimize=True
     )
-    speaks = from_flights > ROUNDING * np.diag(inverse)
+    speaks = from_flights > MIN_FLIGHT_SHARE * np.diag(inverse)
     share = np.clip(1.0 - taken / np.where(speaks, from_flights, np.inf), 0.0, 1.0) * speaks
     expected = np.where(share > 0.0, share * from_flights, 1.0)
-    log_ratio = np.log(np.maximum(seen / expected, LEAST))
-    told = share / (share + HALVED_AT)
-    centre = told @ log_ratio / max(told.sum(), LEAST)
-    return np.asarray(np.exp(told * (log_ratio - centre)))
+    log_ratio = np.log(np.maximum(seen / expected, MIN_SQUARES_RATIO))
+    weight = share / (share + HALF_WEIGHT_SHARE)
+    centre = weight @ log_ratio / max(weight.sum(), MIN_SQUARES_RATIO)
+    return np.asarray(np.exp(weight * (log_ratio - centre)))
 
 
-STRETCH = 8.0
-"""s beyond which what disturbs a flight is forgotten: gusts last a second, and the closed loop
-makes a slow wandering of them. Of lengths from 2 to 18 s the one whose intervals held the truth as
-often as they should, and were narrow: linear refits to simulated flights in gusts."""
-FEWEST_STRETCHES = 16
-"""Of short recordings, stretches are shorter, so that there are as many."""
-FEWEST_PARTS = 4
-"""Where there are fewer flights to leave out in turn, each is cut into parts, none of them shorter
-than a stretch: those would show what stretches show."""
+STRETCH_S = 8.0
+"""Length of a stretch, beyond the correlation time of disturbances: gusts last a second, and the
+closed loop makes slow wander of them. Of lengths from 2 to 18 s this one gave narrow intervals with
+the right coverage in linear refits to simulated flights in gusts."""
+MIN_STRETCHES = 16
+"""Least number of stretches: those of short recordings are shorter."""
+MIN_FLIGHT_PARTS = 4
+"""Fewer flights are cut into parts to leave out in turn, none shorter than a stretch, whose scatter
+is a part of its own."""
 
 
 @dataclass(frozen=True)
 class Stretches:
     """Information (N, K, K) and score (N, K) of N stretches, all channels together.
 
-    The scores are those at the minimum of the loss, which a search ends near: what one strong
-    flight says, it says of the last thousandth of a step too, and so loudly that without it the
-    others would seem to be pulled away.
+    The scores are those at the minimum of the loss, which a search ends near: one flight with much
+    information would have a large score at even a thousandth of a step from it.
     """
 
     information: Array
@@ -340,25 +334,25 @@ class Stretches:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of stretches."""
         return len(self.score)
 
     def projected(self, axes: Array) -> Stretches:
-        """Return what they say along other axes, the columns of a matrix (K, L)."""
+        """Return information and scores along other axes, the columns of a matrix (K, L)."""
         return Stretches(axes.T @ self.information @ axes, self.score @ axes)
 
 
 def stretches_of(information: FisherInformation) -> Stretches:
-    """Return all flights in stretches of `STRETCH`, shorter ones where that makes too few."""
+    """Return all flights in stretches of `STRETCH_S`, or shorter ones for short recordings."""
     total = float(np.sum(_ends(information)))
-    return _cut(information, float(np.clip(total / FEWEST_STRETCHES, BLOCK, STRETCH)))
+    return _cut(information, float(np.clip(total / MIN_STRETCHES, BLOCK, STRETCH_S)))
 
 
-def flights_apart(information: FisherInformation) -> Stretches:
-    """Return the flights as they can be left out in turn: whole, or a few parts of each."""
+def flight_parts(information: FisherInformation) -> Stretches:
+    """Return the parts to leave out in turn: whole flights, or a few parts of each."""
     ends = _ends(information)
     longest = float(ends.max())
-    each = min(-(-FEWEST_PARTS // len(ends)), int(longest / STRETCH))
+    each = min(-(-MIN_FLIGHT_PARTS // len(ends)), int(longest / STRETCH_S))
     return _cut(information, longest / each if each > 1 else np.inf)
 
 

@@ -16,29 +16,30 @@ from tuner.objective.criterion import Point
 from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted
-from tuner.uncertainty.covariance import Covariance, IndependentErrors, covariance_of, flights_apart
+from tuner.uncertainty.covariance import Covariance, IndependentErrors, covariance_of, flight_parts
 from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict, judge
 from tuner.vehicle import COEFFICIENTS, scale_group, term_groups
 
 STEP = "step"
-"""Simulated otherwise: half the physics step, controllers and log at their own rates."""
+"""Key of the problem with half the physics step, controllers and log at their own rates."""
 LOGGED = "logged"
-"""Rotor speeds as a logger may have filtered them."""
+"""Key of the problem with rotor speeds filtered sample by sample."""
 READINGS = "readings"
-"""The battery's voltmeter read again, `DRAWS` times."""
-LACK = "lack"
-"""With what pushes the flights along and is none of the model."""
+"""Key of the problems with the battery's voltmeter read again, `VOLTMETER_DRAWS` times."""
+MODEL_ERRORS = "lack"
+"""Key of the problem with model errors applied."""
 LIMIT = "limit"
+"""Key of the problem with a lower limit of rotor speeds."""
 LIMIT_STEP, LIMIT_SD = 0.01, 0.25
-"""Share by which the rotors' limit is lowered to see what it moves, and to which it is known where
-nothing recorded tells rotor speeds: a vehicle file has a nominal one."""
-DRAWS = 6
-"""How many times: an error that is told by so many is told to a third."""
-AT_BOUND = 2e-3
-"""Distance from a bound, as a share of the range, within which a fit has ended at it."""
-DELAYS = ("actuator_latency",)
-"""By which a rotor's command is late, beside the rotor's own time constants."""
+"""Share by which that limit is lowered, and its relative standard error where rotor speeds were not
+recorded: a vehicle file has a nominal limit."""
+VOLTMETER_DRAWS = 6
+"""Draws of the voltmeter's readings: they estimate an error to a third of itself."""
+BOUND_MARGIN = 2e-3
+"""Distance from a bound, as a share of the range, within which a fit counts as at the bound."""
+ROTOR_DELAYS = ("actuator_latency",)
+"""Coefficients that delay a rotor's command, beside the rotor's own time constants."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class Estimate:
     verdict, reason
         How well it is known and why.
     parts
-        What the standard error is made of.
+        Parts of the standard error.
     """
 
     value: float
@@ -71,7 +72,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How well a fit's coefficients are known.
+    """Uncertainty of a fit's coefficients.
 
     Attributes
     ----------
@@ -107,7 +108,7 @@ class Uncertainty:
 def uncertainty_of(
     fitted: Fitted, *, offsets_fitted: NDArray[np.bool_] | None = None
 ) -> Uncertainty:
-    """Return how well a fit's coefficients are known.
+    """Return the uncertainty of a fit's coefficients.
 
     Parameters
     ----------
@@ -119,13 +120,13 @@ def uncertainty_of(
     )
     space = fitted.objective.space
     searched = set(space.names) - set(fitted.held.values())
-    information = information.resting(at_rest(space, fitted.point, searched))
+    information = information.resting(resting_parameters(space, fitted.point, searched))
     vector = np.asarray(fitted.point.coefficients)
     return uncertainty_at(space, vector, information, tuple(fitted.scales))
 
 
-def at_rest(space: Space, point: Point, searched: Collection[str]) -> NDArray[np.bool_]:
-    """Return which parameters (K,) no search moves: those not searched, and those at a bound."""
+def resting_parameters(space: Space, point: Point, searched: Collection[str]) -> NDArray[np.bool_]:
+    """Return which parameters (K,) a search cannot move: those held, and those at a bound."""
     bounds = zip(space.names, _bounds(space, np.asarray(point.coefficients)), strict=True)
     return np.array([name not in searched or bound is not None for name, bound in bounds], bool)
 
@@ -133,7 +134,7 @@ def at_rest(space: Space, point: Point, searched: Collection[str]) -> NDArray[np
 def uncertainty_at(
     space: Space, vector: Array, information: FisherInformation, flights: Sequence[str]
 ) -> Uncertainty:
-    """Return how well the coefficients are known, from the information at a search vector (K,)."""
+    """Return the uncertainty of coefficients from the information at a search vector (K,)."""
     scaled = space.scaled(vector)
     reference, bounds = references(space, vector), _bounds(space, vector)
     of_residuals = covariance_of(information)
@@ -217,15 +218,14 @@ def _estimates(
 
 
 def _lags(space: Space, scaled: Array) -> Array:
-    """Return how far each scaled coordinate (K,) moves for each s by which a rotor's lag is longer.
+    """Return the change of each scaled coordinate (K,) per s of a rotor's lag; zero for others.
 
-    A rotor's time constants, and the delay of its command, which a simulator begins to follow at a
-    step's beginning or at its end. The estimate of the state is shifted in time, in no simulator's
-    steps.
+    Lags are a rotor's time constants and the delay of its command, which simulators round to steps.
+    The latency of the state estimate is not one: it is a shift in time that depends on no step.
     """
     rows = [COEFFICIENTS[name] for name in space.names]
     is_lag = np.array(
-        [row.unit == "s" and (row.scope == "vehicle" or row.name in DELAYS) for row in rows]
+        [row.unit == "s" and (row.scope == "vehicle" or row.name in ROTOR_DELAYS) for row in rows]
     )
     return np.asarray(is_lag / np.where(space.is_log, np.exp(np.where(is_lag, scaled, 0.0)), 1.0))
 
@@ -239,7 +239,7 @@ def references(space: Space, vector: Array) -> Array:
 def _bounds(space: Space, vector: Array) -> list[Literal["lower", "upper"] | None]:
     """Return the bound at which each parameter has ended, if it has."""
     return [
-        "lower" if share < AT_BOUND else "upper" if share > 1 - AT_BOUND else None
+        "lower" if share < BOUND_MARGIN else "upper" if share > 1 - BOUND_MARGIN else None
         for share in space.share(vector)
     ]
 
@@ -248,8 +248,8 @@ def _shares(information: FisherInformation, flights: int) -> tuple[Array, Array]
     """Return the shares (C, F, K) of channels and flights in the information, and of priors (K,).
 
     The inverse of a parameter's variance is dᵀHd, d its change with all others following along;
-    H is a sum over channels, flights and priors, and so is the inverse of the variance, but for
-    what nuisances that all flights share take from all alike.
+    H is a sum over channels, flights and priors, and so is the inverse of the variance, except for
+    the information that nuisance parameters shared by all flights take away.
     """
     inverse = scaled_inverse(information.total)
     along = inverse / np.diag(inverse)
@@ -266,7 +266,7 @@ def _shares(information: FisherInformation, flights: int) -> tuple[Array, Array]
 
 
 def _partner(row: Array, index: int, names: Sequence[str]) -> tuple[str | None, float]:
-    """Return the name that row ``index`` (K,) of the correlations is largest for, and how large."""
+    """Return the name with the largest correlation in row ``index`` (K,), and its value."""
     if len(row) == 1:
         return None, 0.0
     others = np.where(np.arange(len(row)) == index, 0.0, row)
@@ -277,7 +277,7 @@ def _partner(row: Array, index: int, names: Sequence[str]) -> tuple[str | None, 
 def _source(
     shares: Array, channels: Sequence[str], flights: Sequence[str]
 ) -> tuple[str | None, str | None]:
-    """Return the channel, and the flight if one stands out, that most of the information is from.
+    """Return the channel with the most information, and the flight if one stands out.
 
     Parameters
     ----------
@@ -293,35 +293,34 @@ def _source(
     return channel, None if alike else flights[largest]
 
 
-STEPS_MATTER = 1e-4
-"""s of a lag: the shipped recordings, flown at 4 kHz, are met best by one 0.14 ms too short."""
+STEP_LAG_S = 1e-4
+"""s below which errors of lags are those of steps: the fit to the shipped recordings, simulated at
+4 kHz, finds a lag 0.14 ms too short."""
 
 
 def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Warn of lags that are known more finely than simulators of other physics steps agree."""
+    """Warn of lags with standard errors below the differences between physics steps."""
     names = [
         name
         for name, estimate in uncertainty.estimates.items()
-        if COEFFICIENTS[name].unit == "s" and 0.0 < estimate.std_error < STEPS_MATTER
+        if COEFFICIENTS[name].unit == "s" and 0.0 < estimate.std_error < STEP_LAG_S
     ]
     if not names:
         return ()
-    numbers = {"seconds": STEPS_MATTER}
+    numbers = {"seconds": STEP_LAG_S}
     return (Finding(Code.FINER_THAN_STEPS, "warning", ", ".join(names), numbers),)
 
 
-NOT_WHAT_FLEW = Finding(Code.FLIGHTS_REFUTE, "failure", "the fitted vehicle")
+FLIGHTS_REFUTE = Finding(Code.FLIGHTS_REFUTE, "failure", "the fitted vehicle")
 
 
 def flights_refute(uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Say that the fitted vehicle is not the one that flew, where its flights show that."""
+    """Return the finding that the flights refute the fitted vehicle, if they do."""
     reasons = (estimate.reason.code for estimate in uncertainty.estimates.values())
-    if ReasonCode.REFUTED not in reasons:
-        return ()
-    return (NOT_WHAT_FLEW,)
+    return (FLIGHTS_REFUTE,) if ReasonCode.REFUTED in reasons else ()
 
 
-TERMS_SHOWN = (
+REPORTED_TERMS = (
     "thrust_exponent",
     "motor_lag",
     "rate_gain",
@@ -329,13 +328,13 @@ TERMS_SHOWN = (
     "gyro_scale",
     "tachometer_lag",
 )
-"""Groups of terms of which is said what they mean."""
+"""Groups of terms with a finding: a lab can act on them."""
 
 
-def terms_shown(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Return what terms that were found say that a lab can act on."""
+def term_findings(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ...]:
+    """Return the findings on reported terms that differ significantly from neutral."""
     findings = []
-    for group in TERMS_SHOWN:
+    for group in REPORTED_TERMS:
         known = {
             name: uncertainty.estimates[name]
             for name in term_groups()[group]
@@ -349,32 +348,31 @@ def terms_shown(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ...]
     return tuple(findings)
 
 
-SIMULATORS_STEP = 1.0 / 4000.0
-"""s of a simulator's finest usual step. A lag that it steps by Euler's rule, as most do, is half a
-step shorter than its time constant says: ln(1 - h/τ) = -h/(τ - h/2) to second order. Not by more:
-the standard error of what is only known to lie within limits is their half-width over √3."""
-STUDENT_FACTOR = float(stdtrit(DRAWS, 0.975) / Z95)
-"""Times the root mean square of so many draws: Student's t, whose errors are as large by chance."""
-SAME_ERRORS = ("noise", "residuals", "left_out")
-"""Parts that show the same errors, each in its way."""
-FEWEST = 3
-"""Flights, or parts of them, that can disagree: of two, one degree of freedom is left."""
-LEAST_GROWTH = 1e-3
-"""Share of a variance by which it must grow without a flight that tells of the coefficient."""
+SIMULATOR_STEP_S = 1.0 / 4000.0
+"""A simulator's finest usual step. A lag integrated by Euler's rule, as most do, is half a step
+shorter than its time constant: ln(1 - h/τ) = -h/(τ - h/2) to second order. The standard error of a
+value between two limits is their half-width over √3."""
+STUDENT_FACTOR = float(stdtrit(VOLTMETER_DRAWS, 0.975) / Z95)
+"""Factor on the root mean square of the draws: Student's t over the normal quantile, at 95 %."""
+RESIDUAL_PARTS = ("noise", "residuals", "left_out")
+"""Parts that are three estimates of the same error."""
+MIN_PARTS_LEFT_OUT = 3
+"""Least number of flights, or parts of flights, to leave out in turn: of two, one degree of freedom
+is left."""
+MIN_VARIANCE_GROWTH = 1e-3
+"""Least relative growth of a variance without a flight that has information on the coefficient."""
 
 
 def total_error(parts: Mapping[str, Array]) -> Array:
-    """Return the honest standard error (K,) from its parts, as of `parts_of`.
+    """Return the standard error (K,) that includes all parts, as of `parts_of`.
 
-    Noise, residuals and left-out flights show the same errors in three ways, of which the largest
-    counts. On top comes what terms would move that were left out: a fit without them does not
-    depend on what the flights say of them, and their effect stands in no residual as long as
-    coefficients take it up. And what steps do, those of the simulation and those that the search
-    did not take, what inputs do that were read with errors, and what the model is seen to lack.
-    And all that was believed before, where the flights contradict what they say.
+    Noise, residuals and left-out flights are three estimates of the same error: the largest counts.
+    The others add up as squares: omitted terms, whose effect is in no residual as long as
+    coefficients absorb it; the steps of the simulation and the remaining steps of the search;
+    errors of inputs; model errors; and the prior's standard deviation where flights refute the fit.
     """
-    same = [parts[name] for name in SAME_ERRORS if name in parts]
-    others = [np.square(part) for name, part in parts.items() if name not in SAME_ERRORS]
+    same = [parts[name] for name in RESIDUAL_PARTS if name in parts]
+    others = [np.square(part) for name, part in parts.items() if name not in RESIDUAL_PARTS]
     return np.asarray(np.sqrt(np.max(same, axis=0) ** 2 + sum(others)))
 
 
@@ -384,9 +382,9 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
     Parameters
     ----------
     residuals
-        (K,) standard errors with all that is in the residuals.
+        (K,) standard errors by the sandwich estimate.
     lags
-        (K,) how far a parameter moves for each s by which a lag is longer; zero for what is none.
+        (K,) change of a parameter per s of lag, as of `_lags`.
     """
     inverse = information.inverse
     moved = {
@@ -394,7 +392,7 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
         for name, change in information.changes.items()
     }
     if STEP in moved:
-        moved[STEP] = np.hypot(moved[STEP], lags * SIMULATORS_STEP / 2.0 / np.sqrt(3.0))
+        moved[STEP] = np.hypot(moved[STEP], lags * SIMULATOR_STEP_S / 2.0 / np.sqrt(3.0))
     if LOGGED in moved:
         moved[STEP] = np.hypot(moved[STEP], moved[LOGGED])
     drawn = [moves for name, moves in moved.items() if name.startswith(READINGS)]
@@ -402,10 +400,10 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
         "noise": noise_alone(information),
         "residuals": residuals,
         "left_out": left_out(information),
-        "terms": information.in_doubt,
+        "terms": information.selection_shifts,
         "step": moved.get(STEP),
         "readings": STUDENT_FACTOR * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None,
-        "lack": moved.get(LACK),
+        "lack": moved.get(MODEL_ERRORS),
         "limit": moved[LIMIT] * LIMIT_SD / LIMIT_STEP if LIMIT in moved else None,
         "search": np.abs(inverse.matrix @ information.slope),
     }
@@ -413,26 +411,26 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
 
 
 def noise_alone(information: FisherInformation) -> Array:
-    """Return the standard errors (K,) were the residuals measurement noise alone."""
+    """Return the standard errors (K,) for residuals of measurement noise alone."""
     flights = np.einsum("cf,cfbpq->pq", information.scale**2, information.blocks)
     noisy = Inverse.of(flights + information.given, information.given).matrix
     return np.asarray(np.sqrt(np.diag(noisy)))
 
 
 def left_out(information: FisherInformation) -> Array | None:
-    """Return the standard errors (K,) that leaving flights out in turn speaks for.
+    """Return the standard errors (K,) from leaving flights out in turn.
 
     Without a flight the estimate moves by δ = (H - H_i)⁻¹ g_i, one Gauss-Newton step; if H were
-    right, the covariance of δ would be (H - H_i)⁻¹ - H⁻¹. The mean of the ratio of their squares
-    scales the errors that H speaks for; a flight counts by how much it tells of the coefficient,
-    and not at all where the others and the priors leave it open: nothing contradicts it there.
-    H - H_i is summed up from the others, for the difference would be rounding errors of any sign.
-    (The plain jackknife takes all flights for alike, and one that alone tells of a coefficient for
-    one that contradicts the others.) Errors that last for a whole flight show here alone; few
-    flights leave open how large they are (`overdispersion_factors`).
+    right, the covariance of δ would be (H - H_i)⁻¹ - H⁻¹. The mean ratio of observed to expected
+    squares scales the errors by H. A flight's weight is its information on the coefficient; it is
+    zero where the others and the priors do not determine it. H - H_i is summed over the others, as
+    the difference would be rounding errors. (The plain jackknife gives all flights equal weights,
+    and takes a flight that alone determines a coefficient for one that contradicts the others.)
+    Only this part shows errors that last for a whole flight; few flights hardly show their size
+    (`overdispersion_factors`).
     """
-    parts = flights_apart(information)
-    if parts.count < FEWEST:
+    parts = flight_parts(information)
+    if parts.count < MIN_PARTS_LEFT_OUT:
         return None
     total, independent = information.total, IndependentErrors.of(information)
     inverse = independent.inverse
@@ -443,7 +441,7 @@ def left_out(information: FisherInformation) -> Array | None:
         rest = Inverse.of(others + information.given, information.given)
         without = rest.matrix
         expected = np.maximum(np.diag(without) - known, 0.0)
-        tells = (expected > LEAST_GROWTH * known) & rest.known
+        tells = (expected > MIN_VARIANCE_GROWTH * known) & rest.known
         moved = (without @ parts.score[number]) ** 2
         weights[number] = np.where(tells, expected / (expected + known), 0.0)
         squares[number] = np.where(tells, moved / np.where(tells, expected, 1.0), 0.0)
@@ -455,14 +453,14 @@ def left_out(information: FisherInformation) -> Array | None:
     return independent.widened(beyond * np.maximum(known - given, 0.0), alike - 1.0)
 
 
-NAMED = 0.3
-"""Move of a coefficient, relative to the largest, from which it takes part in a direction."""
+MIN_MOVE_NAMED = 0.3
+"""Least move of a coefficient of a direction, relative to the largest."""
 SCALE_TOLERANCE = 0.1
 """Deviation of a direction's moves from those of a common factor below which it is one."""
-WORST = 3
-"""Directions that are reported."""
-UNDETERMINED = 1.0
-"""Standard error along a direction above which the flights do not determine it at all."""
+REPORTED_DIRECTIONS = 3
+"""Number of directions reported."""
+NULL_DIRECTION_ERROR = 1.0
+"""Standard error along a direction above which the flights do not determine it."""
 
 
 def worst_directions(
@@ -481,15 +479,15 @@ def worst_directions(
     """
     values, vectors = symmetric_eigen(covariance / np.outer(reference, reference))
     directions = []
-    for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:WORST]:
+    for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:REPORTED_DIRECTIONS]:
         largest = vector[np.argmax(np.abs(vector))]
         moves = dict(zip(names, (vector / largest).tolist(), strict=True))
         error = float(abs(largest) * np.sqrt(max(value, 0.0)))
         directions.append(
             Direction(
-                moves={name: move for name, move in moves.items() if abs(move) >= NAMED},
+                moves={name: move for name, move in moves.items() if abs(move) >= MIN_MOVE_NAMED},
                 error=error,
-                null=error > UNDETERMINED,
+                null=error > NULL_DIRECTION_ERROR,
                 common_scale=is_common_scale(moves),
             )
         )

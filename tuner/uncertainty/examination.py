@@ -16,13 +16,15 @@ from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.normal_equations import Objective, portion, portions
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted
-from tuner.uncertainty.estimates import LACK, Uncertainty, at_rest, references, uncertainty_at
-from tuner.uncertainty.model_error import Lack
-from tuner.uncertainty.records import (
-    CoefficientKnowledge,
-    Knowledge,
-    Residual,
+from tuner.uncertainty.estimates import (
+    MODEL_ERRORS,
+    Uncertainty,
+    references,
+    resting_parameters,
+    uncertainty_at,
 )
+from tuner.uncertainty.model_error import ModelErrors
+from tuner.uncertainty.records import CoefficientKnowledge, Knowledge, Residual
 from tuner.uncertainty.sensitivity import LocalSensitivity, local_sensitivity
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
@@ -54,7 +56,7 @@ class Examination:
     residuals: tuple[Residual, ...]
     full_problem: FullProblem
     information: FisherInformation
-    lack: Lack | None = None
+    model_errors: ModelErrors | None = None
 
     @property
     def known(self) -> Array:
@@ -66,9 +68,9 @@ class Examination:
 def examine(
     fitted: Fitted,
     *,
-    otherwise: Mapping[str, Objective] = MappingProxyType({}),
-    in_doubt: Mapping[str, float] = MappingProxyType({}),
-    lack: Lack | None = None,
+    alternatives: Mapping[str, Objective] = MappingProxyType({}),
+    selection_shifts: Mapping[str, float] = MappingProxyType({}),
+    model_errors: ModelErrors | None = None,
     predictor: Predictor | None = None,
     at_minimum: bool = True,
 ) -> Examination:
@@ -78,21 +80,20 @@ def examine(
 
     Parameters
     ----------
-    otherwise
-        What might be simulated differently -> the problem so simulated, for the parts of errors.
-    in_doubt
-        Coefficient -> how far it would move, in the scaled coordinate, with terms that were left
-        out of the model; empty where none was tried.
+    alternatives
+        Source of error -> the problem simulated with it changed, as of `alternatives_of`.
+    selection_shifts
+        Coefficient -> its scaled shift by omitted terms (`tuner.terms.model_averaging`).
     predictor
-        Whose innovations say how well coefficients are known, rather than residuals.
+        Filter whose innovations are used instead of residuals.
     at_minimum
-        Whether a search led to the point: how far it is from the minimum is then part of the error.
+        Whether a search led to the point: its distance from the minimum is then part of the error.
     """
     names = tuple(fitted.scales)
     full_problem = full_problem_of(fitted.objective, fitted.point)
     objective, point, criterion = full_problem.objective, full_problem.point, fitted.criterion
-    if lack is not None:
-        otherwise = {**otherwise, LACK: lack.acting_on(objective)}
+    if model_errors is not None:
+        alternatives = {**alternatives, MODEL_ERRORS: model_errors.applied_to(objective)}
     reference = references(objective.space, np.asarray(point.coefficients))
     informations, sensitivities, predicted = [], [], []
     slopes = None
@@ -103,7 +104,7 @@ def examine(
         flight_names = [names[number] for number in flights]
         others = {
             name: portion(replace(other, space=objective.space), point, criterion, flights)[0]
-            for name, other in otherwise.items()
+            for name, other in alternatives.items()
         }
         if predictor is not None and slopes is not None:  # first: two Jacobians are too much
             of_flights = predictor.among(flights)
@@ -112,7 +113,7 @@ def examine(
         jacobian = batch[0].jacobian(*batch[1:])
         moved = {name: other.residuals(*batch[1:]) for name, other in others.items()}
         compared = jacobian if predictor is None else jacobian.of(predictor.rows)
-        informations.append(information_at(*batch, compared, otherwise=moved))
+        informations.append(information_at(*batch, compared, alternatives=moved))
         sensitivities.append(
             local_sensitivity(*batch, jacobian, reference=reference, flights=flight_names)
         )
@@ -128,22 +129,18 @@ def examine(
             objective.space.names,
             len(full_problem.fitted),
         )
-    gains = {} if lack is None else lack.gains
-    if in_doubt or gains:
-        moves = np.array([in_doubt.get(name, 0.0) for name in objective.space.names])
+    gains = {} if model_errors is None else model_errors.gains
+    if selection_shifts or gains:
+        moves = np.array([selection_shifts.get(name, 0.0) for name in objective.space.names])
         apart = np.array([gains.get(name, 0.0) for name in objective.space.names]) * reference
-        information = replace(information, in_doubt=np.hypot(moves, apart))
+        information = replace(information, selection_shifts=np.hypot(moves, apart))
     searched = set(full_problem.fitted) - set(fitted.held.values())
-    information = information.resting(at_rest(objective.space, point, searched))
+    information = information.resting(resting_parameters(objective.space, point, searched))
     information = replace(information, astray=astray)
 
     def known(*others: str) -> Uncertainty:
         return _uncertainty_of(
-            full_problem,
-            information,
-            (*full_problem.fitted, *others),
-            names,
-            at_minimum=at_minimum,
+            full_problem, information, (*full_problem.fitted, *others), names, at_minimum=at_minimum
         )
 
     return Examination(
@@ -154,7 +151,7 @@ def examine(
         residuals=tuple(residuals),
         full_problem=full_problem,
         information=information,
-        lack=lack,
+        model_errors=model_errors,
     )
 
 
@@ -169,7 +166,7 @@ def _uncertainty_of(
     space, indices = full_problem.subspace(names)
     vector = np.asarray(full_problem.point.coefficients)[indices]
     information = information.about(indices)
-    if not at_minimum:  # flights that agree with each other and not with the vehicle agree
+    if not at_minimum:  # flights may agree with each other and not with the vehicle
         information = information.settled
     return uncertainty_at(space, vector, information, flights)
 
@@ -230,7 +227,7 @@ def _coefficient(
     step: float,
     bias: dict[str, float] | None = None,
 ) -> CoefficientKnowledge:
-    """Return what is known of a coefficient; ``bias`` of one that was not fitted."""
+    """Return the record of a coefficient; ``bias`` is given for one that was not fitted."""
     estimate = uncertainty.estimates[name]
     return CoefficientKnowledge(
         unit=COEFFICIENTS[name].unit,
@@ -252,8 +249,8 @@ def _coefficient(
 
 LAGS = 50
 """Number of lags of the autocorrelation, in samples."""
-OUTSIDE = 0.1
-"""Share of the lags outside the band of 95 % up to which residuals count as white: twice chance."""
+MAX_SHARE_OUTSIDE = 0.1
+"""Largest share of lags outside the 95 % band for white residuals: twice that of chance."""
 MIN_SAMPLES = 4 * LAGS
 """Samples below which the autocorrelation is not computed."""
 
@@ -298,7 +295,7 @@ def _residual(flight: str, channel: str, time: Array, error: Array) -> Residual:
         autocorrelation=[1.0, *others.round(4).tolist()],
         limit=limit,
         memory=float(spacing * (1.0 + 2.0 * (others**2).sum())),
-        white=bool(np.mean(np.abs(others) > limit) <= OUTSIDE),
+        white=bool(np.mean(np.abs(others) > limit) <= MAX_SHARE_OUTSIDE),
     )
 
 
@@ -330,7 +327,7 @@ class FullProblem:
 
 
 def full_problem_of(objective: Objective, point: Point) -> FullProblem:
-    """Return a fit's problem with its fixed coefficients free, too, around their values."""
+    """Return a fit's problem with its fixed coefficients free, too, at their values."""
     space = objective.space
     values = space.numbers(point.coefficients)
     fixed = {
@@ -352,7 +349,7 @@ def full_problem_of(objective: Objective, point: Point) -> FullProblem:
 
 
 def _acts(name: str, value: float) -> bool:
-    """Return whether a fixed coefficient acts in a simulation, and has a logarithm if needed."""
+    """Return whether a fixed coefficient has an effect, and a logarithm if its scale needs one."""
     row = COEFFICIENTS[name]
     neutral = row.is_optional and value == row.neutral
     return not neutral and not (row.scale == "log" and value <= 0.0)

@@ -1,4 +1,4 @@
-"""Ground measurements against flights: each coefficient by either alone and by both together."""
+"""Comparison of coefficients from ground measurements, from flights, and from both."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import Uncertainty
-from tuner.uncertainty.records import CONFLICT, Sources
+from tuner.uncertainty.records import CONFLICT_SE, Sources
 from tuner.vehicle import COEFFICIENTS
 
 
@@ -20,14 +20,14 @@ def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[s
 
     It is empty for a fit without ground measurements.
 
-    What flights alone give follows from the end of the fit by one Gauss-Newton step without the
-    ground measurements; there the loss's slope is theirs alone, with the opposite sign. Standard
+    One Gauss-Newton step from the end of the fit without the ground measurements leads to the
+    values of flights alone: there the loss's slope is minus that of the measurements. Standard
     errors of flights are widened for model error as those of the fit are.
 
     Parameters
     ----------
     fitted, uncertainty
-        The fit; flights say nothing of what it holds at initial values.
+        The fit; coefficients held at initial values have none from flights.
     total
         (K, K) information about its parameters, priors and ground measurements included.
     """
@@ -73,14 +73,18 @@ def _error(space: Space, index: int, scaled: float, error: float) -> float:
 
 
 def ground_conflicts(sources: Mapping[str, Sources], mass: float | None) -> tuple[Finding, ...]:
-    """Return the coefficients of which ground measurements and flights say different things.
+    """Return findings on coefficients where ground measurements and flights contradict each other.
 
-    With the mass at which they would not, where flights show a coefficient over the mass alone;
-    ``mass`` is the one that they were fitted with in kg, None if it was fitted.
+    Where flights determine only a coefficient over the mass, with the mass at which they agree.
+    ``mass`` is that of the fit in kg, None if it was fitted.
     """
     findings = []
     for name, source in sources.items():
-        if source.flights is None or source.deviation is None or abs(source.deviation) <= CONFLICT:
+        if (
+            source.flights is None
+            or source.deviation is None
+            or abs(source.deviation) <= CONFLICT_SE
+        ):
             continue
         row, ground, flights = COEFFICIENTS[name], source.ground, source.flights
         numbers = {"deviation": source.deviation, "ground": ground, "flights": flights}

@@ -1,11 +1,11 @@
-"""Identifiability: what the flights do not identify is held at initial values, the rest refitted.
+"""Identifiability: undetermined coefficients are held at initial values, the rest refitted.
 
-Coefficients that trade off exactly keep their product however far they drift. Setting each back to
-its initial value would worsen the fit; so one of every such group, the stand-in, is held, and the
-others are fitted given its value.
+Coefficients that trade off exactly keep their product however far they drift. Setting all back to
+their initial values would worsen the fit; so one of every such group, the stand-in, is held, and
+the others are fitted given its value.
 
-A term that nobody asked for, that the flights do not identify and that ends at a bound is in the
-model by chance: it goes back to where it began, whatever the fitted flights gained by it.
+A selected term that the flights do not determine and that ends at a bound is in the model by
+chance: it goes back to its initial value, whatever the loss.
 """
 
 from __future__ import annotations
@@ -28,41 +28,45 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
-from tuner.uncertainty.model_error import alternatives_of, lack_of
-from tuner.uncertainty.verdict import IDENTIFIABLE_ERROR, ReasonCode
+from tuner.uncertainty.model_error import alternatives_of, model_errors_of
+from tuner.uncertainty.verdict import MAX_IDENTIFIABLE_ERROR, ReasonCode
 from tuner.vehicle import COEFFICIENTS
 
 MAX_ROUNDS = 3
-"""Largest number of rounds: what is held may leave something else undetermined."""
+"""Largest number of rounds: holding some coefficients may leave others undetermined."""
 SEARCH_TOLERANCE = 0.002
-"""Share of the loss by which it may rise where one of what trades off exactly is held: what an
-optimiser leaves. More says that the others cannot follow, their bounds being in the way, say."""
+"""Largest relative rise of the loss by holding one of an exact trade-off: an optimiser's remainder.
+A larger one shows that the others could not follow, by their bounds for example."""
 RIDGE = 1e-12
 """Added to a Hessian of unit diagonal."""
 CLOSED_LOOP_TOLERANCE = 2.0
-"""Times the loss of flights in their closed loop, likewise: gusts make less of a difference."""
+"""Largest relative rise of the loss in closed loop: gusts raise it by less."""
 
 
-def with_undetermined_held(
+def hold_undetermined(
     job: Job,
     fitted: Fitted,
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
     *,
-    in_doubt: Mapping[str, float] = MappingProxyType({}),
+    selection_shifts: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Fitted, Examination]:
-    """Return the fit once all that it does not identify is held, and its examination.
+    """Return the fit with undetermined coefficients held, and its examination.
 
-    A fit that predicts from recorded states keeps the values of all but those that trade off:
-    together they predict, even where the flights do not tell them apart, and each one's verdict
-    says so. All are kept where the flights are met worse by what follows: by anything there, and by
-    twice the loss in a closed loop.
+    A fit that predicts from recorded states holds only those that trade off: together the others
+    predict even where they are undetermined, as their verdicts say. Nothing is held where that
+    raises the loss by more than the tolerances.
     """
-    lack = lack_of(fitted, job.fitted)
+    model_errors = model_errors_of(fitted, job.fitted)
 
     def examined(fitted: Fitted) -> Examination:
-        otherwise = alternatives_of(fitted.objective, fitted.point, job.fitted)
-        return examine(fitted, otherwise=otherwise, in_doubt=in_doubt, lack=lack)
+        alternatives = alternatives_of(fitted.objective, fitted.point, job.fitted)
+        return examine(
+            fitted,
+            alternatives=alternatives,
+            selection_shifts=selection_shifts,
+            model_errors=model_errors,
+        )
 
     examination = examined(fitted)
     segments = fitted.objective.segments
@@ -81,7 +85,7 @@ def with_undetermined_held(
             "others are fitted again."
         )
         rest = hold(job, fitted, stand_ins, on_progress, stages=LAST if predicts else LAST_TWO)
-        if not _rise(fitted, rest) < (
+        if not _loss_ratio(fitted, rest) < (
             1.0 + SEARCH_TOLERANCE if predicts else CLOSED_LOOP_TOLERANCE
         ):
             on_message(
@@ -92,7 +96,7 @@ def with_undetermined_held(
         fitted = rest
         examination = examined(fitted)
     for _ in range(MAX_ROUNDS):
-        idle = _idle_terms(job, fitted, examination.uncertainty)
+        idle = _undetermined_terms(job, fitted, examination.uncertainty)
         if not idle:
             break
         on_message(
@@ -105,10 +109,10 @@ def with_undetermined_held(
     return fitted, examination
 
 
-def _idle_terms(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> tuple[str, ...]:
-    """Return what was free of terms that the job does not ask for, and ended undetermined.
+def _undetermined_terms(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> tuple[str, ...]:
+    """Return the undetermined coefficients of selected terms that ended at a bound.
 
-    At a bound, that is: elsewhere it may be of use, though nobody can say how large it is.
+    Those elsewhere may improve predictions.
     """
     settings, held = job.settings.job, set(fitted.held.values())
     asked = set(settings.free or ())
@@ -124,8 +128,8 @@ def _idle_terms(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> tuple[str
     )
 
 
-def _rise(fitted: Fitted, other: Fitted) -> float:
-    """Return how many times as large a fit's loss, by its own noise, is where another has led."""
+def _loss_ratio(fitted: Fitted, other: Fitted) -> float:
+    """Return the loss at another fit over that at a fit, both by the noise of the fit."""
     before, after = (
         float(np.sum(fitted.objective.sums(f.point, fitted.criterion, derivatives=False).loss))
         for f in (fitted, other)
@@ -136,16 +140,16 @@ def _rise(fitted: Fitted, other: Fitted) -> float:
 def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:
     """Return each coefficient that the flights do not identify -> its stand-in, which is held.
 
-    A coefficient is its own stand-in unless it trades off against another one. What they determine
-    but for disturbances and model error stays where they put it, with a wide interval: it is no
-    better known where the search began. So does all where the fitted vehicle flies otherwise.
+    A coefficient is its own stand-in unless it trades off against another one. Coefficients that
+    noise alone would leave determined keep their values, with a wide interval: the initial value
+    is no better. So do all where the flights refute the fit.
     """
     undetermined = [
         name
         for name in uncertainty.names
         if not uncertainty.estimates[name].identifiable
         and uncertainty.estimates[name].reason.code is not ReasonCode.REFUTED
-        and name not in _known_roughly(uncertainty)
+        and name not in _narrow_by_noise(uncertainty)
     ]
     stand_ins: dict[str, str] = {}
     for direction in uncertainty.directions:
@@ -154,24 +158,24 @@ def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:
         ]
         if not direction.null or len(members) < 2:
             continue
-        ranked = sorted(members, key=lambda name: _rank(name, direction.moves))
+        ranked = sorted(members, key=lambda name: _hold_order(name, direction.moves))
         stand_ins |= dict.fromkeys(members, ranked[0])
     return stand_ins | {name: name for name in undetermined if name not in stand_ins}
 
 
-def _known_roughly(uncertainty: Uncertainty) -> frozenset[str]:
-    """Return the coefficients whose interval would be narrow if residuals were noise alone."""
+def _narrow_by_noise(uncertainty: Uncertainty) -> frozenset[str]:
+    """Return the coefficients that would be identifiable if residuals were noise alone."""
     covariance = uncertainty.covariance
     of_noise = covariance.data_error / covariance.beyond_noise / uncertainty.reference
     return frozenset(
         name
         for name, error in zip(uncertainty.names, of_noise, strict=True)
         if uncertainty.estimates[name].reason.code is ReasonCode.WIDE_INTERVAL
-        and error < IDENTIFIABLE_ERROR
+        and error < MAX_IDENTIFIABLE_ERROR
     )
 
 
-def _rank(name: str, moves: Mapping[str, float]) -> tuple[float, float]:
+def _hold_order(name: str, moves: Mapping[str, float]) -> tuple[float, float]:
     rank = COEFFICIENTS[name].hold_rank
     return math.inf if rank is None else rank, -abs(moves[name])
 
@@ -184,9 +188,9 @@ def hold(
     *,
     stages: slice = LAST_TWO,
 ) -> Fitted:
-    """Return the fit with the held coefficients at their initial values and the others polished.
+    """Return the fit with the stand-ins held at their initial values and the others refitted.
 
-    From where the others make up for that to first order.
+    The refit starts where the others make up for that to first order.
 
     Parameters
     ----------
@@ -199,7 +203,9 @@ def hold(
         return fitted
     clock = time.perf_counter()
     free = Free(~is_held, free_offsets(job))
-    point = _moved(fitted, np.where(is_held, space.initial, fitted.point.coefficients), free)
+    point = _point_after_holding(
+        fitted, np.where(is_held, space.initial, fitted.point.coefficients), free
+    )
     end = polished(
         job,
         replace(fitted, point=point),
@@ -213,8 +219,8 @@ def hold(
     )
 
 
-def _moved(fitted: Fitted, vector: NDArray[np.float64], free: Free) -> Point:
-    """Return the point with some coefficients elsewhere (K,), what is free following them."""
+def _point_after_holding(fitted: Fitted, vector: NDArray[np.float64], free: Free) -> Point:
+    """Return the point with the coefficients at a vector (K,), and the free ones moved to suit."""
     objective, point = fitted.objective, fitted.point
     sums = objective.sums(point, fitted.criterion)
     hessian = normal_equations(objective, point, fitted.criterion, sums).hessian

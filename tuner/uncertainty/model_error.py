@@ -1,9 +1,9 @@
-"""Model error: a fit's problem simulated finer, fed otherwise, or with what its model lacks.
+"""Model error: a fit's problem with finer steps, other inputs, or errors of its model corrected.
 
-By how much coefficients then have to move is a part of their standard errors. What the model lacks
-is seen in the recordings: the laws that `tuner.equation_error.omitted_laws` finds push the
-simulated flights, each along its recording, and a rate controller that answers otherwise than its
-file (`tuner.equation_error.rate_controller`) flies them so.
+The shift of the coefficients is a part of their standard errors. Recordings show the model's
+errors: forces of omitted laws (`tuner.equation_error.omitted_laws`) then act on the simulated
+flights, and the rate controller has the gains that recorded commands show
+(`tuner.equation_error.rate_controller`).
 """
 
 from __future__ import annotations
@@ -29,8 +29,14 @@ from sim_jax.schedule import Schedule
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Array
 from tuner.equation_error.omitted_laws import Law, Pair, unexplained
-from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, answers
-from tuner.equation_error.recorded_accelerations import FEWEST, Mask, Steps, steps_of
+from tuner.equation_error.rate_controller import (
+    AXES,
+    PARTS,
+    ControllerEstimate,
+    Signals,
+    estimate_controller,
+)
+from tuner.equation_error.recorded_accelerations import MIN_SAMPLES, Mask, Steps, steps_of
 from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import log_voltage_of, read_again
 from tuner.objective.criterion import Point
@@ -42,94 +48,91 @@ from tuner.recordings.flight import Flight, Series
 from tuner.search.findings import odd_flights
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import (
-    DRAWS,
     LIMIT,
     LIMIT_STEP,
     LOGGED,
     READINGS,
     STEP,
+    VOLTMETER_DRAWS,
     Uncertainty,
 )
 from tuner.vehicle.model import Model
 
-MATTERS = 0.5
-"""Standard errors without it, from which the move of a coefficient is said."""
+MIN_REPORTED_SHIFT = 0.5
+"""Least shift of a coefficient that is reported, in standard errors without it."""
 _CHANNELS = ("position", "attitude", SPEEDS, "body_rate", "command")
 LOOP_SIGNALS = ("rate_setpoint", "body_rate", "command")
-"""What a rate controller hears and says, as recorded."""
-WITHIN_PERIOD = 1.5e-3
-"""s of a rate controller's lateness below which nothing is said: stamps tell in which period of the
-loop a sample was taken, and not when in it; half of one at 400 Hz is 1.25 ms."""
-LATE = 1e-3
-"""s of rotor speeds' lateness that is worth a word."""
-SMALLEST = 0.03
-"""Share of what varies along an axis below which a law is none to speak of."""
-
-
-FAR_OFF = 1.3
-"""Factor on a gain from which it is another controller's, and not its file's with the battery's."""
-GAINS = {"rate_gain_roll_pitch": ("roll", "pitch"), "rate_gain_yaw": ("yaw",)}
+"""Recorded inputs and output of a rate controller."""
+MIN_REPORTED_LATENCY_S = 1.5e-3
+"""Least latency of a rate controller that is reported: stamps show the loop's period of a sample,
+not its time within the period; half a period at 400 Hz is 1.25 ms."""
+MIN_REPORTED_SPEED_LAG_S = 1e-3
+"""Least lag of recorded rotor speeds that is reported."""
+MIN_REPORTED_LAW_SHARE = 0.03
+"""Least share of an axis' variation that a reported law explains."""
+FAR_OFF_GAIN = 1.3
+"""Factor on a gain from which the file is another controller's: a battery changes it by less."""
+GAIN_AXES = {"rate_gain_roll_pitch": ("roll", "pitch"), "rate_gain_yaw": ("yaw",)}
 """Coefficient -> axes of the rate controller whose gains it scales."""
 
 
 @dataclass(frozen=True)
-class Lack:
-    """What the model of a fit lacks.
+class ModelErrors:
+    """Errors of a fit's model that its recordings show.
 
     Attributes
     ----------
     laws
-        The likeliest first.
+        Omitted laws, the likeliest first.
     disturbance
-        What all of them make, in every segment; None for no laws.
-    answers
-        Which of the rate controller's gains are not the file's.
-    late
-        s by which recorded rotor speeds come after the turning that they make; zero for not.
+        Their forces and moments in every segment; None for no laws.
+    controller_estimates
+        Gains and latencies of the rate controller that differ from the file's.
+    speed_lag
+        s by which recorded rotor speeds lag behind the turning that they cause; 0 for none.
     gains
-        Fitted coefficient of `GAINS` -> share by which recorded commands put it elsewhere, chance
-        apart.
+        Fitted coefficient of `GAIN_AXES` -> relative deviation of its estimate from recorded
+        commands, its standard error subtracted.
     """
 
     laws: tuple[Law, ...]
     disturbance: Disturbance | None
-    answers: tuple[Answer, ...] = ()
-    late: float = 0.0
+    controller_estimates: tuple[ControllerEstimate, ...] = ()
+    speed_lag: float = 0.0
     gains: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def or_none(self) -> Lack | None:
-        """None if there is nothing to say or to widen."""
-        return self if self.laws or self.answers or self.late or self.gains else None
+    def or_none(self) -> ModelErrors | None:
+        """None if there are no errors."""
+        return (
+            self if self.laws or self.controller_estimates or self.speed_lag or self.gains else None
+        )
 
-    def acting_on(self, objective: Objective) -> Objective:
-        """Return a problem whose simulated flights it pushes, and whose gains are those found.
-
-        And whose rotor speeds were taken when they turned so.
-        """
+    def applied_to(self, objective: Objective) -> Objective:
+        """Return a problem with these disturbances, gains, and stamps of rotor speeds."""
         segments, model = objective.segments, objective.model
         rate = model.controller.rate
-        for answer in self.answers:
-            rate = _answering(rate, answer)
+        for estimate in self.controller_estimates:
+            rate = _with_gain(rate, estimate)
         pushed = replace(
             objective,
             segments=replace(segments, disturbance=self.disturbance),
             model=eqx.tree_at(lambda m: m.controller.rate, model, rate),
         )
-        return _with_speeds_earlier(pushed, self.late) if self.late else pushed
+        return _with_speeds_earlier(pushed, self.speed_lag) if self.speed_lag else pushed
 
 
-def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
-    """Return what the model of a fit lacks; None if that is nothing, or cannot be told.
+def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | None:
+    """Return the errors of a fit's model; None if there are none, or they cannot be estimated.
 
-    Of flights as of `odd_flights` nothing is taken.
+    They are estimated from all flights but crashed ones and those of `odd_flights`.
 
     Parameters
     ----------
     fitted
-        Of whole flights in the closed loop.
+        A fit to whole flights in closed loop.
     flights
-        The F fitted ones, in the order of the segments.
+        The F fitted flights, in the order of the segments.
     """
     objective, point = fitted.objective, fitted.point
     segments, schedule = objective.segments, objective.schedule
@@ -145,16 +148,16 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         for number, flight in enumerate(flights)
         if driven[number] and "command" in flight.series
     }
-    speeds = _driven(commands, model, environment, schedule)
-    read_late = float(model.vehicle.effects.get("tachometer_lag", 0.0))  # to first order
+    speeds = _commanded_speeds(commands, model, environment, schedule)
+    tachometer_lag = float(model.vehicle.effects.get("tachometer_lag", 0.0))  # to first order
     read = []
     for number, flight in enumerate(flights):
         series = dict(flight.series)
         if number in speeds:
             series["rotor_speed"] = speeds[number]
-        elif read_late and "rotor_speed" in series:
-            late = series["rotor_speed"]
-            series["rotor_speed"] = Series(late.time - read_late, late.values)
+        elif tachometer_lag and "rotor_speed" in series:
+            lagging = series["rotor_speed"]
+            series["rotor_speed"] = Series(lagging.time - tachometer_lag, lagging.values)
         read.append(_recorded(replace(flight, series=series), model, conditions, number))
     flown = fly(
         objective.model,
@@ -168,26 +171,26 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
     )
     rate = float(schedule.log_rate)
     odd = odd_flights(fitted.scales)
-    tell = ~np.isfinite(np.asarray(flown.crash_time))
-    tell[[number for number, name in enumerate(fitted.scales) if name in odd]] = False
-    told = _heard(flights, flown, model.controller.mixer, rate, tell)
-    heard = tuple(answer for answer in told if answer.differs)
-    apart = {}
-    for name in set(GAINS) & set(objective.space.names):
-        if (gain := gain_told(name, told)) is not None and abs(gain[0] - 1.0) > gain[1]:
-            apart[name] = float(np.sqrt((gain[0] - 1.0) ** 2 - gain[1] ** 2))
+    usable = ~np.isfinite(np.asarray(flown.crash_time))
+    usable[[number for number, name in enumerate(fitted.scales) if name in odd]] = False
+    estimates = _controller_estimates(flights, flown, model.controller.mixer, rate, usable)
+    differing = tuple(estimate for estimate in estimates if estimate.differs)
+    gain_shifts = {}
+    for name in set(GAIN_AXES) & set(objective.space.names):
+        if (gain := gain_by_commands(name, estimates)) is not None and abs(gain[0] - 1.0) > gain[1]:
+            gain_shifts[name] = float(np.sqrt((gain[0] - 1.0) ** 2 - gain[1] ** 2))
     pairs = {
         number: Pair(one, _simulated(one, flown.channels, conditions, number, rate), by_command)
         for number, (one, by_command) in enumerate(zip(read, driven, strict=True))
-        if one is not None and tell[number]
+        if one is not None and usable[number]
     }
     if not pairs:
-        return Lack((), None, heard, gains=apart).or_none
+        return ModelErrors((), None, differing, gains=gain_shifts).or_none
     scaled = np.asarray(objective.space.scaled(point.coefficients))
     parameters = objective.space.parameters
     found = unexplained(model, parameters, scaled, tuple(pairs.values()))
     if not found.laws:
-        return Lack((), None, heard, found.late, apart).or_none
+        return ModelErrors((), None, differing, found.speed_lag, gain_shifts).or_none
     body = model.vehicle.body
     by = np.array([*[body.mass] * 3, body.inertia_xx, body.inertia_yy, body.inertia_zz], float)
     ticks = np.arange(objective.samples + 2) / rate
@@ -201,16 +204,18 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
             pushes[axis, :, number] = np.interp(ticks, one.time, column)
     force, moment = (Vec3(*map(jnp.asarray, rows)) for rows in (pushes[:3], pushes[3:]))
     pushed = Disturbance(force=force, moment=moment, rate=rate)
-    return Lack(found.laws, pushed, heard, found.late, apart)
+    return ModelErrors(found.laws, pushed, differing, found.speed_lag, gain_shifts)
 
 
-def gain_told(name: str, answers: Sequence[Answer]) -> tuple[float, float] | None:
-    """Return a coefficient of `GAINS` by recorded commands, over the fit's, and its error.
+def gain_by_commands(
+    name: str, controller_estimates: Sequence[ControllerEstimate]
+) -> tuple[float, float] | None:
+    """Return a coefficient of `GAIN_AXES` by recorded commands over the fit's, and its error.
 
-    None where they do not tell it of all its axes.
+    None where one of its axes has no estimate.
     """
-    those = [one for one in answers if one.part == "P" and one.axis in GAINS[name]]
-    if len(those) < len(GAINS[name]):
+    those = [one for one in controller_estimates if one.part == "P" and one.axis in GAIN_AXES[name]]
+    if len(those) < len(GAIN_AXES[name]):
         return None
     weights = np.array([one.sd**-2.0 for one in those])
     value = float(np.average([one.value for one in those], weights=weights))
@@ -220,18 +225,17 @@ def gain_told(name: str, answers: Sequence[Answer]) -> tuple[float, float] | Non
 def alternatives_of(
     objective: Objective, point: Point, flights: Sequence[Flight] = ()
 ) -> dict[str, Objective]:
-    """Return what might be simulated differently -> the problem so simulated.
+    """Return the name of a source of error -> the problem simulated with it changed.
 
-    Physics runs in the same steps where a recording is fed in step by step: it is laid out for
-    those.
+    Where a recording is fed in step by step, physics keeps its steps.
 
     Parameters
     ----------
     flights
-        Those that are flown whole in it, to have their voltmeters read again where the fit has a
-        battery; none for a fit in which that is not asked.
+        Whole flights, whose voltmeter readings are drawn again if the fit has a battery; none to
+        leave that out.
     """
-    limited = _limited(objective)
+    limited = _with_lower_limit(objective)
     if not isinstance(objective.segments.inlet, ReferenceInlet):
         return limited
     schedule = objective.schedule
@@ -239,16 +243,15 @@ def alternatives_of(
     return {
         STEP: replace(objective, schedule=finer),
         **limited,
-        **_filtered_by_samples(objective),
-        **_read_again(objective, point, flights),
+        **_with_sampled_filter(objective),
+        **_with_other_readings(objective, point, flights),
     }
 
 
-def _limited(objective: Objective) -> dict[str, Objective]:
-    """Return the problem whose rotors reach less speed, if nothing recorded tells rotor speeds.
+def _with_lower_limit(objective: Objective) -> dict[str, Objective]:
+    """Return the problem with a lower limit of rotor speeds, if no recording has rotor speeds.
 
-    Thrust and drag tell rotors that turn faster from ones that give more by nothing but their
-    limit.
+    Without them only the limit separates the rotors' speeds from their constants.
     """
     segments, model = objective.segments, objective.model
     if "rotor_speed" in segments.measured or isinstance(segments.inlet, RotorSpeedInlet):
@@ -258,23 +261,23 @@ def _limited(objective: Objective) -> dict[str, Objective]:
     return {LIMIT: replace(objective, model=limited)}
 
 
-def _filtered_by_samples(objective: Objective) -> dict[str, Objective]:
-    """Return the problem whose rotor speeds were filtered sample by sample, if it has their lag.
+def _with_sampled_filter(objective: Objective) -> dict[str, Objective]:
+    """Return the problem with rotor speeds filtered sample by sample, if their lag is fitted.
 
-    Such a filter is late by half a period of the log less than one of the same time constant that
-    is steady, and what was logged does not tell which it was: limits, of which the standard error
-    is the half-width over √3.
+    A filter in discrete time lags by half a period of the log less than one in continuous time with
+    the same time constant, and the log does not show which it was. Between these limits the
+    standard error is the half-width over √3.
     """
     speeds = objective.segments.measured.get("rotor_speed")
     if speeds is None or "tachometer_lag" not in objective.space.names:
         return {}
-    apart = np.diff(np.asarray(speeds.time), axis=0)
-    late = 0.5 * float(np.median(apart[apart > 0.0])) / np.sqrt(3.0)
-    return {LOGGED: _with_speeds_earlier(objective, late)}
+    periods = np.diff(np.asarray(speeds.time), axis=0)
+    lag_error = 0.5 * float(np.median(periods[periods > 0.0])) / np.sqrt(3.0)
+    return {LOGGED: _with_speeds_earlier(objective, lag_error)}
 
 
 def _with_speeds_earlier(objective: Objective, seconds: float) -> Objective:
-    """Return a problem whose rotor speeds were recorded so much earlier."""
+    """Return a problem with the stamps of rotor speeds moved to earlier."""
     measured = dict(objective.segments.measured)
     if "rotor_speed" in measured:
         speeds = measured["rotor_speed"]
@@ -282,10 +285,10 @@ def _with_speeds_earlier(objective: Objective, seconds: float) -> Objective:
     return replace(objective, segments=replace(objective.segments, measured=measured))
 
 
-def _read_again(
+def _with_other_readings(
     objective: Objective, point: Point, flights: Sequence[Flight]
 ) -> dict[str, Objective]:
-    """Return the problem with other readings of the voltmeters, if they matter to a fit."""
+    """Return problems with voltmeter readings drawn again, if the fit uses them."""
     segments = objective.segments
     vehicle = objective.model_at(point.coefficients).vehicle
     matters = bool(float(vehicle.effects.get("battery_exponent", 0.0)))
@@ -295,7 +298,7 @@ def _read_again(
     as_read = log_voltage_of(flights, windows, objective.schedule)
     assert as_read is not None, "the segments hold what was read"
     random, others = np.random.default_rng(0), {}
-    for number in range(DRAWS):
+    for number in range(VOLTMETER_DRAWS):
         again = log_voltage_of(read_again(flights, random), windows, objective.schedule)
         assert again is not None, "there is a voltmeter"
         volts = segments.log_voltage + (again - as_read)
@@ -305,15 +308,17 @@ def _read_again(
     return others
 
 
-def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Return what there is to say of it; of laws, those that may have moved coefficients."""
-    if lack is None:
+def model_error_findings(
+    model_errors: ModelErrors | None, uncertainty: Uncertainty
+) -> tuple[Finding, ...]:
+    """Return the findings on model errors; on omitted laws only if these may move coefficients."""
+    if model_errors is None:
         return ()
     moved = [
         name
         for name, estimate in uncertainty.estimates.items()
         if (move := estimate.parts.lack)
-        and move**2 > MATTERS**2 * (estimate.std_error**2 - move**2)
+        and move**2 > MIN_REPORTED_SHIFT**2 * (estimate.std_error**2 - move**2)
     ]
     laws = [
         Finding(
@@ -323,30 +328,38 @@ def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ..
             {"share": law.share},
             (law.axis, law.feature, *moved),
         )
-        for law in lack.laws
-        if moved and abs(law.share) > SMALLEST
+        for law in model_errors.laws
+        if moved and abs(law.share) > MIN_REPORTED_LAW_SHARE
     ]
-    heard = [one for one in lack.answers if one.part != "late" or abs(one.value) > WITHIN_PERIOD]
-    if abs(lack.late) > LATE:
-        numbers = {"seconds": lack.late}
+    differing = [
+        one
+        for one in model_errors.controller_estimates
+        if one.part != "late" or abs(one.value) > MIN_REPORTED_LATENCY_S
+    ]
+    if abs(model_errors.speed_lag) > MIN_REPORTED_SPEED_LAG_S:
+        numbers = {"seconds": model_errors.speed_lag}
         laws.insert(0, Finding(Code.ROTOR_SPEEDS_LATE, "warning", "rotor speeds", numbers))
-    return (*_said_of_controller(heard), *laws)
+    return (*_controller_findings(differing), *laws)
 
 
 def gains_far_off(fitted: Fitted, flights: Sequence[Flight]) -> tuple[Finding, ...]:
-    """Return which gains of the controller file cannot be those that flew, by recorded commands.
+    """Return the gains that cannot be those of the controller file, by recorded commands.
 
-    They tell that beside any fit; arguments are those of `lack_of`.
+    The fit need not be good for that; arguments are those of `model_errors_of`.
     """
-    lack = lack_of(fitted, flights)
-    answers = () if lack is None else lack.answers
-    return _said_of_controller(
-        [one for one in answers if one.part != "late" and not 1.0 / FAR_OFF < one.value < FAR_OFF]
+    model_errors = model_errors_of(fitted, flights)
+    controller_estimates = () if model_errors is None else model_errors.controller_estimates
+    return _controller_findings(
+        [
+            one
+            for one in controller_estimates
+            if one.part != "late" and not 1.0 / FAR_OFF_GAIN < one.value < FAR_OFF_GAIN
+        ]
     )
 
 
-def _said_of_controller(answers: Sequence[Answer]) -> tuple[Finding, ...]:
-    parts = {part: [one for one in answers if one.part == part] for part in PARTS}
+def _controller_findings(controller_estimates: Sequence[ControllerEstimate]) -> tuple[Finding, ...]:
+    parts = {part: [one for one in controller_estimates if one.part == part] for part in PARTS}
     return tuple(
         Finding(
             Code.CONTROLLER_ANSWERS,
@@ -364,41 +377,41 @@ def _said_of_controller(answers: Sequence[Answer]) -> tuple[Finding, ...]:
     )
 
 
-def _answering(gains: RateGains, answer: Answer) -> RateGains:
-    """Return the gains of which one is as it was found, P before the lateness of its axis.
+def _with_gain(gains: RateGains, estimate: ControllerEstimate) -> RateGains:
+    """Return the gains with one estimate applied, P before the latency of its axis.
 
-    A lag of the gyro is as good as less D; a lateness is that beside a D that grows with P.
+    A latency of the gyro acts like less D.
     """
-    axis = "xyz"[AXES.index(answer.axis)]
+    axis = "xyz"[AXES.index(estimate.axis)]
 
     def scaled(gain: Vec3) -> Vec3:
-        return replace(gain, **{axis: answer.value * getattr(gain, axis)})
+        return replace(gain, **{axis: estimate.value * getattr(gain, axis)})
 
-    if answer.part == "P":
+    if estimate.part == "P":
         return replace(gains, p=scaled(gains.p), d=scaled(gains.d))
-    if answer.part == "I":
+    if estimate.part == "I":
         return replace(gains, i=scaled(gains.i))
-    late = getattr(gains.d, axis) - answer.value * getattr(gains.p, axis)
-    return replace(gains, d=replace(gains.d, **{axis: late}))
+    less_d = getattr(gains.d, axis) - estimate.value * getattr(gains.p, axis)
+    return replace(gains, d=replace(gains.d, **{axis: less_d}))
 
 
-def _heard(
-    flights: Sequence[Flight], flown: Flown, mixer: MixerSettings, rate: float, tell: Mask
-) -> tuple[Answer, ...]:
-    """Return how the rate controllers of recorded flights answer, beside those of the fit's.
+def _controller_estimates(
+    flights: Sequence[Flight], flown: Flown, mixer: MixerSettings, rate: float, usable: Mask
+) -> tuple[ControllerEstimate, ...]:
+    """Return the estimates of recorded rate controllers relative to those of the fit.
 
-    ``tell`` (F,) says which flights are looked at.
+    ``usable`` (F,) are the flights to use.
     """
     recorded, simulated = [], []
     for number, flight in enumerate(flights):
         series = flight.series
         known = set(LOOP_SIGNALS) <= set(series)
-        if not (known and tell[number]):
+        if not (known and usable[number]):
             continue
         clock = np.arange(flown.channels["command"].shape[1]) / rate
         time = series["command"].time
         time = time[(time >= 0.0) & (time <= clock[-1])]
-        if len(time) < FEWEST or not all(
+        if len(time) < MIN_SAMPLES or not all(
             np.isfinite(series[name].values).all() for name in LOOP_SIGNALS
         ):
             continue
@@ -410,15 +423,15 @@ def _heard(
             stamps = stamps[(stamps >= 0.0) & (stamps <= clock[-1])]
             there = Series(clock, flown.channels[channel][number])
             # what a loop computes holds until it runs again; a body turns on
-            read = _at if name == "body_rate" else zero_order_hold
+            read = _interpolated if name == "body_rate" else zero_order_hold
             made.append(Series(stamps, read(there, stamps)))
         simulated.append(_signals(made, mixer, even))
-    return answers(recorded, simulated) if recorded else ()
+    return estimate_controller(recorded, simulated) if recorded else ()
 
 
 def _signals(parts: Sequence[Series], mixer: MixerSettings, time: Array) -> Signals:
-    """Return what a rate controller hears and says from set-points, gyro and commands."""
-    wanted, rate, commands = (_at(part, time) for part in parts)
+    """Return a rate controller's inputs and outputs from set-points, gyro and commands."""
+    wanted, rate, commands = (_interpolated(part, time) for part in parts)
     torque = torque_of(mixer, tuple(commands.T))
     turned = np.array([1.0, -1.0, -1.0])  # FRD
     return Signals(
@@ -432,15 +445,17 @@ def _signals(parts: Sequence[Series], mixer: MixerSettings, time: Array) -> Sign
 def _recorded(
     flight: Flight, model: Model, conditions: Mapping[str, Array], number: int
 ) -> Steps | None:
-    """Return the steps of a recording, of the centre of mass in body axes through the air."""
+    """Return the steps of a recording: motion of the centre of mass relative to the air."""
     known = {"position", "attitude", "body_rate", "rotor_speed"} <= set(flight.series)
     if known:
-        flight = replace(flight, series={**flight.series, **_of_body(flight.series, model)})
+        flight = replace(
+            flight, series={**flight.series, **_of_centre_of_mass(flight.series, model)}
+        )
     steps = steps_of(flight)
-    return None if steps is None else _through_air(steps, conditions, number)
+    return None if steps is None else _relative_to_air(steps, conditions, number)
 
 
-def _of_body(series: Mapping[str, Series], model: Model) -> dict[str, Series]:
+def _of_centre_of_mass(series: Mapping[str, Series], model: Model) -> dict[str, Series]:
     """Return pose and velocity of the centre of mass, in body axes, from those of markers."""
     markers = markers_of(model.vehicle)
     attitude, position = series["attitude"], series["position"]
@@ -452,37 +467,37 @@ def _of_body(series: Mapping[str, Series], model: Model) -> dict[str, Series]:
     if markers.offset is not None:
         offset = np.array(markers.offset.stacked())  # SciPy takes no array that is read-only
         arm = Series(attitude.time, turned.apply(offset))
-        moved["position"] = _less(position, arm)
+        moved["position"] = _difference(position, arm)
         if "velocity" in series and float(model.controller.sees_markers) > 0.5:
-            rates = _at(series["body_rate"], attitude.time)
+            rates = _interpolated(series["body_rate"], attitude.time)
             swing = Series(attitude.time, turned.apply(np.cross(rates, offset)))
-            moved["velocity"] = _less(series["velocity"], swing)
+            moved["velocity"] = _difference(series["velocity"], swing)
     return moved
 
 
-def _at(series: Series, times: Array) -> Array:
+def _interpolated(series: Series, times: Array) -> Array:
     return np.column_stack([np.interp(times, series.time, column) for column in series.values.T])
 
 
-def _less(series: Series, other: Series) -> Series:
-    return Series(series.time, series.values - _at(other, series.time))
+def _difference(series: Series, other: Series) -> Series:
+    return Series(series.time, series.values - _interpolated(other, series.time))
 
 
-def _driven(
+def _commanded_speeds(
     commands: Mapping[int, Series], model: Model, environment: Environment, schedule: Schedule
 ) -> dict[int, Series]:
-    """Return the rotor speeds that flights' commands ask for, late as the motors are."""
+    """Return the rotor speeds that the motors reach by flights' commands."""
     if not commands:
         return {}
-    late = float(model.vehicle.setup.actuator_latency)
-    late += float(model.vehicle.effects.get("time_constant_second", 0.0))  # to first order
+    delay = float(model.vehicle.setup.actuator_latency)
+    delay += float(model.vehicle.effects.get("time_constant_second", 0.0))  # to first order
     values = np.concatenate([series.values for series in commands.values()])
     steps = [np.diff(series.time, prepend=series.time[0]) for series in commands.values()]
-    found = _motor_answers(model.vehicle.motor, values, np.concatenate(steps)[:, None])
+    found = _motor_response(model.vehicle.motor, values, np.concatenate(steps)[:, None])
     ends = np.cumsum([len(series.time) for series in commands.values()])[:-1]
-    answers = zip(*(np.split(np.asarray(part), ends) for part in found), strict=True)
+    responses = zip(*(np.split(np.asarray(part), ends) for part in found), strict=True)
     driven = {}
-    for (number, series), (curve, up, down) in zip(commands.items(), answers, strict=True):
+    for (number, series), (curve, up, down) in zip(commands.items(), responses, strict=True):
         time, asked = series.time, curve.copy()
         if environment.log_voltage is not None:
             volts = np.asarray(environment.log_voltage)[:, number]
@@ -496,18 +511,18 @@ def _driven(
         for row in range(1, len(asked)):
             before, now = asked[row - 1], speeds[row - 1]
             speeds[row] = before + np.where(before > now, up[row], down[row]) * (now - before)
-        driven[number] = Series(time + late, speeds)
+        driven[number] = Series(time + delay, speeds)
     return driven
 
 
 @eqx.filter_jit
-def _motor_answers(motor: Motor, commands: Array, steps: Array) -> tuple[Any, Any, Any]:
-    """Return the speeds that commands ask for, and the shares of a difference that steps leave."""
+def _motor_response(motor: Motor, commands: Array, steps: Array) -> tuple[Any, Any, Any]:
+    """Return commanded speeds, and the shares of a difference left after each step."""
     lag = Lag.over(motor, jnp.asarray(steps))
     return reference_speed(motor, jnp.asarray(commands)), lag.decay_up, lag.decay_down
 
 
-def _through_air(part: Steps, conditions: Mapping[str, Array], number: int) -> Steps:
+def _relative_to_air(part: Steps, conditions: Mapping[str, Array], number: int) -> Steps:
     x, y = (conditions.get(name, np.zeros(number + 1))[number] for name in ("wind_x", "wind_y"))
     wind = Vec3(np.asarray(x), np.asarray(y), np.zeros(()))
     motion = part.motion
@@ -522,15 +537,15 @@ def _simulated(
     number: int,
     rate: float,
 ) -> Steps:
-    """Return the same steps as the fit flies them; nothing of them is unknown."""
+    """Return the same steps as the fit simulates them."""
     clock = np.arange(channels[MOTION].shape[1]) / rate
 
     def at(name: str) -> Array:
-        return _at(Series(clock, channels[name][number]), part.time)
+        return _interpolated(Series(clock, channels[name][number]), part.time)
 
     rows, attitude, speeds = at(MOTION), at(TURNED), at(SPEEDS)
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
-    position, velocity, turning = (Vec3.of(rows[:, at].T) for at in _PARTS)
+    position, velocity, turning = (Vec3.of(rows[:, at].T) for at in _MOTION_PARTS)
     motion = Motion(position, velocity, Quaternion.of(attitude.T), turning)
     flown = replace(
         part,
@@ -539,7 +554,7 @@ def _simulated(
         rotor_acceleration=np.gradient(speeds, part.step, axis=0),
         accelerations=np.zeros_like(part.accelerations),
     )
-    return _through_air(flown, conditions, number)
+    return _relative_to_air(flown, conditions, number)
 
 
-_PARTS = (slice(0, 3), slice(3, 6), slice(6, 9))
+_MOTION_PARTS = (slice(0, 3), slice(3, 6), slice(6, 9))

@@ -1,8 +1,8 @@
 """Profile likelihood: one coefficient fixed at a value, all the others fitted again.
 
-Where the fit's quadratic picture of itself is wrong, the profile shows it: a valley that does not
-rise on one side has no interval there (Raue et al., "Structural and practical identifiability
-analysis of partially observed dynamical models by exploiting the profile likelihood", 2009).
+A profile needs no quadratic approximation: one that stays flat on a side has no interval there
+(Raue et al., "Structural and practical identifiability analysis of partially observed dynamical
+models by exploiting the profile likelihood", 2009).
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from tuner.core.numerics import Array
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal_equations import Objective
 from tuner.search.levenberg_marquardt import advance, begin
-from tuner.uncertainty.covariance import WIDE
+from tuner.uncertainty.covariance import PRIOR_WIDENING
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import FullProblem
-from tuner.uncertainty.records import THRESHOLD, Profile
+from tuner.uncertainty.records import CHI_SQUARE_95, Profile
 from tuner.vehicle import COEFFICIENTS
 
-POINTS = 13
-"""Number of the coefficient's values, the middle one where it stands."""
-REACH = 3.5
+GRID_POINTS = 13
+"""Number of the coefficient's values, the middle one that of the fit."""
+GRID_REACH_SE = 3.5
 """Distance of the outermost values in standard errors."""
-MAX_REACH = 1.2
+MAX_GRID_REACH = 1.2
 """Largest distance of the outermost values in the scaled coordinate, a factor of three."""
 MAX_ITERATIONS = 12
-"""Of refitting the others."""
+"""Iterations of refitting the others."""
 TOLERANCE = 0.01
 """Decrease of every point's χ² below which refitting stops."""
 
@@ -43,10 +43,9 @@ def profile_likelihood(
     full_problem
         The problem in all coefficients, at the fit's point.
     uncertainty
-        At this point, of the coefficient and of those that are fitted again for each of its values.
+        At this point, of the coefficient and of those that are refitted for each of its values.
     criterion
-        Whose weights the residuals have; of the priors, only as much is kept as keeps the other
-        coefficients from diverging.
+        Weights of the residuals; priors are weakened until they only prevent divergence.
     """
     space, indices = full_problem.subspace(uncertainty.names)
     objective = replace(full_problem.objective, space=space)
@@ -54,14 +53,16 @@ def profile_likelihood(
     vector = np.asarray(full_problem.point.coefficients)[indices]
     centre = space.scaled(vector)
     error = float(uncertainty.covariance.data_error[index])
-    reach = min(REACH * error, MAX_REACH * uncertainty.reference[index])
+    reach = min(GRID_REACH_SE * error, MAX_GRID_REACH * uncertainty.reference[index])
     parameter = space.parameters[index]
     low, high = parameter.scaled(parameter.lower), parameter.scaled(parameter.upper)
-    grid = np.linspace(max(centre[index] - reach, low), min(centre[index] + reach, high), POINTS)
+    grid = np.linspace(
+        max(centre[index] - reach, low), min(centre[index] + reach, high), GRID_POINTS
+    )
     along = (
         uncertainty.covariance.data_only[:, index] / uncertainty.covariance.data_only[index, index]
     )
-    # the others follow as the quadratic approximation says
+    # the others start from the quadratic approximation
     scaled = centre + np.outer(grid - centre[index], along)
     scaled[:, index] = grid
     starts = space.vector_at(scaled)
@@ -90,7 +91,7 @@ def _refitted(
     count = len(objective.space)
     free = np.concatenate([np.ones(count), (offsets != 0.0).astype(float).ravel()])
     free[index] = 0.0
-    weak_priors = replace(criterion, prior=1.0 / WIDE)
+    weak_priors = replace(criterion, prior=1.0 / PRIOR_WIDENING)
     points = Point(starts, np.repeat(offsets[None], len(starts), axis=0))
     step, previous = begin(points), np.full(len(starts), np.inf)
     for _ in range(MAX_ITERATIONS):
@@ -105,9 +106,9 @@ def _refitted(
 
 def _crossing(values: Array, rise: Array) -> float | None:
     """Return where a profile passes the threshold, on its way from its lowest point."""
-    beyond = np.flatnonzero(rise > THRESHOLD)
+    beyond = np.flatnonzero(rise > CHI_SQUARE_95)
     if len(beyond) == 0:
         return None
     outer = int(beyond[0])
-    share = (THRESHOLD - rise[outer - 1]) / (rise[outer] - rise[outer - 1])
+    share = (CHI_SQUARE_95 - rise[outer - 1]) / (rise[outer] - rise[outer - 1])
     return float(values[outer - 1] + share * (values[outer] - values[outer - 1]))

@@ -1,4 +1,4 @@
-"""What a result folder's files hold of uncertainty and sensitivity, as data."""
+"""Records of uncertainty and sensitivity in a result folder's files."""
 
 from __future__ import annotations
 
@@ -85,8 +85,8 @@ class Refit(Part):
     rmse: AxesRmse | None = None
 
 
-CONFLICT = 3.0
-"""Standard errors apart beyond which ground measurements and flights contradict each other."""
+CONFLICT_SE = 3.0
+"""Standard errors of difference beyond which ground and flights contradict each other."""
 
 
 class Sources(Part):
@@ -138,7 +138,7 @@ class Residual(Part):
 
 
 PROFILES_TABLE = "profiles.csv"
-THRESHOLD = 3.841459
+CHI_SQUARE_95 = 3.841459
 """Rise of χ² (one degree of freedom) at the true value that 95 % of experiments stay below."""
 
 
@@ -157,7 +157,7 @@ class Profile(Part):
     quadratic
         The rise that the standard error predicts.
     interval
-        Where the rise passes `THRESHOLD`; None where it does not within the values.
+        Where the rise passes `CHI_SQUARE_95`; None where it does not within the values.
     """
 
     name: str
@@ -191,14 +191,14 @@ Method = Literal["morris", "sobol"]
 GLOBAL_TABLE = "global_sensitivity.csv"
 
 #: Method -> what the attributes `main`, `total` and `spread` of a `SensitivityIndex` are.
-MEANING = {
+INDEX_MEANINGS = {
     "morris": ("mean effect μ", "mean absolute effect μ*", "standard deviation of the effect σ"),
     "sobol": ("first-order index", "total index", "95 % confidence of the total index"),
 }
 
 
 class SensitivityIndex(Part):
-    """Effect of one coefficient on the logarithm of one RMSE; see `MEANING`.
+    """Effect of one coefficient on the logarithm of one RMSE; see `INDEX_MEANINGS`.
 
     ``flight`` and ``channel`` are empty for the mean over all of them.
     """
@@ -237,7 +237,7 @@ class GlobalSensitivity(ResultFile):
     def write(self, folder: Path) -> None:
         """Write ``global_sensitivity.json`` and, for other programs, ``.csv``."""
         super().write(folder)
-        header = ("coefficient", "flight", "channel", *MEANING[self.method])
+        header = ("coefficient", "flight", "channel", *INDEX_MEANINGS[self.method])
         rows = [
             [i.coefficient, i.flight or "all", i.channel or "all", i.main, i.total, i.spread]
             for i in self.indices
@@ -473,24 +473,24 @@ def _shares(knowledge: Knowledge) -> Iterable[Sequence[object]]:
 
 
 CALIBRATION = Path(__file__).with_name("calibration.json")
-"""How often intervals held the truth where it was known; `benchmarks.calibration` writes it."""
+"""Measured coverage of the intervals; `benchmarks.calibration` writes it."""
 COVERAGE_LEVELS = ("50", "80", "95")
-"""Per cent that intervals are meant to hold."""
+"""Nominal coverage of intervals, per cent."""
 
 
-class Held(Part):
-    """How often the intervals of one kind of flight held the truth.
+class CoverageRecord(Part):
+    """Coverage of the intervals of one kind of flight.
 
     Attributes
     ----------
     flights
-        What they had beside measurement noise.
+        The disturbances beside measurement noise.
     sets, intervals
-        How many sets were flown, and how many intervals of coefficients looked at.
+        Number of sets flown, and of intervals compared.
     coverage
-        Level in per cent -> share that held the truth.
+        Level in per cent -> share of intervals that held the truth.
     least
-        That of the coefficient whose 95 % intervals held it least often.
+        Coverage of the coefficient whose 95 % intervals held it least often.
     """
 
     flights: str
@@ -501,13 +501,13 @@ class Held(Part):
 
 
 class Calibration(Part):
-    """What was measured of every kind of flight, and when."""
+    """Coverage for every kind of flight, and the date of its measurement."""
 
     date: str
-    kinds: tuple[Held, ...]
+    kinds: tuple[CoverageRecord, ...]
 
 
 @lru_cache(maxsize=1)
 def calibration() -> Calibration:
-    """Return what was measured."""
+    """Return the measured coverage."""
     return Calibration.model_validate_json(CALIBRATION.read_text(encoding="utf-8"))

@@ -28,17 +28,16 @@ from tuner.vehicle import with_values
 
 
 class Draw(NamedTuple):
-    """The flights that a fit is made to again.
+    """The flights of a refit.
 
     Attributes
     ----------
     title
-        What stands before the stages' names in messages.
+        Prefix of the stages' names in messages.
     counts
-        (F,) how often each fitted flight counts. One that counts for nothing keeps its place, with
-        weights of zero.
+        (F,) multiplicity of each fitted flight; one with 0 keeps its place, with zero weights.
     left_out
-        The flight that the fit is then to predict.
+        The flight that the refit is to predict.
     """
 
     title: str
@@ -47,12 +46,9 @@ class Draw(NamedTuple):
 
 
 def refits(
-    job: Job,
-    fitted: Fitted,
-    draws: Sequence[Draw],
-    on_iteration: Callable[[Iteration], None],
+    job: Job, fitted: Fitted, draws: Sequence[Draw], on_iteration: Callable[[Iteration], None]
 ) -> list[Refit]:
-    """Have the engine in force polish a fit again, for each draw of its flights.
+    """Polish a fit again for each draw of its flights, by the engine in force.
 
     Parameters
     ----------
@@ -61,7 +57,7 @@ def refits(
     """
     engine, last = current(), dict[int, Iteration]()
 
-    def heard(number: int, report: dict[str, Any]) -> None:
+    def on_report(number: int, report: dict[str, Any]) -> None:
         before, last[number] = last.get(number), Iteration(**report)
         if engine.at_once == 1:
             on_iteration(last[number])
@@ -69,7 +65,7 @@ def refits(
             on_iteration(before)
 
     whole = engine.share((job, fitted))
-    found = engine.map(_refit, [(whole, draw) for draw in draws], heard)
+    found = engine.map(_refit, [(whole, draw) for draw in draws], on_report)
     if engine.at_once > 1:
         for iteration in last.values():
             on_iteration(iteration)
@@ -96,7 +92,7 @@ def _refit(task: tuple[Callable[[], tuple[Job, Fitted]], Draw], report: Report) 
 
 
 def _counted(objective: Objective, counts: NDArray[np.float64]) -> Objective:
-    """Return an objective to which each flight contributes so many times."""
+    """Return an objective with each flight counted so many times."""
     some = (counts > 0.0)[objective.flight]
     changed: Objective = eqx.tree_at(
         lambda o: [measured.weight for measured in o.segments.measured.values()],
@@ -118,14 +114,14 @@ BOOTSTRAP_FILE = "bootstrap.csv"
 def bootstrap(
     job: Job, fitted: Fitted, count: int, folder: Path, on_iteration: Callable[[Iteration], None]
 ) -> dict[str, float]:
-    """Refit to two or more flights, drawn with replacement; write and return what they give.
+    """Refit to two or more flights, drawn with replacement; write the table, return the errors.
 
     The engine in force computes the refits; the draws follow from the job's seed.
 
     Parameters
     ----------
     folder
-        Gets ``bootstrap.csv``: a row a refit, how often each flight was drawn and what came out.
+        Gets ``bootstrap.csv``: for each refit the count of each flight and the coefficients.
 
     Returns
     -------

@@ -32,7 +32,7 @@ SMALL_STEP = 0.01
 """Relative change whose effect is computed from the derivative."""
 LARGE_STEP = 0.1
 """Relative change whose effect is simulated."""
-BINS = 40
+TIME_BINS = 40
 """Number of stretches of time that a flight is cut into."""
 
 #: Channel -> its axes, its unit, and that unit's size in the unit of the residuals.
@@ -120,8 +120,8 @@ def _outputs(
 ) -> Iterator[OutputSensitivity]:
     """Return the effects on every output that holds data.
 
-    ``moved`` (K,) is the change of the search vector for +1 %, ``batch`` what the vectors of
-    `_steps` give behind that of the point.
+    ``moved`` (K,) is the change of the search vector for +1 %, ``batch`` the evaluation at the
+    point and the vectors of `_steps`.
     """
     names, count = objective.space.names, len(objective.space)
 
@@ -176,7 +176,7 @@ def _over_time(
     """Return the middles (B,) of a flight's stretches in s and the effects in them (K, B)."""
     segments = np.flatnonzero(objective.flight == flight)
     begins, measured = objective.segments.begins, objective.segments.measured
-    squares, counts = np.zeros((len(moved), BINS)), np.zeros(BINS)
+    squares, counts = np.zeros((len(moved), TIME_BINS)), np.zeros(TIME_BINS)
     end = max(
         float(np.max(np.asarray(m.time)[:, segments] + begins[segments], initial=0.0))
         for m in measured.values()
@@ -185,13 +185,13 @@ def _over_time(
         scale = criterion.scale[channel][flight]
         for segment in segments:
             time = np.asarray(recorded.time)[:, segment] + begins[segment]
-            stretch = np.clip((time / end * BINS).astype(int), 0, BINS - 1)
+            stretch = np.clip((time / end * TIME_BINS).astype(int), 0, TIME_BINS - 1)
             rows = np.asarray(jacobian.columns[channel])[: len(moved), ..., segment] / scale
             for index, power in enumerate((rows**2).sum(axis=2)):
-                squares[index] += np.bincount(stretch, power, minlength=BINS)
+                squares[index] += np.bincount(stretch, power, minlength=TIME_BINS)
             seen = (np.asarray(recorded.weight)[..., segment] > 0).sum(axis=1)
-            counts += np.bincount(stretch, seen, minlength=BINS)
-    middles = (np.arange(BINS) + 0.5) * end / BINS
+            counts += np.bincount(stretch, seen, minlength=TIME_BINS)
+    middles = (np.arange(TIME_BINS) + 0.5) * end / TIME_BINS
     return middles, np.sqrt(squares / np.maximum(counts, 1.0)) * moved[:, None]
 
 
@@ -209,9 +209,9 @@ def shortest_half(time: Array, effect: Array) -> tuple[float, float]:
 
 GRID_LEVELS = 4
 """Number of levels of Morris' grid."""
-FLOOR = 1e-3
-"""Lower limit of an RMSE in standard deviations, below which its logarithm means nothing."""
-SAMPLES = {"morris": 16, "sobol": 64}
+MIN_RMSE_SD = 1e-3
+"""Lower limit of an RMSE in standard deviations, before its logarithm."""
+DEFAULT_SAMPLES = {"morris": 16, "sobol": 64}
 """Default number of trajectories, or base points; each coefficient adds so many simulations."""
 
 
@@ -245,7 +245,7 @@ def global_sensitivity(
         "names": list(space.names),
         "bounds": [[p.scaled(end) for end in bounds[p.name]] for p in space.parameters],
     }
-    count = samples or SAMPLES[method]
+    count = samples or DEFAULT_SAMPLES[method]
     points = _samples(problem, method, count, seed)
     batch = evaluate(objective, space.vector_at(points), point, criterion)
     crashed = np.isfinite(np.asarray(batch.crash_time))
@@ -293,11 +293,11 @@ def _log_rmse(
             total = np.asarray(squares[channel])[..., segments].sum(axis=(1, 2))
             rms = np.sqrt(total / count)
             usable = np.isfinite(rms)
-            worst = float(rms[usable & ~crashed_here].max(initial=FLOOR))
+            worst = float(rms[usable & ~crashed_here].max(initial=MIN_RMSE_SD))
             rms = np.where(usable, rms, worst)
             rms = np.where(crashed_here, np.maximum(rms, worst), rms)
             names.append((name, channel))
-            columns.append(np.log10(np.maximum(rms, FLOOR)))
+            columns.append(np.log10(np.maximum(rms, MIN_RMSE_SD)))
     table = np.stack(columns, axis=-1)
     return [("", ""), *names], np.column_stack([table.mean(axis=1), table])
 

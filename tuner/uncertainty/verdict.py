@@ -1,6 +1,6 @@
-"""How well each coefficient is known, and why: codes and numbers, no prose.
+"""Verdicts on coefficients and their reasons, as codes and numbers.
 
-Sentences are made from them in `tuner.uncertainty.verdict_texts`.
+`tuner.uncertainty.verdict_texts` makes sentences from them.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from tuner.core.numerics import Z95
 
 WELL_KNOWN = 0.05
 """Half the 95 % interval, relative to the coefficient's reference, below which it is well known."""
-IDENTIFIABLE_ERROR = 0.25
+MAX_IDENTIFIABLE_ERROR = 0.25
 """Relative standard error from the flights alone above which they do not determine it."""
 NO_INFORMATION_ERROR = 10.0
-"""Relative standard error from the flights alone above which they hold no information about it."""
-PRIOR_SHARE = 0.5
-"""Share of the information above which a coefficient's interval is its prior's work."""
-CONFUSED = 0.9
+"""Relative standard error from the flights alone above which they have no information."""
+MAX_PRIOR_SHARE = 0.5
+"""Share of the prior in the information above which it dominates."""
+HIGH_CORRELATION = 0.9
 """Correlation above which two coefficients are called hard to distinguish."""
-INFLATED = 2.0
+HIGH_INFLATION = 2.0
 """Inflation of the standard error above which the reason mentions model error."""
 
 
@@ -34,7 +34,7 @@ class Direction(Part):
     moves
         Name -> relative change (logarithmic coefficients) or change in units of the coefficient's
         reference; the largest is ±1. Only coefficients that move by more than
-        `tuner.uncertainty.estimates.NAMED`.
+        `tuner.uncertainty.estimates.MIN_MOVE_NAMED`.
     error
         Standard error along the direction from the flights alone: 0.1 means that all moves times
         ten percent are one standard error away.
@@ -67,7 +67,7 @@ class Verdict(StrEnum):
 
 
 class ReasonCode(StrEnum):
-    """What a verdict rests on."""
+    """Main reason of a verdict."""
 
     INTERVAL = "interval"
     """The flights determine it, to ``half_width``."""
@@ -186,7 +186,7 @@ def judge(
     if refuted:
         return Verdict.NOT_IDENTIFIABLE, reason(ReasonCode.REFUTED, "prior_given")
     prior_share = known.prior_share or 0.0
-    if data_error > IDENTIFIABLE_ERROR or prior_share > PRIOR_SHARE:
+    if data_error > MAX_IDENTIFIABLE_ERROR or prior_share > MAX_PRIOR_SHARE:
         for direction in directions:
             if direction.null and name in direction.moves and len(direction.moves) > 1:
                 why = reason(ReasonCode.NULL_DIRECTION, "prior_given", direction=direction)
@@ -194,7 +194,7 @@ def judge(
         else:
             if data_error >= NO_INFORMATION_ERROR:
                 why = reason(ReasonCode.NO_INFORMATION, "prior_given")
-            elif data_error > IDENTIFIABLE_ERROR:
+            elif data_error > MAX_IDENTIFIABLE_ERROR:
                 half_width = Z95 * data_error
                 why = reason(ReasonCode.WIDE_INTERVAL, "prior_given", half_width=half_width)
             else:
@@ -202,9 +202,9 @@ def judge(
         return Verdict.NOT_IDENTIFIABLE, why
     well = relative_half_width < WELL_KNOWN and known.bound is None
     kept = ["half_width", "unit", "channel", "flight"]
-    if not well and known.correlated_with and abs(known.correlation or 0.0) > CONFUSED:
+    if not well and known.correlated_with and abs(known.correlation or 0.0) > HIGH_CORRELATION:
         kept += ["correlated_with", "correlation"]
-    if (known.noise_inflation or 1.0) > INFLATED:
+    if (known.noise_inflation or 1.0) > HIGH_INFLATION:
         kept.append("noise_inflation")
     verdict = Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN
     return verdict, reason(ReasonCode.INTERVAL, *kept)
@@ -254,7 +254,7 @@ def judge_by_error(
         Where most of the information comes from.
     """
     half_width = Z95 * error
-    if relative > IDENTIFIABLE_ERROR:
+    if relative > MAX_IDENTIFIABLE_ERROR:
         return Verdict.NOT_IDENTIFIABLE, Reason(code=roughly, half_width=half_width, unit=unit)
     well = Z95 * relative < WELL_KNOWN
     verdict = Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN

@@ -10,12 +10,12 @@ from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict
 from tuner.vehicle import scale_group
 
-MOST = 100.0
-"""Of a logarithm's interval, more than any prior leaves."""
-HARDLY = math.log(10.0)
-"""Of a logarithm's interval, from which no percentage is said of it."""
-NEGLIGIBLE = 0.01
-"""Share of the largest part of an error below which another is not worth a word."""
+MAX_LOG_HALF_WIDTH = 100.0
+"""Largest half-width of a logarithm's interval: more than any prior leaves."""
+MAX_LOG_QUOTED = math.log(10.0)
+"""Largest half-width of a logarithm's interval that is given as a percentage."""
+MIN_REPORTED_SHARE = 0.01
+"""Least part of an error that is reported, as a share of the largest."""
 
 
 def verdict_in_words(verdict: Verdict) -> str:
@@ -26,7 +26,7 @@ def verdict_in_words(verdict: Verdict) -> str:
 def judgement_in_words(verdict: Verdict, reason: Reason) -> str:
     """Return a verdict and its reason, as a phrase."""
     because = reason_in_words(reason)
-    if verdict is Verdict.TIED and because:  # which names what it is tied to
+    if verdict is Verdict.TIED and because:  # which names the other coefficient
         return because
     return f"{verdict_in_words(verdict)}: {because}" if because else verdict_in_words(verdict)
 
@@ -71,7 +71,7 @@ def half_width_in_words(
 
 
 def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
-    """Return what half of a 95 % interval would be from each cause alone.
+    """Return half of a 95 % interval from each cause alone.
 
     In ``unit``; in shares of ``value`` where that is None.
     """
@@ -87,7 +87,7 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
         "the rotors' limit": parts.limit,
         "a vehicle that flies otherwise": parts.astray,
     }
-    least = NEGLIGIBLE * max(error or 0.0 for error in named.values())
+    least = MIN_REPORTED_SHARE * max(error or 0.0 for error in named.values())
     size = 1.0 if unit is not None else max(abs(value), 1e-300)
     return ", ".join(
         f"{cause} ±{quantity(Z95 * error / size, unit)}"
@@ -108,7 +108,7 @@ def _main_clause(reason: Reason) -> str:
         f"The interval is that of {prior}",
         ReasonCode.NO_INFORMATION: "the flights hold no information about it; "
         f"the interval is that of {prior}",
-        ReasonCode.WIDE_INTERVAL: f"the flights alone {_told(reason)}; the interval leans "
+        ReasonCode.WIDE_INTERVAL: f"the flights alone {_closeness(reason)}; the interval leans "
         f"on {prior}",
         ReasonCode.REFUTED: "the fitted vehicle does not fly what was recorded, so that its "
         f"flights say nothing about it; the interval is no narrower than that of {prior}",
@@ -130,12 +130,12 @@ def _half_width(reason: Reason) -> str:
     half, unit = reason.half_width, reason.unit
     if half is None:
         return ""
-    return quantity(half if unit is not None else math.expm1(min(half, MOST)), unit)
+    return quantity(half if unit is not None else math.expm1(min(half, MAX_LOG_HALF_WIDTH)), unit)
 
 
-def _told(reason: Reason) -> str:
-    """Return how closely flights alone determine it; of a logarithm, not beyond `HARDLY`."""
-    if reason.unit is None and (reason.half_width or 0.0) > HARDLY:
+def _closeness(reason: Reason) -> str:
+    """Return how closely flights alone determine a coefficient."""
+    if reason.unit is None and (reason.half_width or 0.0) > MAX_LOG_QUOTED:
         return "hardly tell it from ten times as much"
     return f"determine it only to ±{_half_width(reason)}"
 

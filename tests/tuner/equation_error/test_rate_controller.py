@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from tuner.equation_error.rate_controller import AXES, Signals, answers
+from tuner.equation_error.rate_controller import AXES, Signals, estimate_controller
 
 RATE, SECONDS = 100.0, 40.0
 P_GAIN, I_GAIN, D_GAIN = 0.15, 0.2, 0.003
@@ -38,26 +38,29 @@ def flight(
 def told(seed, d=D_GAIN, **changed):
     random = np.random.default_rng(seed)
     simulated = [flight(random, d=d)]
-    found = answers([flight(random, d=d, gusts=0.2, noise=0.01, **changed)], simulated)
-    return [answer for answer in found if answer.differs]
+    found = estimate_controller([flight(random, d=d, gusts=0.2, noise=0.01, **changed)], simulated)
+    return [estimate for estimate in found if estimate.differs]
 
 
 @pytest.mark.parametrize(
     ("part", "change"), [("P", {"p": 1.05 * P_GAIN}), ("I", {"i": 0.7 * I_GAIN})]
 )
 def test_a_gain_is_told_of_every_axis(part, change):
-    found = {answer.axis: answer for answer in told(1, **change) if answer.part == part}
+    found = {estimate.axis: estimate for estimate in told(1, **change) if estimate.part == part}
     assert set(found) == set(AXES)
     true = next(iter(change.values())) / {"P": P_GAIN, "I": I_GAIN}[part]
-    for answer in found.values():
-        assert answer.value == pytest.approx(true, abs=4.0 * answer.sd)
-        assert answer.sd < 0.25 * abs(true - 1.0)
-    assert {answer.part for answer in told(1, **change)} == {part}
+    for estimate in found.values():
+        assert estimate.value == pytest.approx(true, abs=4.0 * estimate.sd)
+        assert estimate.sd < 0.25 * abs(true - 1.0)
+    assert {estimate.part for estimate in told(1, **change)} == {part}
 
 
 def test_a_slower_filter_is_told_of_roll_and_pitch_together():
     found = told(1, d=0.0, late=3e-3)  # without D, which answers late, too
-    assert {(answer.axis, answer.part) for answer in found} == {("roll", "late"), ("pitch", "late")}
+    assert {(estimate.axis, estimate.part) for estimate in found} == {
+        ("roll", "late"),
+        ("pitch", "late"),
+    }
     assert found[0].value == pytest.approx(3e-3, abs=4.0 * found[0].sd)
     assert (found[0].value, found[0].sd) == (found[1].value, found[1].sd)
 
@@ -69,20 +72,22 @@ def test_the_file_that_flew_is_not_doubted():
 def test_what_a_gyro_reads_at_rest_is_not_what_the_loop_integrated():
     random = np.random.default_rng(0)
     real, made = flight(random, gusts=0.2, noise=0.01, bias=0.02), flight(random)
-    found = answers([real], [made])
-    assert not any(answer.differs for answer in found)
-    assert max(answer.sd for answer in found if answer.part == "I") < 0.05
+    found = estimate_controller([real], [made])
+    assert not any(estimate.differs for estimate in found)
+    assert max(estimate.sd for estimate in found if estimate.part == "I") < 0.05
 
 
 def test_a_flight_that_swings_in_another_phase_tells_nothing():
     random = np.random.default_rng(0)
     real, made = flight(random, gusts=0.2, noise=0.01), flight(random)
     swinging = swing(real, 0.0), swing(real, 0.5 * np.pi)
-    assert answers([real, swinging[0]], [made, swinging[1]]) == answers([real], [made])
+    assert estimate_controller([real, swinging[0]], [made, swinging[1]]) == estimate_controller(
+        [real], [made]
+    )
     swinging[1].torque[:, 1] = swinging[0].torque[:, 1]  # pitch alone is followed
-    others = answers([real, swinging[0]], [made, swinging[1]])
-    assert {answer.axis for answer in others} == set(AXES)
-    assert answers([swinging[0]], [swing(real, 0.5 * np.pi)]) == ()
+    others = estimate_controller([real, swinging[0]], [made, swinging[1]])
+    assert {estimate.axis for estimate in others} == set(AXES)
+    assert estimate_controller([swinging[0]], [swing(real, 0.5 * np.pi)]) == ()
 
 
 def swing(signals: Signals, phase: float) -> Signals:
@@ -110,4 +115,6 @@ def test_one_step_of_a_set_point_tells_nothing():
             np.interp(time - 0.004, time, torque[:, 0])[:, None].repeat(3, 1),
         )
 
-    assert not any(answer.differs for answer in answers([flown(0.1)], [flown(0.12)]))
+    assert not any(
+        estimate.differs for estimate in estimate_controller([flown(0.1)], [flown(0.12)])
+    )

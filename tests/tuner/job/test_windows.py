@@ -21,7 +21,7 @@ from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.search.progress import beginning, criterion_of
 from tuner.search.stages import WHOLE, plan
-from tuner.uncertainty.identifiability import with_undetermined_held
+from tuner.uncertainty.identifiability import hold_undetermined
 from tuner.vehicle import values_of, with_values
 
 WRONG = {"inertia_xx": 1.3, "inertia_yy": 0.8, "motor_constant": 1.1, "moment_constant": 0.8}
@@ -215,7 +215,7 @@ def test_one_of_what_trades_off_is_held_and_the_rest_follows(
     free = (*FREE, "mass", "inertia_zz", "rolling_moment_coefficient")
     job = job_through("rotor_speed", full_flight, full_bag, updated, free=free)
     messages = []
-    fitted, examination = with_undetermined_held(
+    fitted, examination = hold_undetermined(
         job, fitted_through(job, tmp_path), lambda *_: None, messages.append
     )
     assert fitted.held["motor_constant"] == "mass"

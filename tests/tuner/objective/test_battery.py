@@ -30,7 +30,7 @@ from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import normal_equations
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, InitialState, Series
-from tuner.uncertainty.estimates import DRAWS, STEP
+from tuner.uncertainty.estimates import STEP, VOLTMETER_DRAWS
 from tuner.uncertainty.model_error import alternatives_of
 
 NOISE = 0.02
@@ -284,7 +284,7 @@ def test_a_fit_is_simulated_with_other_readings_where_they_matter_to_it(exponent
     point = Point(jnp.asarray(vector), jnp.zeros((5, 2)))
     others = alternatives_of(fit, point, flights)
     assert next(iter(others)) == STEP
-    assert len(others) == 1 + (DRAWS if exponent else 0)
+    assert len(others) == 1 + (VOLTMETER_DRAWS if exponent else 0)
     for name, other in others.items():
         if name == STEP:
             continue

@@ -14,7 +14,7 @@ from tuner.report.result_texts import (
     what_is_lost,
 )
 from tuner.result import PoseRmse
-from tuner.uncertainty.records import COVERAGE_LEVELS, Calibration, Held, calibration
+from tuner.uncertainty.records import COVERAGE_LEVELS, Calibration, CoverageRecord, calibration
 from tuner.vehicle import Written
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
@@ -63,7 +63,7 @@ def test_a_gain_is_a_share_of_the_loss():
 
 def held(flights, share):
     coverage = dict(zip(COVERAGE_LEVELS, (0.6, 0.8, share), strict=True))
-    return Held(flights=flights, sets=12, intervals=144, coverage=coverage, least=0.8)
+    return CoverageRecord(flights=flights, sets=12, intervals=144, coverage=coverage, least=0.8)
 
 
 def test_every_kind_of_flight_is_named_with_what_it_held():

@@ -78,7 +78,7 @@ def test_flights_that_hardly_tell_anything_end_in_a_result(
     options = Options(flights=flights, config=str(job))
     for broken in (False, True):
         if broken:
-            monkeypatch.setattr(disturbances, "with_undetermined_held", fails)
+            monkeypatch.setattr(disturbances, "hold_undetermined", fails)
             monkeypatch.setattr("tuner.job.run.what_to_log", fails)
         told.clear()
         listener = Listener(on_message=told.append)

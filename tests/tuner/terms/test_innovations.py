@@ -17,9 +17,9 @@ from tuner.objective.space import Space, extended, space_of
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms import innovations
-from tuner.terms.candidates import Selected, start_of
-from tuner.terms.innovations import Innovations
-from tuner.terms.linearisation import linear_of
+from tuner.terms.candidates import Selected, neutral_values_of
+from tuner.terms.innovations import LinearisedInnovations
+from tuner.terms.linearisation import linearised_from
 from tuner.vehicle import COEFFICIENTS, term_groups
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
@@ -37,7 +37,7 @@ TOLD = 10.0
 def wide_space(names: Sequence[str]) -> Space:
     """Return the space of a model's coefficients, and of those of terms at neutral values."""
     space = space_of(making.vehicle_file(), making.controller_file(), JobFile(free=MODEL))
-    return extended(space, tuple(names), JobFile(), start_of(names))
+    return extended(space, tuple(names), JobFile(), neutral_values_of(names))
 
 
 def information(
@@ -80,8 +80,8 @@ def seen(
     truth: Mapping[str, float],
     alike: Mapping[str, str] | None = None,
     *,
-    in_doubt: Mapping[str, float] | None = None,
-) -> Innovations:
+    selection_shifts: Mapping[str, float] | None = None,
+) -> LinearisedInnovations:
     """Return innovations of a fit of a model and the rows that are kept."""
     kept = [name for r in rows if r.kept for name in r.names]
     space = wide_space([*kept, *(name for r in rows if not r.kept for name in r.names)])
@@ -94,9 +94,9 @@ def seen(
         SimpleNamespace(objective=SimpleNamespace(space=wide_space(kept)), held={}, findings=()),
     )
     base = (NOBODY, NOBODY)
-    selected = Selected(cast(Job, NOBODY), fitted, tuple(rows), in_doubt or {}, base)
-    linear = linear_of(said, scaled, scaled, loss)
-    return Innovations(selected, fitted, space, vector, linear)
+    selected = Selected(cast(Job, NOBODY), fitted, tuple(rows), selection_shifts or {}, base)
+    linear = linearised_from(said, scaled, scaled, loss)
+    return LinearisedInnovations(selected, fitted, space, vector, linear)
 
 
 @pytest.fixture
@@ -114,9 +114,13 @@ def chosen(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(innovations, "findings_at", lambda *_: ())
 
     def choose(
-        innovation: Innovations, had: Sequence[str] = (), *, first: bool = False, lags: bool = False
+        innovation: LinearisedInnovations,
+        had: Sequence[str] = (),
+        *,
+        first: bool = False,
+        lags: bool = False,
     ) -> tuple[Selected, dict[str, Any]] | None:
-        selected = innovation.with_lags() if lags else innovation.selection(had, first=first)
+        selected = innovation.with_lag_terms() if lags else innovation.selection(had, first=first)
         return None if selected is None else (selected, found)
 
     return choose
@@ -256,8 +260,8 @@ def test_terms_left_out_are_in_doubt_by_what_innovations_say_of_them(alike: bool
     """As far as they do what a coefficient does; what set-points hide stays as it was."""
     before = {"inertia_xx": 9.0, "estimate_latency": 7.0}
     found = seen(
-        [DRAG], {}, {"fuselage_drag": "inertia_xx"} if alike else {}, in_doubt=before
-    ).in_doubt()
+        [DRAG], {}, {"fuselage_drag": "inertia_xx"} if alike else {}, selection_shifts=before
+    ).selection_shifts()
     assert found["estimate_latency"] == 7.0
     assert (found["inertia_xx"] < 2e-3) != alike
     assert found["inertia_xx"] < 9.0
@@ -287,23 +291,25 @@ def test_terms_are_judged_with_what_the_model_lacks_acting(monkeypatch) -> None:
     wide = SimpleNamespace(objective=there, point=SimpleNamespace(coefficients=plain.vector))
     monkeypatch.setattr(innovations, "with_free", lambda *_: (NOBODY, wide))
     fitted = cast(Fitted, SimpleNamespace(**vars(plain.fitted), criterion=NOBODY))
-    lack = SimpleNamespace(acting_on=lambda objective: replace(objective, pushed=True))
-    said = Innovations.of(plain.selected, fitted, cast(Any, there))
+    model_errors = SimpleNamespace(applied_to=lambda objective: replace(objective, pushed=True))
+    said = LinearisedInnovations.of(plain.selected, fitted, cast(Any, there))
 
-    def doubt(lack: Any) -> float:
-        return said.with_acting(lack, cast(Any, there)).in_doubt()["inertia_xx"]
+    def doubt(model_errors: Any) -> float:
+        return said.with_model_error(model_errors, cast(Any, there)).selection_shifts()[
+            "inertia_xx"
+        ]
 
-    assert doubt(lack) > 10.0 * doubt(None) > 0.0
+    assert doubt(model_errors) > 10.0 * doubt(None) > 0.0
 
 
 def test_what_innovations_surely_put_elsewhere_is_contradicted() -> None:
     usual, said = USUAL["fuselage_drag"], seen([DRAG], {"fuselage_drag": 2.0})
     sizes = (-2.0, 0.0, 1.98, 2.0, 2.02, 2.1)
-    found = [said.contradict("fuselage_drag", size * usual) for size in sizes]
+    found = [said.contradicts("fuselage_drag", size * usual) for size in sizes]
     assert found == [True, True, False, False, False, True]
-    assert not said.contradict("tachometer_lag", 1.0)  # which nobody tried
+    assert not said.contradicts("tachometer_lag", 1.0)  # which nobody tried
     fitted = seen([DRAG.model_copy(update={"kept": True})], {"fuselage_drag": 2.0})
-    assert not fitted.contradict("fuselage_drag", -2.0 * usual)
+    assert not fitted.contradicts("fuselage_drag", -2.0 * usual)
 
 
 def test_a_steady_wind_is_a_disturbance_like_others() -> None:
@@ -314,6 +320,6 @@ def test_a_steady_wind_is_a_disturbance_like_others() -> None:
         reason=SelectionCode.NOT_SIGNIFICANT,
     )
     space = wide_space(())
-    innovation = seen([DRAG], {}, in_doubt={"inertia_xx": 9.0})
+    innovation = seen([DRAG], {}, selection_shifts={"inertia_xx": 9.0})
     alone = replace(innovation, selected=replace(innovation.selected, rows=(wind,)), space=space)
-    assert alone.in_doubt() == {"inertia_xx": 9.0}
+    assert alone.selection_shifts() == {"inertia_xx": 9.0}

@@ -6,7 +6,7 @@ from tests.tuner.uncertainty.making import controller_file, vehicle_file
 from tuner.config import JobFile
 from tuner.objective.information import BLOCK, FisherInformation
 from tuner.objective.space import space_of
-from tuner.terms.linearisation import linear_of, neutral_of
+from tuner.terms.linearisation import linearised_from, neutral_of
 from tuner.terms.score import score
 
 FLIGHTS, SECONDS, WINDOW, STRIDE, RATE = 3, 24.0, 0.5, 0.25, 40
@@ -31,7 +31,7 @@ def in_windows(columns, residual):
         scale=np.ones((1, FLIGHTS * len(begins))),
     )
     loss = 0.5 * float((left**2).sum())
-    return information, linear_of(information, np.zeros(size), np.zeros(size), loss)
+    return information, linearised_from(information, np.zeros(size), np.zeros(size), loss)
 
 
 def slow(random, count):
@@ -87,7 +87,7 @@ def test_a_flight_that_is_flown_whole_keeps_its_stretches():
         begins=np.zeros(2),
         scale=np.ones((1, 2)),
     )
-    linear = linear_of(information, np.zeros(1), np.zeros(1), 1.0)
+    linear = linearised_from(information, np.zeros(1), np.zeros(1), 1.0)
     np.testing.assert_array_equal(linear.hessian.ravel(), blocks.ravel())
     np.testing.assert_array_equal(linear.score.ravel(), information.score.ravel())
     assert linear.section.tolist() == [0, 0, 0, 1, 1, 2, 2] * 2

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.terms.candidates import presence_of
-from tuner.terms.linearisation import Linear
-from tuner.terms.model_averaging import Evidence, in_doubt
+from tuner.terms.candidates import prior_presence_of
+from tuner.terms.linearisation import LinearisedLoss
+from tuner.terms.model_averaging import Evidence, selection_shifts
 
 MODEL, TERM = np.array([0]), np.array([1])
 PRESENT = (TERM, 1.0)
@@ -37,7 +37,7 @@ def flown(random, usual=USUAL):
     meat = np.einsum("sp,sq->pq", columns.sum(axis=1), columns.sum(axis=1)) + hessian.sum(axis=0)
     errors = np.sqrt(np.diag(inverse @ meat @ inverse))
     unit = np.array([1.0, errors[1]])
-    linear = Linear(
+    linear = LinearisedLoss(
         scaled=np.zeros(2),
         hessian=hessian * np.outer(unit, unit),
         score=score * unit,
@@ -70,7 +70,7 @@ def share(fits, size, *, with_part):
     for linear, alone in fits:
         fit = with_term(linear, size)
         off = fit.step(MODEL, inside=np.ones(len(fit.flight), bool))[0]
-        error = np.hypot(alone, in_doubt(fit, MODEL, [PRESENT])[0] if with_part else 0.0)
+        error = np.hypot(alone, selection_shifts(fit, MODEL, [PRESENT])[0] if with_part else 0.0)
         held.append(abs(off) < 1.96 * error)
     return np.mean(held)
 
@@ -83,22 +83,22 @@ def test_a_term_too_small_to_be_added_is_covered_whatever_its_size(fits, size):
 
 
 def test_the_ground_is_there_for_every_vehicle_and_stand_ins_are_seldom_needed():
-    assert presence_of(["ground_effect"]) == 1.0
-    assert presence_of(["linear_drag_x"]) < presence_of(["fuselage_drag"]) < 1.0
+    assert prior_presence_of(["ground_effect"]) == 1.0
+    assert prior_presence_of(["linear_drag_x"]) < prior_presence_of(["fuselage_drag"]) < 1.0
 
 
 def test_over_vehicles_of_which_half_have_the_term_in_some_size_intervals_hold(fits):
     """As a priori: absent or, as likely small as large, from what is as good as absent on."""
-    random, presence = np.random.default_rng(6), presence_of(["flapping_moment_coefficient"])
+    random, presence = np.random.default_rng(6), prior_presence_of(["flapping_moment_coefficient"])
     held, parts = [], []
     for linear, alone in fits:
         there = random.random() < presence
         size = np.exp(random.uniform(np.log(0.4), np.log(USUAL))) if there else 0.0
         fit = with_term(linear, size)
         off = fit.step(MODEL, inside=np.ones(len(fit.flight), bool))[0]
-        part = in_doubt(fit, MODEL, [(TERM, presence)])[0]
+        part = selection_shifts(fit, MODEL, [(TERM, presence)])[0]
         held.append([abs(off) < 1.96 * error for error in (alone, np.hypot(alone, part))])
-        parts.append(part / in_doubt(fit, MODEL, [PRESENT])[0])
+        parts.append(part / selection_shifts(fit, MODEL, [PRESENT])[0])
     without, with_part = np.mean(held, axis=0)
     assert without < 0.75
     assert with_part > 0.91
@@ -112,7 +112,7 @@ def test_where_flights_say_little_of_a_term_chance_counts_for_less_than_a_refit_
         every = np.ones(len(linear.flight), bool)
         moved = linear.step(np.array([0, 1]), inside=every) - linear.step(MODEL, inside=every)
         steps.append(moved[0] ** 2)
-        parts.append(in_doubt(linear, MODEL, [PRESENT])[0] ** 2)
+        parts.append(selection_shifts(linear, MODEL, [PRESENT])[0] ** 2)
     assert np.sqrt(np.mean(parts)) < 0.6 * np.sqrt(np.mean(steps))
 
 
@@ -121,16 +121,16 @@ def test_what_the_flights_call_for_counts_in_full(fits):
         fit = with_term(replace(linear, prior_sd=np.array([1e3, 30.0])), 12.0)
         every = np.ones(len(fit.flight), bool)
         moved = fit.step(np.array([0, 1]), inside=every) - fit.step(MODEL, inside=every)
-        assert in_doubt(fit, MODEL, [PRESENT])[0] == pytest.approx(abs(moved[0]), rel=0.15)
+        assert selection_shifts(fit, MODEL, [PRESENT])[0] == pytest.approx(abs(moved[0]), rel=0.15)
 
 
 def test_what_is_seldom_there_counts_for_less_and_in_full_where_the_flights_call_for_it(fits):
     seldom = (TERM, 0.1)
-    absent = [[in_doubt(fit, MODEL, [g])[0] for g in (seldom, PRESENT)] for fit, _ in fits]
+    absent = [[selection_shifts(fit, MODEL, [g])[0] for g in (seldom, PRESENT)] for fit, _ in fits]
     assert np.median([one / other for one, other in absent]) < 0.4
     for linear, _ in fits[:20]:
         fit = with_term(replace(linear, prior_sd=np.array([1e3, 30.0])), 12.0)
-        called_for = [in_doubt(fit, MODEL, [group])[0] for group in (seldom, PRESENT)]
+        called_for = [selection_shifts(fit, MODEL, [group])[0] for group in (seldom, PRESENT)]
         assert called_for[0] == pytest.approx(called_for[1], rel=1e-3)
 
 
@@ -144,7 +144,7 @@ def test_what_no_flight_tells_from_the_model_is_as_wide_as_it_may_be(fits):
     )
     sizes = np.exp(np.linspace(np.log(0.1), 0.0, 25))
     expected = USUAL * np.sqrt(np.mean(sizes**2))
-    assert in_doubt(same, MODEL, [PRESENT])[0] == pytest.approx(expected, rel=0.05)
+    assert selection_shifts(same, MODEL, [PRESENT])[0] == pytest.approx(expected, rel=0.05)
 
 
 def crowded(random, count, absent=1):
@@ -156,7 +156,7 @@ def crowded(random, count, absent=1):
         before = gusts[stretch - 1] if stretch % 9 else random.normal()
         gusts[stretch] = 0.5 * before + np.sqrt(0.75) * random.normal()
     residual = random.normal(size=shape) + 2.0 * gusts[:, None]
-    return Linear(
+    return LinearisedLoss(
         scaled=np.zeros(size),
         hessian=columns.transpose(0, 2, 1) @ columns,
         score=np.einsum("sip,si->sp", columns, residual),
@@ -196,11 +196,11 @@ def test_of_many_axes_of_a_group_none_is_told_much_surer_than_it_is_by_the_scatt
 def test_groups_add_up_as_squares(fits):
     linear, _ = fits[1]
     one, both = (
-        in_doubt(linear, MODEL, [PRESENT])[0],
-        in_doubt(linear, MODEL, [PRESENT, PRESENT])[0],
+        selection_shifts(linear, MODEL, [PRESENT])[0],
+        selection_shifts(linear, MODEL, [PRESENT, PRESENT])[0],
     )
     assert both == pytest.approx(np.sqrt(2.0) * one)
-    assert in_doubt(linear, MODEL, [])[0] == 0.0
+    assert selection_shifts(linear, MODEL, [])[0] == 0.0
 
 
 @pytest.mark.parametrize("said", [0.0, 1e-30])
@@ -208,4 +208,4 @@ def test_a_term_of_which_the_flights_say_nothing_changes_nothing(said):
     linear, _ = flown(np.random.default_rng(4))
     mute = np.diag([1.0, np.sqrt(said)])
     linear = replace(linear, hessian=mute @ linear.hessian @ mute, score=linear.score @ mute)
-    assert in_doubt(linear, MODEL, [PRESENT]) == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert selection_shifts(linear, MODEL, [PRESENT]) == pytest.approx([0.0, 0.0], abs=1e-9)

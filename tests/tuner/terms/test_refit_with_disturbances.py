@@ -19,8 +19,12 @@ from tuner.search.problem import Job
 from tuner.search.progress import COLOURED, Fitted
 from tuner.terms import refit_with_disturbances as disturbances
 from tuner.terms.candidates import Selected
-from tuner.terms.refit_with_disturbances import ROUGHLY, _believed, with_disturbances
-from tuner.uncertainty.model_error import Lack
+from tuner.terms.refit_with_disturbances import (
+    ROUGH_STEPS,
+    _without_contradicted_lag,
+    with_disturbances,
+)
+from tuner.uncertainty.model_error import ModelErrors
 
 NOBODY = cast(Any, None)
 
@@ -87,16 +91,16 @@ def test_two_fits_contradict_each_other_by_the_errors_of_both(moved, errors, agr
         for at, error in zip((0.0, moved), errors, strict=True)
     )
     new.estimates["freed"] = SimpleNamespace(value=1e9, std_error=1.0)
-    assert disturbances._agree(new, old) == agrees
+    assert disturbances._estimates_agree(new, old) == agrees
 
 
 @pytest.mark.parametrize(
     ("called_for", "descents"),
     [
-        ([None, None], [ROUGHLY, STEPS]),
-        (["drag", None], [ROUGHLY, STEPS]),
-        ([None, "drag", None], [ROUGHLY, STEPS, STEPS]),
-        (["drag", "battery", "inflow", "more"], [ROUGHLY, STEPS, STEPS, STEPS]),
+        ([None, None], [ROUGH_STEPS, STEPS]),
+        (["drag", None], [ROUGH_STEPS, STEPS]),
+        ([None, "drag", None], [ROUGH_STEPS, STEPS, STEPS]),
+        (["drag", "battery", "inflow", "more"], [ROUGH_STEPS, STEPS, STEPS, STEPS]),
     ],
     ids=["nothing", "at once", "later", "again and again"],
 )
@@ -127,8 +131,8 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
 
         return SimpleNamespace(selected=selected, selection=selection)
 
-    monkeypatch.setattr(disturbances, "_descended", descended)
-    monkeypatch.setattr(disturbances.Innovations, "of", seen)
+    monkeypatch.setattr(disturbances, "_fit_innovations", descended)
+    monkeypatch.setattr(disturbances.LinearisedInnovations, "of", seen)
     assert with_disturbances(begin, lambda *_: None, lambda _: None) is None  # keeps no track
     assert taken == descents
     assert within[-1] == [group for group in called_for[: len(descents) - 1] if group]
@@ -139,13 +143,13 @@ def test_no_terms_are_chosen_by_innovations_of_a_filter_that_lost_a_flight(monke
     predictor = SimpleNamespace(memory=0, is_lost=True)
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
     monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
-    monkeypatch.setattr(disturbances, "_descended", lambda *_, **__: (None, predictor))
+    monkeypatch.setattr(disturbances, "_fit_innovations", lambda *_, **__: (None, predictor))
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
     said: list[str] = []
     found = with_disturbances(Selected(job, fitted(2.0 * COLOURED)), lambda *_: None, said.append)
     assert found is None
-    assert said[-1] == disturbances.LACKS
+    assert said[-1] == disturbances.FILTER_LOST
 
 
 def test_a_fit_with_a_lag_whose_filter_loses_a_flight_is_not_taken(monkeypatch):
@@ -154,16 +158,18 @@ def test_a_fit_with_a_lag_whose_filter_loses_a_flight_is_not_taken(monkeypatch):
     tracks.without_gains = tracks
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
     monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: tracks)
-    monkeypatch.setattr(disturbances, "_descended", lambda _, there, own, **__: (there, own))
+    monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, own, **__: (there, own))
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
     begin = Selected(job, fitted(2.0 * COLOURED))
     seen = SimpleNamespace(selected=begin, selection=lambda *_, **__: None)
-    monkeypatch.setattr(disturbances.Innovations, "of", lambda *_: seen)
-    monkeypatch.setattr(disturbances, "_with_lags", lambda found, there, *_: (found, there, loses))
+    monkeypatch.setattr(disturbances.LinearisedInnovations, "of", lambda *_: seen)
+    monkeypatch.setattr(
+        disturbances, "_with_lag_terms", lambda found, there, *_: (found, there, loses)
+    )
     said: list[str] = []
     assert with_disturbances(begin, lambda *_: None, said.append) is None
-    assert said[-1] == disturbances.LACKS
+    assert said[-1] == disturbances.FILTER_LOST
 
 
 @pytest.mark.parametrize(
@@ -182,7 +188,7 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
     row = SimpleNamespace(group="fuselage_drag", kept=True)
     begin = Selected(job, fitted(2.0 * COLOURED), (cast(Any, row),))
-    lack = Lack((Law("force_z", "airspeed_across", 0.2),), None)
+    model_errors = ModelErrors((Law("force_z", "airspeed_across", 0.2),), None)
     polished, examined, read = [], [], []
     chosen = iter([replace(begin, rows=()) if others else None, None])
 
@@ -190,33 +196,37 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
         return SimpleNamespace(
             selected=selected,
             selection=lambda *_, **__: next(chosen),
-            contradict=lambda *_: True,
-            with_acting=lambda lack, _: SimpleNamespace(in_doubt=lambda: {"acting": lack}),
+            contradicts=lambda *_: True,
+            with_model_error=lambda model_errors, _: SimpleNamespace(
+                selection_shifts=lambda: {"acting": model_errors}
+            ),
         )
 
-    def with_lags(found: Any, there: Fitted, own: Any, _: Any) -> Any:
+    def with_lag_terms(found: Any, there: Fitted, own: Any, _: Any) -> Any:
         return (seen(replace(found.selected)) if lag else found), there, own
 
     def polish(_: Job, fit: Fitted, *, title: str, **__: Any) -> Fitted:
         polished.append(title)
         return replace(fit, wall_time=float(len(polished)))
 
-    def examine(fit: Fitted, *, in_doubt: Any, predictor: Any = None, **_: Any) -> Any:
+    def examine(fit: Fitted, *, selection_shifts: Any, predictor: Any = None, **_: Any) -> Any:
         examined.append(fit)
-        assert predictor is None or in_doubt == {"acting": lack}
+        assert predictor is None or selection_shifts == {"acting": model_errors}
         return SimpleNamespace(uncertainty=NOBODY)
 
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
     monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
-    monkeypatch.setattr(disturbances, "_descended", lambda _, there, own, **__: (there, own))
-    monkeypatch.setattr(disturbances.Innovations, "of", seen)
+    monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, own, **__: (there, own))
+    monkeypatch.setattr(disturbances.LinearisedInnovations, "of", seen)
     monkeypatch.setattr(disturbances, "free_offsets", lambda _: np.zeros((0, 0), bool))
     monkeypatch.setattr(disturbances, "polished", polish)
     monkeypatch.setattr(disturbances, "alternatives_of", lambda *given: read.append(given[2:]))
-    monkeypatch.setattr(disturbances, "lack_of", lambda *_: replace(lack, late=0.012))
+    monkeypatch.setattr(
+        disturbances, "model_errors_of", lambda *_: replace(model_errors, speed_lag=0.012)
+    )
     monkeypatch.setattr(disturbances, "examine", examine)
-    monkeypatch.setattr(disturbances, "_with_lags", with_lags)
-    monkeypatch.setattr(disturbances, "_agree", lambda *_: not lag)
+    monkeypatch.setattr(disturbances, "_with_lag_terms", with_lag_terms)
+    monkeypatch.setattr(disturbances, "_estimates_agree", lambda *_: not lag)
     monkeypatch.setattr(disturbances, "_is_sharper", lambda *_: True)
     assert with_disturbances(begin, lambda *_: None, lambda _: None) is not None
     assert polished == ["clocks", "simulated"][:titles]
@@ -227,17 +237,19 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
 
 def test_a_lateness_that_samples_contradict_is_not_believed():
     law = Law("force_z", "airspeed_across", 0.2)
-    seconds, both = {"tachometer_lag": 0.012}, Lack((law,), None, late=0.012)
+    seconds, both = {"tachometer_lag": 0.012}, ModelErrors((law,), None, speed_lag=0.012)
 
-    def believed(lack: Lack | None, *, contradicted: bool) -> Lack | None:
-        def contradict(name: str, value: float) -> bool:
+    def believed(model_errors: ModelErrors | None, *, contradicted: bool) -> ModelErrors | None:
+        def contradicts(name: str, value: float) -> bool:
             return contradicted and value == seconds[name]
 
-        return _believed(lack, cast(Any, SimpleNamespace(contradict=contradict)))
+        return _without_contradicted_lag(
+            model_errors, cast(Any, SimpleNamespace(contradicts=contradicts))
+        )
 
     assert believed(both, contradicted=False) == both
-    assert believed(both, contradicted=True) == Lack((law,), None)
-    assert believed(Lack((), None, late=0.012), contradicted=True) is None
+    assert believed(both, contradicted=True) == ModelErrors((law,), None)
+    assert believed(ModelErrors((), None, speed_lag=0.012), contradicted=True) is None
     assert believed(None, contradicted=True) is None
 
 
@@ -261,7 +273,7 @@ def test_what_no_derivative_tells_is_judged_by_a_fit_with_it(
     without.without_gains = without
     without.at = lambda *_: "as it was"
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
-    monkeypatch.setattr(disturbances, "_descended", lambda _, there, __: (there, beside))
+    monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, __: (there, beside))
     begin = Selected(NOBODY, fitted(2.0 * COLOURED))
 
     def seen(selected: Selected, *_: Any) -> Any:
@@ -271,12 +283,12 @@ def test_what_no_derivative_tells_is_judged_by_a_fit_with_it(
 
         return SimpleNamespace(
             selected=selected,
-            with_lags=lambda: grown("motor_lag"),
+            with_lag_terms=lambda: grown("motor_lag"),
             selection=lambda _: grown(called_for),
         )
 
-    monkeypatch.setattr(disturbances.Innovations, "of", seen)
-    found, _, predictor = disturbances._with_lags(
+    monkeypatch.setattr(disturbances.LinearisedInnovations, "of", seen)
+    found, _, predictor = disturbances._with_lag_terms(
         seen(begin), begin.fitted, cast(Any, without), lambda _: None
     )
     assert [row.group for row in found.selected.rows] == expected

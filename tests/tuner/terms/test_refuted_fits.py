@@ -52,9 +52,9 @@ def followed(selected: Selected, monkeypatch: pytest.MonkeyPatch) -> bool:
         tried.append("disturbances")
 
     monkeypatch.setattr(refit_with_disturbances, "with_disturbances", following)
-    monkeypatch.setattr(refit_with_disturbances, "with_undetermined_held", lambda *_, **__: held)
+    monkeypatch.setattr(refit_with_disturbances, "hold_undetermined", lambda *_, **__: held)
     silent = (lambda *_: None), (lambda _: None), Explanation(lambda _: None)
-    assert refit_with_disturbances.examined(selected, *silent) == (selected, *held)
+    assert refit_with_disturbances.refit_and_examine(selected, *silent) == (selected, *held)
     return bool(tried)
 
 

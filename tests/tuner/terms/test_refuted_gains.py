@@ -12,11 +12,11 @@ from tests.tuner.uncertainty.test_model_error import flown, problem
 from tuner.config import JobFile
 from tuner.objective.criterion import Point
 from tuner.terms.candidates import Selected, with_terms
-from tuner.terms.search_with_terms import GAINS, refuted_by_commands, with_refuted
+from tuner.terms.search_with_terms import GAIN_AXES, refuted_by_commands, with_refuted
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 ROW = SelectionRow(
-    group="rate_gain", names=tuple(GAINS), kept=True, reason=SelectionCode.SIGNIFICANT
+    group="rate_gain", names=tuple(GAIN_AXES), kept=True, reason=SelectionCode.SIGNIFICANT
 )
 
 
@@ -26,10 +26,10 @@ ROW = SelectionRow(
     ids=["the file's", "those that were found", "neither"],
 )
 def test_commands_take_back_gains_that_are_the_files(flies, found, refuted):
-    objective = problem(dict.fromkeys(GAINS, 1.0))
-    _, flights = flown(problem(dict.fromkeys(GAINS, flies)), 0, loop=True)
-    objective, point = with_terms(objective, making.truth(objective), tuple(GAINS), JobFile())
-    numbers = objective.space.numbers(point.coefficients) | dict.fromkeys(GAINS, found)
+    objective = problem(dict.fromkeys(GAIN_AXES, 1.0))
+    _, flights = flown(problem(dict.fromkeys(GAIN_AXES, flies)), 0, loop=True)
+    objective, point = with_terms(objective, making.truth(objective), tuple(GAIN_AXES), JobFile())
+    numbers = objective.space.numbers(point.coefficients) | dict.fromkeys(GAIN_AXES, found)
     point = Point(objective.space.vector_of(numbers), point.offsets)
     fitted = making.fitted_of(objective, point)
     job = cast(Any, SimpleNamespace(fitted=tuple(flights)))

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.terms.linearisation import Linear, lost_by_sections
-from tuner.terms.score import Score, _Gain, chance_of_gusts, row_of, score, surviving
+from tuner.terms.linearisation import LinearisedLoss, section_loss_ratio
+from tuner.terms.score import Score, _Gain, backward_elimination, chance_of_gusts, row_of, score
 from tuner.vehicle.selection_table import SelectionCode
 
 MODEL, FIRST, SECOND, COPY = (np.array([i]) for i in range(4))
@@ -36,7 +36,7 @@ def linear_fit(*effects, seed=0, correlated=False, shown_by=FLIGHTS, gusts=False
         hessian.append(columns.T @ columns)
         score_.append(columns.T @ residual)
         loss += 0.5 * float(residual @ residual)
-    return Linear(
+    return LinearisedLoss(
         scaled=np.zeros(4),
         hessian=np.array(hessian),
         score=np.array(score_),
@@ -72,14 +72,14 @@ def test_a_term_of_the_truth_earns_its_place():
 def test_noise_buys_no_term_even_where_it_is_correlated_in_time(seed, correlated):
     linear = linear_fit(0.0, seed=seed, correlated=correlated)
     for group in (FIRST, SECOND):
-        assert not score(linear, MODEL, group, candidates=2).earns_place
+        assert not score(linear, MODEL, group, candidates=2).is_accepted
 
 
 @pytest.mark.parametrize("shown_by", [1, FLIGHTS])
 def test_gusts_that_last_buy_a_term_no_more_often_than_chance_is_let(shown_by):
     fits = [linear_fit(0.0, seed=seed, gusts=True, shown_by=shown_by) for seed in range(200)]
     both = np.concatenate([FIRST, SECOND])
-    bought = [score(linear, MODEL, both, candidates=1).earns_place for linear in fits]
+    bought = [score(linear, MODEL, both, candidates=1).is_accepted for linear in fits]
     assert np.mean(bought) <= 0.02
 
 
@@ -94,7 +94,7 @@ def test_what_chance_explains_goes_before_what_it_does_not(monkeypatch):
 
     monkeypatch.setattr("tuner.terms.score.score", scored)
     groups = {"first": FIRST, "second": SECOND}
-    kept, taken = surviving(linear_fit(0.0), MODEL, groups, candidates=2)
+    kept, taken = backward_elimination(linear_fit(0.0), MODEL, groups, candidates=2)
     assert (list(kept), list(taken)) == (["first"], ["second"])
 
 
@@ -108,19 +108,21 @@ def test_beside_what_is_there_in_vain_nothing_else_goes(monkeypatch):
 
     monkeypatch.setattr("tuner.terms.score.score", scored)
     of = {"candidates": 2}
-    kept, taken = surviving(linear_fit(0.0), MODEL, {"first": FIRST, "second": SECOND}, **of)
+    kept, taken = backward_elimination(
+        linear_fit(0.0), MODEL, {"first": FIRST, "second": SECOND}, **of
+    )
     assert (list(kept), list(taken)) == (["second"], ["first"])
-    kept, taken = surviving(linear_fit(0.0), MODEL, {"second": SECOND}, **of)
+    kept, taken = backward_elimination(linear_fit(0.0), MODEL, {"second": SECOND}, **of)
     assert (list(kept), list(taken)) == ([], ["second"])
     # what stands in for others goes all the same, and before all
     groups = {"first": FIRST, "second": SECOND}
-    kept, taken = surviving(linear_fit(0.0), MODEL, groups, **of, stand_ins=["second"])
+    kept, taken = backward_elimination(linear_fit(0.0), MODEL, groups, **of, lumped=["second"])
     assert list(taken) == ["second", "first"]
 
 
 def test_backward_elimination_leaves_the_term_of_the_truth_at_the_fit_with_both():
     linear = moved_to_minimum(linear_fit(0.5), np.concatenate([MODEL, FIRST, SECOND]))
-    kept, taken = surviving(
+    kept, taken = backward_elimination(
         linear,
         MODEL,
         {"first": FIRST, "second": SECOND},
@@ -133,12 +135,12 @@ def test_backward_elimination_leaves_the_term_of_the_truth_at_the_fit_with_both(
 def test_of_two_that_do_the_same_the_stand_in_goes(stand_in):
     linear = moved_to_minimum(linear_fit(0.5), FIRST)
     twin = replace(linear, **_with_a_twin(linear))
-    kept, taken = surviving(
+    kept, taken = backward_elimination(
         twin,
         np.array([0]),
         {"first": FIRST, "copy": np.array([len(linear.scaled)])},
         candidates=2,
-        stand_ins=[stand_in],
+        lumped=[stand_in],
     )
     assert list(taken) == [stand_in]
     assert len(kept) == 1
@@ -161,7 +163,7 @@ def _with_a_twin(linear):
 def test_what_the_flights_disagree_about_lowers_the_loss_and_is_not_added():
     found = score(linear_fit(1.0, 0.0, 0.0, 0.0), MODEL, FIRST, candidates=1)
     assert found.gain_fit > 0.01 > found.gain_holdout
-    assert not found.earns_place
+    assert not found.is_accepted
 
 
 def test_a_term_that_one_flight_alone_shows_is_predicted_by_sections():
@@ -173,9 +175,11 @@ def test_a_term_that_one_flight_alone_shows_is_predicted_by_sections():
 def alone(linear, number=0):
     """Return the loss of one flight of some, without the others."""
     own = linear.flight == number
-    seen = None if linear.seen is None else linear.seen[own]
+    seen = None if linear.columns_seen is None else linear.columns_seen[own]
     parts = {name: getattr(linear, name)[own] for name in ("hessian", "score", "section")}
-    return replace(linear, **parts, flight=linear.flight[own], seen=seen, loss=linear.loss / 4)
+    return replace(
+        linear, **parts, flight=linear.flight[own], columns_seen=seen, loss=linear.loss / 4
+    )
 
 
 def test_a_flight_that_is_alone_predicts_itself_section_by_section():
@@ -201,13 +205,13 @@ def test_a_flight_that_is_alone_is_bought_a_term_no_more_often_than_chance_is_le
         after = moved_to_minimum(linear, both)
         found = score(linear, MODEL, FIRST, candidates=1)
         stayed = score(after, MODEL, FIRST, candidates=1, inside=True)
-        bought.append((found.earns_place, stayed.earns_place))
+        bought.append((found.is_accepted, stayed.is_accepted))
     assert np.mean(bought) <= 0.01
 
 
 def test_what_surrounds_a_flight_that_is_alone_has_to_stand_out_from_its_gusts(monkeypatch):
     """Its column is no term of the vehicle's, though all stretches see it."""
-    own = replace(alone(by_flight(linear_fit(0.5), 1)), around=FLIGHTS)
+    own = replace(alone(by_flight(linear_fit(0.5), 1)), condition_columns=FLIGHTS)
     group = np.array([3])
     assert score(own, MODEL, group, candidates=1).reason is SelectionCode.PREDICTS_SECTIONS
     monkeypatch.setattr("tuner.terms.score.chance_of_gusts", lambda *_: 0.5)
@@ -217,7 +221,7 @@ def test_what_surrounds_a_flight_that_is_alone_has_to_stand_out_from_its_gusts(m
 def test_sections_of_a_flight_that_is_alone_are_met_worse_by_fits_without_them():
     linear = alone(linear_fit(0.0))
     fitted = moved_to_minimum(linear, np.concatenate([MODEL, FIRST]))
-    lost = [lost_by_sections(fitted, free) for free in (MODEL, np.concatenate([MODEL, FIRST]))]
+    lost = [section_loss_ratio(fitted, free) for free in (MODEL, np.concatenate([MODEL, FIRST]))]
     assert 1.0 < lost[0] < lost[1] < 1.1
 
 
@@ -233,7 +237,7 @@ def test_a_term_in_the_model_is_worth_what_taking_it_away_would_cost():
     inside = score(after, MODEL, FIRST, candidates=1, inside=True)
     assert inside.gain_fit == pytest.approx(added.gain_fit, rel=1e-6)
     assert inside.gain_holdout == pytest.approx(added.gain_holdout, rel=1e-6)
-    assert inside.earns_place
+    assert inside.is_accepted
 
 
 def test_what_is_in_the_model_stays_where_flights_left_out_are_of_two_minds():
@@ -243,7 +247,7 @@ def test_what_is_in_the_model_stays_where_flights_left_out_are_of_two_minds():
     after = moved_to_minimum(before, np.concatenate([MODEL, FIRST]))
     inside = score(after, MODEL, FIRST, candidates=1, inside=True)
     assert inside.reason is SelectionCode.SIGNIFICANT
-    assert inside.earns_place
+    assert inside.is_accepted
     shared = score(after, MODEL, FIRST, candidates=10, inside=True)
     assert shared.reason is SelectionCode.NOT_SIGNIFICANT
 
@@ -253,10 +257,10 @@ def test_a_gust_that_does_what_a_term_would_is_not_feared_where_a_recorded_signa
     both = np.concatenate([MODEL, FIRST])
     after = moved_to_minimum(linear_fit(0.8, seed=6, gusts=True, shown_by=1), both)
     groups, of = {"first": FIRST}, {"candidates": 14}
-    kept, taken = surviving(after, MODEL, groups, **of)
+    kept, taken = backward_elimination(after, MODEL, groups, **of)
     assert not kept
     assert taken["first"].reason is SelectionCode.NOT_SIGNIFICANT
-    kept, taken = surviving(after, MODEL, groups, **of, no_gusts=["first"])
+    kept, taken = backward_elimination(after, MODEL, groups, **of, excluding_gusts=["first"])
     assert not taken
     assert kept["first"].reason is SelectionCode.PREDICTS_SECTIONS
     assert kept["first"].chance < 1e-5
@@ -268,7 +272,7 @@ def test_a_term_that_all_sections_call_for_stays_though_few_stretches_scatter(sh
     both = np.concatenate([MODEL, FIRST])
     after = moved_to_minimum(linear_fit(0.8, seed=seed, gusts=True, shown_by=shown_by), both)
     found = score(after, MODEL, FIRST, candidates=14, inside=True)
-    assert found.earns_place
+    assert found.is_accepted
     assert found.chance < 1e-9
 
 
@@ -277,8 +281,8 @@ def test_gusts_let_a_term_stay_whose_signal_was_recorded_hardly_more_often():
     both, stayed = np.concatenate([MODEL, FIRST]), []
     for seed in range(200):
         after = moved_to_minimum(linear_fit(0.0, seed=seed, gusts=True), both)
-        found = score(after, MODEL, FIRST, candidates=14, inside=True, no_gust=True)
-        stayed.append(found.earns_place)
+        found = score(after, MODEL, FIRST, candidates=14, inside=True, excludes_gusts=True)
+        stayed.append(found.is_accepted)
     assert np.mean(stayed) <= 0.01
 
 
@@ -294,7 +298,7 @@ def test_one_flight_that_the_others_predict_badly_takes_no_term_away(monkeypatch
     outside = score(linear_fit(0.8), MODEL, FIRST, candidates=1)
     assert outside.reason is SelectionCode.NOT_PREDICTED
     inside = score(after, MODEL, FIRST, candidates=1, inside=True)
-    assert inside.earns_place is stays
+    assert inside.is_accepted is stays
 
 
 def by_flight(linear, column):
@@ -309,7 +313,7 @@ def by_flight(linear, column):
         score=linear.score[:, order],
         prior=np.eye(wide) * 1e-6,
         pull=np.zeros(wide),
-        seen=np.column_stack(
+        columns_seen=np.column_stack(
             [np.tile(np.arange(len(others)), (len(linear.flight), 1)), 3 + linear.flight]
         ),
     )
@@ -336,10 +340,10 @@ def dense(linear):
     """Return the same loss where every stretch sees every column, most of them for nothing."""
     count, wide = len(linear.flight), len(linear.scaled)
     hessian, slope = np.zeros((count, wide, wide)), np.zeros((count, wide))
-    for number, seen in enumerate(linear.seen):
+    for number, seen in enumerate(linear.columns_seen):
         hessian[number][np.ix_(seen, seen)] = linear.hessian[number]
         slope[number, seen] = linear.score[number]
-    return replace(linear, hessian=hessian, score=slope, seen=None)
+    return replace(linear, hessian=hessian, score=slope, columns_seen=None)
 
 
 def test_columns_that_one_flight_sees_are_columns_like_others():
@@ -368,7 +372,7 @@ def test_flights_show_what_surrounds_them_however_strongly_each_does():
 @pytest.mark.parametrize("correlated", [False, True])
 def test_noise_buys_no_column_for_each_flight(seed, correlated):
     own = by_flight(linear_fit(0.0, seed=seed, correlated=correlated), 1)
-    assert not score(own, MODEL, 3 + np.arange(FLIGHTS), candidates=2).earns_place
+    assert not score(own, MODEL, 3 + np.arange(FLIGHTS), candidates=2).is_accepted
 
 
 @pytest.mark.parametrize(

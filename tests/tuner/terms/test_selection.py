@@ -82,16 +82,16 @@ def test_what_a_term_that_was_missed_would_change_widens_the_intervals_that_hold
     result, _ = selected(DRAG / 5.0, seed=4)
     row = next(row for row in result.rows if row.group == "fuselage_drag")
     assert not row.kept
-    assert set(BASE_IN_ORDER) <= set(result.in_doubt)
+    assert set(BASE_IN_ORDER) <= set(result.selection_shifts)
     truth = result.job.space.numbers(result.job.space.initial)
 
-    def missed(in_doubt):
-        estimates = examine(result.fitted, in_doubt=in_doubt).uncertainty.estimates
+    def missed(selection_shifts):
+        estimates = examine(result.fitted, selection_shifts=selection_shifts).uncertainty.estimates
         intervals = {name: estimates[name].ci95 for name in BASE_IN_ORDER}
         return [n for n, (low, high) in intervals.items() if not low < float(truth[n]) < high]
 
     assert missed({})
-    assert not missed(result.in_doubt)
+    assert not missed(result.selection_shifts)
 
 
 @pytest.mark.long
@@ -118,7 +118,7 @@ def test_a_term_that_does_not_predict_flights_left_out_once_refitted_is_dropped(
     # what it would have changed is known all the same, and covers what its absence spoiled
     ends = [np.asarray(space.scaled(v)) for v in (result.fitted.point.coefficients, space.initial)]
     wrong = np.abs(ends[0] - ends[1])
-    doubt = np.array([result.in_doubt[name] for name in space.names])
+    doubt = np.array([result.selection_shifts[name] for name in space.names])
     covariance = uncertainty_of(result.fitted).covariance
     known = covariance.error
     assert np.any(wrong > 1.96 * known / covariance.beyond_noise)  # what noise would say
@@ -130,11 +130,11 @@ def test_of_all_groups_only_the_battery_is_judged_as_one_that_a_recorded_signal_
 ):
     judged = []
 
-    def surviving(*_, no_gusts, **__):
-        judged.extend(no_gusts)
+    def backward_elimination(*_, excluding_gusts, **__):
+        judged.extend(excluding_gusts)
         return {}, {}
 
-    monkeypatch.setattr(selection, "surviving", surviving)
+    monkeypatch.setattr(selection, "backward_elimination", backward_elimination)
     groups = {**term_groups(), "wind": ("wind_x", "wind_y")}
     job = SimpleNamespace(space=SimpleNamespace(names=BASE_IN_ORDER))
     standing = LinearisedFit(SimpleNamespace(residuals_at_noise_level=False), groups, BLIND)
@@ -161,7 +161,7 @@ def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
     monkeypatch.setattr(own, "_score", lambda *_: Score(0.4, 0.3, 0.1, 0.5, reason))
     monkeypatch.setattr(own, "linearised", lambda *_: standing)
     monkeypatch.setattr(own, "_with_all", lambda *_: searched.append(True))
-    monkeypatch.setattr(own, "_grown", lambda *_: standing)
+    monkeypatch.setattr(own, "_with_added", lambda *_: standing)
     monkeypatch.setattr(own, "_rows", lambda *_: ())
     monkeypatch.setattr(own, "_in_doubt", lambda *_: {})
     monkeypatch.setattr(selection, "findings_at", lambda *_: ())
@@ -180,7 +180,7 @@ def test_what_an_elimination_took_is_not_tried_again_unless_it_was_no_part_of_it
     monkeypatch.setattr(own, "_score", lambda *_: score)
     monkeypatch.setattr(own, "linearised", lambda *_: standing)
     monkeypatch.setattr(own, "_with_all", lambda *_: standing)
-    monkeypatch.setattr(own, "_grown", lambda _, __, groups, ___: wanted.extend(groups) or standing)
+    monkeypatch.setattr(own, "_with_added", lambda _, __, groups, ___: wanted.extend(groups) or standing)
     monkeypatch.setattr(own, "_rows", lambda _, __, dropped: rows.extend(dropped) or ())
     monkeypatch.setattr(own, "_in_doubt", lambda *_: {})
     groups = {"fuselage_drag": ("fuselage_drag",), "linear_drag": ("linear_drag_x",)}

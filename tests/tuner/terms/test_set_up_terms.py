@@ -27,8 +27,10 @@ GROUPS = {
 def selected(monkeypatch, groups=GROUPS, **given):
     """Return the selection among these terms alone, which makes it cheap."""
     monkeypatch.setattr(search_with_terms, "candidate_groups", lambda *_: groups)
-    monkeypatch.setattr(search_with_terms, "groups_around", lambda *_, **__: {})
-    monkeypatch.setattr(search_with_terms, "lack_of", lambda *_: None)  # no commands were recorded
+    monkeypatch.setattr(search_with_terms, "condition_groups", lambda *_, **__: {})
+    monkeypatch.setattr(
+        search_with_terms, "model_errors_of", lambda *_: None
+    )  # no commands were recorded
     fit = job_with(0.0, seed=0, **given)
     return with_terms_selected(*fit, lambda *_: None, lambda _: None)
 
@@ -39,7 +41,7 @@ def selected(monkeypatch, groups=GROUPS, **given):
 def test_they_are_found_where_they_flew_and_their_intervals_hold_the_truth(monkeypatch, setpoints):
     result = selected(monkeypatch, effects=TRUTH, setpoints=setpoints)
     assert {row.group for row in result.rows if row.kept} == set(GROUPS)
-    known = examine(result.fitted, in_doubt=result.in_doubt).uncertainty.estimates
+    known = examine(result.fitted, selection_shifts=result.selection_shifts).uncertainty.estimates
     base = result.job.space.numbers(result.job.space.initial)
     for name in (*BASE, *TRUTH):
         low, high = known[name].ci95
@@ -63,7 +65,7 @@ def test_a_lag_is_found_where_it_flew_and_biases_no_motor(monkeypatch, name, val
     effects = {name: value} if value else {}
     result = selected(monkeypatch, {"lag": (name,)}, effects=effects, base=base)
     assert [row.kept for row in result.rows] == [value > 0.0]
-    known = examine(result.fitted, in_doubt=result.in_doubt).uncertainty.estimates
+    known = examine(result.fitted, selection_shifts=result.selection_shifts).uncertainty.estimates
     space = problem(base).space
     for coefficient, true in (space.numbers(space.initial) | effects).items():
         low, high = known[coefficient].ci95

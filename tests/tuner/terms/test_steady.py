@@ -41,7 +41,7 @@ def at_minimum(linear):
     return replace(
         linear,
         scaled=change,
-        score=linear.score + np.einsum("spq,sq->sp", linear.hessian, change[linear.seen]),
+        score=linear.score + np.einsum("spq,sq->sp", linear.hessian, change[linear.columns_seen]),
         pull=linear.pull + linear.prior @ change,
         loss=linear.loss + linear.change_of_loss(change).sum(),
     )
@@ -50,9 +50,9 @@ def at_minimum(linear):
 def test_it_makes_no_difference_from_where_columns_are_led_to_nothing():
     own = by_flight(linear_fit(0.5, -0.3, 0.0, 0.2, gusts=True), 1)
     moved = at_minimum(own)
-    away = np.where(np.isin(np.arange(len(STILL)), WINDS), -moved.scaled, 0.0)
+    to_neutral = np.where(np.isin(np.arange(len(STILL)), WINDS), -moved.scaled, 0.0)
     wanted = chance_of_gusts(own, MODEL, WINDS, STILL)
-    assert chance_of_gusts(moved, MODEL, WINDS, away) == pytest.approx(wanted, rel=1e-6)
+    assert chance_of_gusts(moved, MODEL, WINDS, to_neutral) == pytest.approx(wanted, rel=1e-6)
 
 
 def test_a_flight_of_one_stretch_says_nothing_of_what_is_steady():
@@ -64,7 +64,7 @@ def test_a_flight_of_one_stretch_says_nothing_of_what_is_steady():
         score=own.score[first],
         flight=own.flight[first],
         section=own.section[first],
-        seen=own.seen[first],
+        columns_seen=own.columns_seen[first],
     )
     assert chance_of_gusts(short, MODEL, WINDS, STILL) == 1.0
 
@@ -72,7 +72,7 @@ def test_a_flight_of_one_stretch_says_nothing_of_what_is_steady():
 def test_the_mean_of_gusts_is_no_wind():
     """By residuals about the winds of flights alone, a wind would stay in a third of the fits."""
     stays = [
-        score(at_minimum(own), MODEL, WINDS, candidates=1, inside=True).earns_place
+        score(at_minimum(own), MODEL, WINDS, candidates=1, inside=True).is_accepted
         for seed in range(100)
         for own in [by_flight(linear_fit(0.0, seed=seed, gusts=True, alike=True), 1)]
     ]

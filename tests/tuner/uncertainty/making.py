@@ -71,9 +71,10 @@ def problem(
     space = space_of(vehicle, controller, JobFile(free=tuple(free), **(job or {})))
     model, schedule = model_of(vehicle, controller), schedule_of(controller)
     samples = round(SECONDS * PHYSICS)
-    at_rest = Vec3(jnp.zeros(2), jnp.zeros(2), jnp.ones(2))
+    resting_parameters = Vec3(jnp.zeros(2), jnp.zeros(2), jnp.ones(2))
     start = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (2,)), hover(model.vehicle, at_rest)
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (2,)),
+        hover(model.vehicle, resting_parameters),
     )
     segments = Segments(references(), start, _sensors(), jnp.arange(2))
     objective = Objective(model, segments, space, schedule, samples, AIRBORNE)

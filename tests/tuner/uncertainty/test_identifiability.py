@@ -8,7 +8,7 @@ import pytest
 from tuner.config import JobFile
 from tuner.terms.candidates import Selected
 from tuner.uncertainty import identifiability
-from tuner.uncertainty.identifiability import stand_ins_of, with_undetermined_held
+from tuner.uncertainty.identifiability import hold_undetermined, stand_ins_of
 from tuner.uncertainty.verdict import Reason, ReasonCode
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
@@ -52,7 +52,7 @@ def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, afte
     traded = {"motor_constant": "input_scaling", "input_scaling": "input_scaling"}
     alone = {"time_constant_up": "time_constant_up"}  # open by itself: predicting fits keep it
     monkeypatch.setattr(identifiability, "alternatives_of", lambda *_: None)
-    monkeypatch.setattr(identifiability, "lack_of", lambda *_: None)
+    monkeypatch.setattr(identifiability, "model_errors_of", lambda *_: None)
     nothing = SimpleNamespace(uncertainty=SimpleNamespace(names=()))
     monkeypatch.setattr(identifiability, "examine", lambda *_, **__: nothing)
     monkeypatch.setattr(identifiability, "stand_ins_of", lambda _: traded | alone)
@@ -64,7 +64,7 @@ def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, afte
     monkeypatch.setattr(identifiability, "hold", hold)
     said = []
     job = SimpleNamespace(settings=SimpleNamespace(job=JobFile()), fitted=())
-    rest, _ = with_undetermined_held(job, fitted, lambda *_: None, said.append)
+    rest, _ = hold_undetermined(job, fitted, lambda *_: None, said.append)
     assert rest.held == (traded if is_held else {})
     assert ("all keep their values" in said[-1]) is not is_held
 
@@ -98,7 +98,7 @@ def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
         uncertainty=SimpleNamespace(names=(name,), estimates={name: estimate})
     )
     monkeypatch.setattr(identifiability, "alternatives_of", lambda *_: None)
-    monkeypatch.setattr(identifiability, "lack_of", lambda *_: None)
+    monkeypatch.setattr(identifiability, "model_errors_of", lambda *_: None)
     monkeypatch.setattr(identifiability, "examine", lambda *_, **__: examined)
     monkeypatch.setattr(identifiability, "stand_ins_of", lambda _: traded)
 
@@ -109,7 +109,7 @@ def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
     terms = {"ground_effect": ("ground_effect",)}
     settings = SimpleNamespace(job=file)
     job, said = SimpleNamespace(settings=settings, first_terms=terms, fitted=()), []
-    rest, _ = with_undetermined_held(job, fitted, lambda *_: None, said.append)
+    rest, _ = hold_undetermined(job, fitted, lambda *_: None, said.append)
     assert rest.held == (traded | {name: name} if goes else traded)
     assert any("taken out of the model" in line for line in said) is goes
 
@@ -117,7 +117,7 @@ def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
         group=name, names=(name,), kept=True, reason=SelectionCode.PREDICTS_SECTIONS
     )
     asked = chosen.model_copy(update={"reason": SelectionCode.ASKED_FOR})
-    after, *others = Selected(job, rest, (chosen, asked)).rows_given(rest.held)
+    after, *others = Selected(job, rest, (chosen, asked)).rows_after_holding(rest.held)
     assert after.kept is not goes
     assert (after.reason is SelectionCode.NO_INFORMATION) is goes
     assert others == [asked]

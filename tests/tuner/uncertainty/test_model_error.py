@@ -21,7 +21,7 @@ from sim_jax.state import AIRBORNE, hover
 from tests.tuner.uncertainty import making
 from tuner.config import JobFile
 from tuner.equation_error.omitted_laws import _likeliest
-from tuner.equation_error.rate_controller import Answer
+from tuner.equation_error.rate_controller import ControllerEstimate
 from tuner.findings.findings import Code
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import Objective
@@ -32,7 +32,13 @@ from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import with_terms
 from tuner.uncertainty.examination import examine
-from tuner.uncertainty.model_error import Lack, alternatives_of, gains_far_off, lack_found, lack_of
+from tuner.uncertainty.model_error import (
+    ModelErrors,
+    alternatives_of,
+    gains_far_off,
+    model_error_findings,
+    model_errors_of,
+)
 from tuner.vehicle import with_values
 from tuner.vehicle.model import model_of, schedule_of
 
@@ -79,10 +85,10 @@ def problem(
     space = space_of(vehicle, controller, JobFile(free=free))
     model = model_of(vehicle, controller)
     schedule = schedule_of(controller, log_rate=RATE)
-    at_rest = Vec3(jnp.zeros(FLIGHTS), jnp.zeros(FLIGHTS), jnp.ones(FLIGHTS))
+    resting_parameters = Vec3(jnp.zeros(FLIGHTS), jnp.zeros(FLIGHTS), jnp.ones(FLIGHTS))
     start = jax.tree.map(
         lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (FLIGHTS,)),
-        hover(model.vehicle, at_rest),
+        hover(model.vehicle, resting_parameters),
     )
     pushing = None
     if random is not None:
@@ -172,14 +178,18 @@ def fitted_at(objective: Objective, point: Point, flights: list[Flight]) -> Fitt
 @pytest.mark.parametrize("gusts", [False, True], ids=["still", "gusts"])
 def test_drag_of_a_fuselage_is_told_without_its_name(gusts):
     fitted, flights = fit_of(FUSELAGE, 0, gusts=gusts)
-    lack = lack_of(fitted, flights)
-    axes = {law.axis for law in lack.laws if law.feature == "airspeed_squared" and law.share < 0.0}
+    model_errors = model_errors_of(fitted, flights)
+    axes = {
+        law.axis
+        for law in model_errors.laws
+        if law.feature == "airspeed_squared" and law.share < 0.0
+    }
     assert axes >= ({"force_z"} if gusts else {"force_x", "force_y", "force_z"})
 
 
 def test_the_right_model_lacks_nothing():
     alarms = sum(
-        lack_of(*fit_of({}, seed, gusts=gusts)) is not None
+        model_errors_of(*fit_of({}, seed, gusts=gusts)) is not None
         for seed in range(3)
         for gusts in (False, True)
     )
@@ -188,19 +198,19 @@ def test_the_right_model_lacks_nothing():
 
 def test_the_intervals_of_what_it_moves_hold_it():
     fitted, flights = fit_of(FUSELAGE, 0, gusts=False)
-    lack = lack_of(fitted, flights)
-    without, held = examine(fitted), examine(fitted, lack=lack)
+    model_errors = model_errors_of(fitted, flights)
+    without, held = examine(fitted), examine(fitted, model_errors=model_errors)
     for name, estimate in held.uncertainty.estimates.items():
         parts = estimate.parts
         # the fit stands at the truth: what it lacks is what moves the minimum away from there
         assert parts.lack == pytest.approx(parts.search, rel=0.25)
         alone = without.uncertainty.estimates[name].std_error
         assert estimate.std_error == pytest.approx(np.hypot(alone, parts.lack))
-    findings = lack_found(held.lack, held.uncertainty)
+    findings = model_error_findings(held.model_errors, held.uncertainty)
     assert findings
     assert all(finding.code is Code.LAW_LACKING for finding in findings)
     assert "rotor_drag_coefficient" in findings[0].names
-    assert lack_found(without.lack, without.uncertainty) == ()
+    assert model_error_findings(without.model_errors, without.uncertainty) == ()
 
 
 @pytest.mark.parametrize("sees", [False, True])
@@ -208,7 +218,7 @@ def test_markers_beside_the_centre_of_mass_are_no_law(sees):
     """What is recorded is the markers' frame; the vehicle's own is what forces act on."""
     beside = {"marker_offset_x": 0.03, "marker_offset_z": -0.02, "marker_tilt_y": 0.02}
     fitted, flights = fit_of(beside, 0, gusts=False, known=beside, sees_markers=sees)
-    assert lack_of(fitted, flights) is None
+    assert model_errors_of(fitted, flights) is None
 
 
 def test_a_hover_tells_of_no_law():
@@ -224,7 +234,7 @@ def test_commands_stand_in_for_tachometers():
         replace(flight, series={n: s for n, s in flight.series.items() if n != "rotor_speed"})
         for flight in flights
     ]
-    assert lack_of(fitted, blind) is None
+    assert model_errors_of(fitted, blind) is None
 
 
 def test_what_a_logger_filters_sample_by_sample_is_half_a_period_off():
@@ -237,7 +247,7 @@ def test_what_a_logger_filters_sample_by_sample_is_half_a_period_off():
     numbers = objective.space.numbers(point.coefficients) | {"tachometer_lag": 0.008}
     point = Point(objective.space.vector_of(numbers), point.offsets)
     fitted = fitted_at(objective, point, flights)
-    known = examine(fitted, otherwise=alternatives_of(objective, fitted.point)).uncertainty
+    known = examine(fitted, alternatives=alternatives_of(objective, fitted.point)).uncertainty
     lag, inertia = (known.estimates[name] for name in ("tachometer_lag", "inertia_xx"))
     assert lag.parts.step == pytest.approx(0.5 / RATE / np.sqrt(3.0), rel=0.2)
     assert inertia.parts.step < 0.005 * inertia.value  # the lag takes it up
@@ -256,7 +266,7 @@ def test_rotors_whose_speed_nothing_tells_are_known_as_well_as_their_limit():
     def known(measured):
         objective = replace(truth, segments=replace(truth.segments, measured=measured))
         fitted = fitted_at(objective, making.truth(objective), flights)
-        return examine(fitted, otherwise=alternatives_of(objective, fitted.point)).uncertainty
+        return examine(fitted, alternatives=alternatives_of(objective, fitted.point)).uncertainty
 
     told = known(measured).estimates["motor_constant"]
     assert told.parts.limit is None
@@ -270,10 +280,13 @@ def test_rotors_whose_speed_nothing_tells_are_known_as_well_as_their_limit():
 
 def test_gains_that_were_found_fly_the_other_model():
     objective = problem({})
-    found = (Answer("roll", "P", 1.05, 0.01, True), Answer("yaw", "I", 0.7, 0.01, True))
-    late = Answer("pitch", "late", 2e-3, 1e-4, True)
+    found = (
+        ControllerEstimate("roll", "P", 1.05, 0.01, True),
+        ControllerEstimate("yaw", "I", 0.7, 0.01, True),
+    )
+    speed_lag = ControllerEstimate("pitch", "late", 2e-3, 1e-4, True)
     before = objective.model.controller.rate
-    other = Lack((), None, (*found, late)).acting_on(objective)
+    other = ModelErrors((), None, (*found, speed_lag)).applied_to(objective)
     rate = other.model.controller.rate
     assert float(rate.p.x) == pytest.approx(1.05 * float(before.p.x))
     assert float(rate.d.x) == pytest.approx(1.05 * float(before.d.x))  # K of all but I
@@ -282,11 +295,13 @@ def test_gains_that_were_found_fly_the_other_model():
     assert (rate.p.y, rate.p.z, rate.i.x) == (before.p.y, before.p.z, before.i.x)
 
 
-@pytest.mark.parametrize(("late", "said"), [(1e-3, False), (-2e-3, True)])
-def test_lateness_within_a_period_of_the_loop_is_not_said(late, said):
+@pytest.mark.parametrize(("speed_lag", "said"), [(1e-3, False), (-2e-3, True)])
+def test_lateness_within_a_period_of_the_loop_is_not_said(speed_lag, said):
     """Stamps do not tell when in a period a sample was taken."""
-    lack = Lack((), None, (Answer("roll", "late", late, 1e-4, True),))
-    assert bool(lack_found(lack, SimpleNamespace(estimates={}))) is said
+    model_errors = ModelErrors(
+        (), None, (ControllerEstimate("roll", "late", speed_lag, 1e-4, True),)
+    )
+    assert bool(model_error_findings(model_errors, SimpleNamespace(estimates={}))) is said
 
 
 def test_commands_that_were_recorded_between_two_ticks_are_those_that_hold():
@@ -296,7 +311,7 @@ def test_commands_that_were_recorded_between_two_ticks_are_those_that_hold():
         series["command"] = Series(command.time + 0.5 / RATE, command.values)
     objective = problem({})
     objective = replace(objective, segments=replace(objective.segments, measured=measured))
-    assert lack_of(making.fitted_of(objective, making.truth(objective)), flights) is None
+    assert model_errors_of(making.fitted_of(objective, making.truth(objective)), flights) is None
 
 
 def flown_with_p(factor):
@@ -324,26 +339,28 @@ def test_a_gain_that_is_far_off_is_told_beside_the_fit(factor):
 def test_odd_flights_say_nothing_of_the_controller_or_the_model(monkeypatch):
     fitted, flights = flown_with_p(1.06)
     monkeypatch.setattr("tuner.uncertainty.model_error.odd_flights", frozenset)
-    assert lack_of(fitted, flights) is None
+    assert model_errors_of(fitted, flights) is None
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.06])
 def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
     """Flights of a P that is not the file's, whose set-points and commands were recorded."""
     fitted, flights = flown_with_p(factor)
-    lack = lack_of(fitted, flights)
+    model_errors = model_errors_of(fitted, flights)
     if factor == 1.0:
-        assert lack is None
+        assert model_errors is None
         return
-    known = {(one.axis, one.part): one for one in lack.answers}
+    known = {(one.axis, one.part): one for one in model_errors.controller_estimates}
     assert {("roll", "P"), ("pitch", "P")} <= set(known)
     assert known["roll", "P"].value == pytest.approx(factor, abs=0.01)
-    examination = examine(fitted, lack=Lack((), None, lack.answers))
+    examination = examine(
+        fitted, model_errors=ModelErrors((), None, model_errors.controller_estimates)
+    )
     for name in ("inertia_xx", "inertia_yy"):
         parts = examination.uncertainty.estimates[name].parts
         assert parts.lack == pytest.approx(parts.search, rel=0.25)
         assert parts.lack > parts.noise
-    said = lack_found(examination.lack, examination.uncertainty)
+    said = model_error_findings(examination.model_errors, examination.uncertainty)
     assert said[0].code is Code.CONTROLLER_ANSWERS
 
 
@@ -354,10 +371,10 @@ def test_the_interval_of_a_gain_holds_the_one_of_recorded_commands(gain):
     objective = problem({name: gain}, free=(*FREE, name))
     objective = replace(objective, segments=replace(objective.segments, measured=measured))
     fitted = fitted_at(objective, making.truth(objective), flights)
-    lack = lack_of(fitted, flights)
-    apart = 0.0 if lack is None else lack.gains.get(name, 0.0)
+    model_errors = model_errors_of(fitted, flights)
+    apart = 0.0 if model_errors is None else model_errors.gains.get(name, 0.0)
     assert apart == pytest.approx(1.0 / gain - 1.0, abs=0.006)
-    known = examine(fitted, lack=lack).uncertainty.estimates[name]
+    known = examine(fitted, model_errors=model_errors).uncertainty.estimates[name]
     assert (known.parts.terms or 0.0) == pytest.approx(apart * gain)
     assert known.std_error >= apart * gain
 
@@ -375,12 +392,14 @@ def test_rotor_speeds_that_were_filtered_are_told_and_in_the_intervals(seconds):
             flight.series["rotor_speed"] = Series(flight.time, speeds[..., number])
     objective = replace(objective, segments=replace(objective.segments, measured=measured))
     fitted = making.fitted_of(objective, making.truth(objective))
-    lack = lack_of(fitted, flights)
+    model_errors = model_errors_of(fitted, flights)
     if not seconds:
-        assert lack is None
+        assert model_errors is None
         return
-    assert lack.late == pytest.approx(keep / (1.0 - keep) / RATE, rel=0.3)  # a sampled filter's lag
-    acting = lack.acting_on(objective).segments.measured
+    assert model_errors.speed_lag == pytest.approx(
+        keep / (1.0 - keep) / RATE, rel=0.3
+    )  # a sampled filter's lag
+    acting = model_errors.applied_to(objective).segments.measured
     moved = acting["rotor_speed"].time - measured["rotor_speed"].time
-    assert np.asarray(moved) == pytest.approx(-lack.late)
+    assert np.asarray(moved) == pytest.approx(-model_errors.speed_lag)
     assert acting["body_rate"] is measured["body_rate"]

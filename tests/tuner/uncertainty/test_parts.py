@@ -11,8 +11,8 @@ from scipy import stats
 from tuner.objective.information import FisherInformation
 from tuner.uncertainty.covariance import overdispersion_factors
 from tuner.uncertainty.estimates import (
-    DRAWS,
     READINGS,
+    VOLTMETER_DRAWS,
     left_out,
     noise_alone,
     parts_of,
@@ -139,7 +139,9 @@ def test_the_quoted_error_holds_every_part():
         np.hypot(spread["left_out"], np.abs(step)), rel=1e-6
     )
     doubt = 10.0 * spread["left_out"]
-    doubted = parts_of(replace(information, in_doubt=doubt), np.full(COUNT, 0.01), np.zeros(COUNT))
+    doubted = parts_of(
+        replace(information, selection_shifts=doubt), np.full(COUNT, 0.01), np.zeros(COUNT)
+    )
     assert total_error(doubted) == pytest.approx(np.hypot(spread["left_out"], doubt))
 
 
@@ -162,8 +164,8 @@ def test_readings_drawn_again_count_as_far_as_they_scatter_the_estimates():
     information, _ = regression(np.random.default_rng(6), apart=0.0)
     total, random, held = information.total, np.random.default_rng(7), []
     for _ in range(400):
-        moves = random.normal(size=(DRAWS + 1, COUNT))
-        changes = {f"{READINGS} {i}": (total @ moves[i])[None] for i in range(DRAWS)}
+        moves = random.normal(size=(VOLTMETER_DRAWS + 1, COUNT))
+        changes = {f"{READINGS} {i}": (total @ moves[i])[None] for i in range(VOLTMETER_DRAWS)}
         spread = parts_of(
             replace(information, changes=changes), np.full(COUNT, 1e-9), np.zeros(COUNT)
         )

@@ -10,7 +10,13 @@ from tuner.design.proposals import proposals_in_words
 from tuner.report.chart import FITTED, GREY, PALETTE, Bars, Chart, Heat, Line, Look, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Cell, Section, Table, figures
-from tuner.uncertainty.records import MEANING, THRESHOLD, GlobalSensitivity, Knowledge, Profile
+from tuner.uncertainty.records import (
+    CHI_SQUARE_95,
+    INDEX_MEANINGS,
+    GlobalSensitivity,
+    Knowledge,
+    Profile,
+)
 from tuner.uncertainty.verdict_texts import direction_in_words
 
 FAINTEST = 1e-4
@@ -333,7 +339,7 @@ def _chart(profile: Profile) -> Chart:
         ),
         Line("profile", profile.values, rise, Look(FITTED.colour, width=2.0, marks=True)),
     )
-    panel = Panel(lines, y_title="rise of χ²", levels=((THRESHOLD, "95 %"),))
+    panel = Panel(lines, y_title="rise of χ²", levels=((CHI_SQUARE_95, "95 %"),))
     return Chart(
         key=f"profile_{profile.name}",
         title=profile.name,
@@ -371,7 +377,7 @@ def global_sensitivity(contents: Contents) -> Section | None:
 
 def _over_all(indices: GlobalSensitivity) -> Chart:
     overall = sorted((i for i in indices.indices if not i.flight), key=lambda i: -i.total)
-    meaning = MEANING[indices.method]
+    meaning = INDEX_MEANINGS[indices.method]
     texts = [
         f"{i.coefficient}: {meaning[1]} {i.total:.3g}, {meaning[2]} {i.spread:.3g}" for i in overall
     ]
@@ -402,7 +408,7 @@ def _each(indices: GlobalSensitivity) -> Chart:
             ]
             for name in names
         ],
-        bar=MEANING[indices.method][1],
+        bar=INDEX_MEANINGS[indices.method][1],
     )
     return Chart(
         key="global_each",

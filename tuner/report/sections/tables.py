@@ -11,7 +11,7 @@ from tuner.findings.findings import remedy, sentence
 from tuner.report.contents import Contents
 from tuner.report.result_texts import effective_in_words, refits_in_words, rmse_in_words
 from tuner.report.section import Cell, Section, Table, figures, short
-from tuner.uncertainty.records import CONFLICT
+from tuner.uncertainty.records import CONFLICT_SE
 from tuner.vehicle import COEFFICIENTS
 
 #: Settings that other sections show.
@@ -68,7 +68,7 @@ def sources(contents: Contents) -> Section | None:
         pairs = [t for v, e in zip(both, errors, strict=True) for t in (figures(v), short(e))]
         if source.deviation is None:
             agree = Cell("flights do not identify it", look="kept")
-        elif abs(source.deviation) > CONFLICT:
+        elif abs(source.deviation) > CONFLICT_SE:
             agree = Cell("● conflict", look="not")
         else:
             agree = Cell("○ yes", look="well")
