@@ -22,7 +22,7 @@ from tuner.evaluate.validation import controller_flown, vehicle_fitted
 from tuner.objective.inlets import INLETS
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
-from tuner.search.job_flights import read_usable
+from tuner.search.job_flights import read_recordings
 from tuner.search.problem import job_of
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.uncertainty.identifiability import hold_undetermined
@@ -74,7 +74,7 @@ def _predicted(path: Path, mass: float) -> dict[str, list[Predictions]]:
     """Return each predictor's predictions of a flight's second half."""
     settings = settle(Options([str(path)], vehicle="crazyflie", mass=mass))
     settings = replace(settings, job=JobFile(inlet=INLET))
-    (recording,), _ = read_usable(settings)
+    (recording,), _ = read_recordings(settings)
     whole = recording.flight
     first, second = cut(whole, 0.0, 0.5), cut(whole, 0.5, 1.0)
     parts = (replace(recording, flight=first), replace(recording, flight=second, holdout=True))

@@ -36,11 +36,11 @@ from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
 from tuner.objective.normal_equations import Objective
 from tuner.objective.space import Space
-from tuner.search.continuation import grow
+from tuner.search.continuation import run_stages
 from tuner.search.estimation import free_offsets
-from tuner.search.job_flights import read_usable
+from tuner.search.job_flights import read_recordings
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Fitted, Free, beginning, criterion_of, point_of
+from tuner.search.progress import Fitted, Free, criterion_of, initial_progress, point_of
 from tuner.search.stages import plan
 from tuner.terms.candidates import with_terms
 from tuner.uncertainty.estimates import uncertainty_of
@@ -181,7 +181,7 @@ def reference_job() -> Job:
     """Return the reference flights' job: their plan, stamps and noise."""
     paths = [str(path) for path in sorted((ROOT / "reference_flights").glob("*.bag"))]
     settings = settle(Options(paths, config=str(ROOT / "reference_flights" / "tune.yaml")))
-    return job_of(settings, read_usable(settings)[0])
+    return job_of(settings, read_recordings(settings)[0])
 
 
 @lru_cache(maxsize=2)
@@ -229,10 +229,10 @@ def fitted(objective: Objective) -> Fitted:
     steps = reference_job().settings.job.search.max_iterations
     stages = plan("gradient", objective.samples, rate, windows=False, robust=True, steps=steps)
     begin = space.at_share((space.prior_mean - space.lower) / space.width)
-    progress = grow(
+    progress = run_stages(
         objective,
         stages,
-        beginning(objective, begin[None]),
+        initial_progress(objective, begin[None]),
         free=Free(np.ones(len(space), bool), free_offsets(reference_job())),
         undecided={},
         on_progress=lambda _: None,

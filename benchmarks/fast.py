@@ -22,7 +22,7 @@ from tuner.job.run import run
 from tuner.recordings.flight import Flight
 from tuner.result import RunResult
 from tuner.search.inlet_choice import regressors
-from tuner.search.job_flights import read_usable
+from tuner.search.job_flights import read_recordings
 from tuner.vehicle import VehicleFile
 
 LABS: tuple[tuple[int, float, fast_flights.Fed], ...] = (
@@ -79,7 +79,7 @@ def _row(seed: int, rate: float, fed: fast_flights.Fed, folder: Path) -> Iterato
             low, high = found.ci95 or (np.nan, np.nan)
             yield f"{found.best / truth:.3f} ± {0.5 * (high - low) / truth:.3f}"
     yield f"{sum(inside)} of {len(inside)}"
-    recordings, _ = read_usable(settle(options))
+    recordings, _ = read_recordings(settle(options))
     fitted, held_out = ([r.flight for r in recordings if r.holdout is out] for out in (False, True))
     vehicle = settle(options).vehicle
     for ahead in AHEAD:

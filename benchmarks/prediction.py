@@ -25,7 +25,7 @@ from tuner.findings.sentences import PREDICTED
 from tuner.job.run import run
 from tuner.objective.inlets import INLETS
 from tuner.result import BEST_FIT_FILE, RunResult
-from tuner.search.job_flights import read_usable
+from tuner.search.job_flights import read_recordings
 from tuner.vehicle import ControllerFile, read_vehicle
 
 FLIGHTS = Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights"))
@@ -96,7 +96,7 @@ def contest_of(folder: Path) -> Contest:
         Its recordings cannot be fitted.
     """
     options = options_of(folder)
-    recordings, _ = read_usable(settle(options))
+    recordings, _ = read_recordings(settle(options))
     fitted = [recording.flight for recording in recordings if not recording.holdout]
     held_out = [recording for recording in recordings if recording.holdout]
     if not held_out or any(INLETS[recording.inlet].closed_loop for recording in recordings):

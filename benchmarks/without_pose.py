@@ -25,7 +25,7 @@ from tuner.recordings.flight import Flight, Series
 from tuner.recordings.loader import InertialFlight
 from tuner.recordings.states import initial_state
 from tuner.result import BEST_FIT_FILE
-from tuner.search.job_flights import without_pose
+from tuner.search.job_flights import read_inertial_flights
 from tuner.vehicle import ControllerFile, read_vehicle
 
 INLET: InletName = "actuator"
@@ -48,7 +48,7 @@ def contest_of(folder: Path) -> Contest:
     """
     paths = [str(path) for path in sorted(folder.glob("log*"))]
     settings = settle(Options(paths, vehicle="crazyflie"))
-    flights = sorted(without_pose(settings)[0], key=_flown)
+    flights = sorted(read_inertial_flights(settings)[0], key=_flown)
     if len(flights) < 2:
         raise InputError(folder, "it holds fewer than two flights without a pose", "")
     began = time.perf_counter()

@@ -83,12 +83,12 @@ def _cross_validation() -> tuple[dict[str, _Folds], list[str]]:
     """Return engine -> its cross-validation, and every table."""
     from tuner.config import Options, settle  # noqa: PLC0415 (jax is configured first)
     from tuner.search.estimation import search  # noqa: PLC0415
-    from tuner.search.job_flights import read_usable  # noqa: PLC0415
+    from tuner.search.job_flights import read_recordings  # noqa: PLC0415
     from tuner.search.problem import job_of  # noqa: PLC0415
     from tuner.uncertainty.refits import CROSS_VALIDATION_FILE, cross_validate  # noqa: PLC0415
 
     settings = settle(Options([str(path) for path in sorted(FOLDER.glob("*.bag"))]))
-    job = job_of(settings, read_usable(settings)[0])
+    job = job_of(settings, read_recordings(settings)[0])
     found, tables = {}, []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -34,7 +34,7 @@ from tuner.findings.findings import Code  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
 from tuner.recordings.flight import Flight, Series  # noqa: E402
 from tuner.search.estimation import search  # noqa: E402
-from tuner.search.job_flights import read_usable  # noqa: E402
+from tuner.search.job_flights import read_recordings  # noqa: E402
 from tuner.search.problem import Job, job_of  # noqa: E402
 from tuner.search.progress import Fitted  # noqa: E402
 from tuner.uncertainty.estimates import uncertainty_of  # noqa: E402
@@ -64,7 +64,7 @@ def solved(
     settings: Settings, change: Callable[[Flight], Flight] = lambda flight: flight
 ) -> tuple[Job, Fitted, float]:
     """Return a job on changed recordings, its solution, and the s that the search took."""
-    recordings = [replace(r, flight=change(r.flight)) for r in read_usable(settings)[0]]
+    recordings = [replace(r, flight=change(r.flight)) for r in read_recordings(settings)[0]]
     job = job_of(settings, recordings)
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:

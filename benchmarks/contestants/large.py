@@ -18,8 +18,8 @@ from benchmarks.calibration import problem  # noqa: E402
 from benchmarks.simulated_recordings import recorded  # noqa: E402
 from tuner.objective.criterion import Point  # noqa: E402
 from tuner.objective.normal_equations import Objective  # noqa: E402
-from tuner.search.levenberg_marquardt import advance, begin  # noqa: E402
-from tuner.search.progress import beginning, criterion_of  # noqa: E402
+from tuner.search.levenberg_marquardt import advance, initial_step  # noqa: E402
+from tuner.search.progress import criterion_of, initial_progress  # noqa: E402
 from tuner.search.stages import plan  # noqa: E402
 
 DURATION = 40.0
@@ -57,11 +57,11 @@ def main(count: int) -> None:
         robust=True,
         steps=ITERATIONS,
     )[-1]
-    progress = beginning(objective, objective.space.initial[None] + NEARBY)
+    progress = initial_progress(objective, objective.space.initial[None] + NEARBY)
     criterion = criterion_of(stage, progress.scales, np.asarray(progress.points.offsets[0]), None)
     points: Point = progress.points
     free = np.ones(len(objective.space) + points.offsets[0].size, bool)
-    step, times = begin(points), []
+    step, times = initial_step(points), []
     for _ in range(ITERATIONS):
         began = time.process_time()
         step = advance(objective, step, criterion, free)

@@ -29,7 +29,7 @@ from tuner.config import TrajectorySettings  # noqa: E402
 from tuner.core.shipped import configs_folder  # noqa: E402
 from tuner.evaluate.closed_loop import simulate  # noqa: E402
 from tuner.objective.criterion import Point  # noqa: E402
-from tuner.search.progress import beginning, criterion_of  # noqa: E402
+from tuner.search.progress import criterion_of, initial_progress  # noqa: E402
 from tuner.search.stages import plan  # noqa: E402
 from tuner.vehicle import ControllerFile, read_vehicle  # noqa: E402
 
@@ -93,7 +93,7 @@ def fit(what: str) -> None:
     objective = reference_job().objective
     rate = float(objective.schedule.log_rate)
     stage = plan("gradient", objective.samples, rate, windows=False, robust=True, steps=1)[-1]
-    progress = beginning(objective, objective.space.initial[None])
+    progress = initial_progress(objective, objective.space.initial[None])
     vector, offsets = (
         np.asarray(part[0]) for part in (progress.points.coefficients, progress.points.offsets)
     )

@@ -45,10 +45,10 @@ def tune(
             configure()
             from tuner.config import settle
             from tuner.job.run import run
-            from tuner.search.job_flights import without_pose
+            from tuner.search.job_flights import read_inertial_flights
 
         with span("reading"):
-            bare, left_out = without_pose(settle(options))
+            bare, left_out = read_inertial_flights(settle(options))
         told = listening(quiet=quiet, verbose=verbose)
         if bare:
             from tuner.job.without_pose import fit_without_pose

@@ -49,8 +49,8 @@ from tuner.objective.simulation import MOTION, SPEEDS, TURNED, Flown, fly
 from tuner.objective.space import Space
 from tuner.objective.windows import Window
 from tuner.options import RecordingOptions
-from tuner.search.job_flights import Recording, as_logged, read_usable
-from tuner.search.levenberg_marquardt import FAR
+from tuner.search.job_flights import Recording, read_recordings, with_logged_parameters
+from tuner.search.levenberg_marquardt import MAX_STATE_SD
 from tuner.search.problem import limits_of
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import ControllerFile, VehicleFile, check_rotors, read_vehicle
@@ -354,7 +354,7 @@ class _Group:
             better = misfit <= least
             best, least = np.where(better, trial, best), np.where(better, misfit, least)
             asked = np.asarray(sums.states)
-            asked = np.clip(np.where(np.isfinite(asked), asked, 0.0), -FAR, FAR)
+            asked = np.clip(np.where(np.isfinite(asked), asked, 0.0), -MAX_STATE_SD, MAX_STATE_SD)
             trial = np.where(better, asked, 0.5 * (best + trial))
         return best
 
@@ -399,7 +399,7 @@ def compare(
     """
     for path in out:
         check_table_file(path)
-    settings, logged = as_logged(settle(options, fits=False))
+    settings, logged = with_logged_parameters(settle(options, fits=False))
     read = {flight.resolve() for flight in settings.flights}
     for path in out:
         if path.resolve() in read:
@@ -409,7 +409,7 @@ def compare(
     if not isinstance(vehicles, Mapping):
         vehicles = {name: name for name in vehicles}
     sets = {label: _vehicle(named) for label, named in vehicles.items()}
-    recordings, noticed = read_usable(settings, fits=False)
+    recordings, noticed = read_recordings(settings, fits=False)
     for finding in (*logged, *noticed):
         on_message(one_line(finding))
     comparison = Comparison(recordings, settings.controller, window=settings.job.search.window)

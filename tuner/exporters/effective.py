@@ -31,15 +31,15 @@ from tuner.evaluate.records import AxesRmse
 from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
 from tuner.objective.criterion import Point, units_of
 from tuner.result import EffectiveResult, LostTerm, PoseRmse, Run, RunResult
-from tuner.search.continuation import grow
+from tuner.search.continuation import run_stages
 from tuner.search.estimation import stages_of
 from tuner.search.job_flights import (
     Recording,
-    read_usable,
+    read_recordings,
     with_known,
 )
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Free, Progress, beginning
+from tuner.search.progress import Free, Progress, initial_progress
 from tuner.vehicle import (
     COEFFICIENTS,
     ControllerFile,
@@ -225,7 +225,7 @@ def fitted_in(
 
     def ended(progress: Progress, moves: NDArray[np.bool_]) -> Progress:
         none = np.zeros(begun.points.offsets.shape[1:], bool)
-        return grow(
+        return run_stages(
             problem.objective,
             stages,
             progress,
@@ -269,7 +269,10 @@ def _bounds(run: Run, start: VehicleFile, free: Sequence[str]) -> dict[str, Coef
 
 def _as_it_ended(run: Run, problem: Job, lost: Collection[str]) -> Progress:
     """Return where a fit begins, with clocks, air and weights as the run ended with them."""
-    objective, begun = problem.objective, beginning(problem.objective, problem.space.initial[None])
+    objective, begun = (
+        problem.objective,
+        initial_progress(problem.objective, problem.space.initial[None]),
+    )
     offsets: Any = run.result.settings.get("offsets", {})
     weighed: Any = run.result.settings.get("scales", {})
     conditions = {flight.name: flight.conditions for flight in run.result.flights}
@@ -369,7 +372,7 @@ def recordings_of(run: Run) -> Recorded:
     """
     settings = _settings(run)
     wanted = {flight.name: flight for flight in run.result.flights}
-    readable, _ = read_usable(settings, fits=False)
+    readable, _ = read_recordings(settings, fits=False)
     recordings = tuple(r for r in readable if r.flight.name in wanted)
     if gone := sorted(set(wanted) - {r.flight.name for r in recordings}):
         raise InputError(wanted[gone[0]].path, "is not the recording of the run", "fit it again")

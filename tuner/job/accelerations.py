@@ -80,7 +80,7 @@ def _begun(job: Job, found: Estimate) -> Job | None:
         search = search.model_copy(update={"window": found.horizon})
     changed = settings.job.model_copy(update={"free": moving, "fixed": (), "search": search})
     begun = job_of(replace(settings, vehicle=vehicle, job=changed), job.recordings)
-    return replace(begun, asked=job.settings, accelerations=found)
+    return replace(begun, user_settings=job.settings, accelerations=found)
 
 
 def _finding(found: Estimate) -> Finding:

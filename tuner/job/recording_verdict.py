@@ -96,12 +96,16 @@ def _simulatable(path: Path, settings: Settings) -> Verdict:
 
     configure()
     from tuner.objective.inlets import bypassed_by  # noqa: PLC0415
-    from tuner.search.job_flights import as_logged, read_usable, without_pose  # noqa: PLC0415
+    from tuner.search.job_flights import (  # noqa: PLC0415
+        read_inertial_flights,
+        read_recordings,
+        with_logged_parameters,
+    )
 
-    settings, logged = as_logged(settings)
+    settings, logged = with_logged_parameters(settings)
     gains = tuple(g for f in logged if f.code is Code.LOGGED_GAINS for g in f.names)
     try:
-        bare, _ = without_pose(settings)
+        bare, _ = read_inertial_flights(settings)
         if bare:
             seconds = sum(end - begin for flight in bare for begin, end in flight.flying)
             seen = (
@@ -109,7 +113,7 @@ def _simulatable(path: Path, settings: Settings) -> Verdict:
                 "are fitted, from the motor commands."
             )
             return Verdict(str(path), True, ("none",), (seen,))
-        recordings, findings = read_usable(settings, holdout=(), fits=False)
+        recordings, findings = read_recordings(settings, holdout=(), fits=False)
     except InputError as error:
         return Verdict(str(path), False, why=(f"{error.what}; {error.remedy}",))
     inlets = [recording.inlet for recording in recordings]

@@ -50,13 +50,13 @@ from tuner.report.result_texts import export_sentence
 from tuner.result import BEST_FIT_FILE, OF_A_RUN, Run, RunResult, forget, place_for
 from tuner.search.estimation import OnProgress
 from tuner.search.explanation import Explanation
-from tuner.search.findings import inputs_late, turning_unexplained, voltage_taken
-from tuner.search.input_lag import with_inputs_on_time
+from tuner.search.findings import late_input_findings, reference_voltage_findings, turning_findings
+from tuner.search.input_lag import with_input_lags
 from tuner.search.iteration import Iteration
-from tuner.search.job_flights import as_logged, read_usable
+from tuner.search.job_flights import read_recordings, with_logged_parameters
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import Fitted, Progress
-from tuner.search.rotor_change import used_up_to_changes
+from tuner.search.rotor_change import cut_at_rotor_changes
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import ExaminedFit, refit_and_examine
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
@@ -103,7 +103,7 @@ def run(
     OutputError
         The result folder cannot be written to; a search goes on from there with ``resume``.
     """
-    settings, logged = as_logged(settle(options))
+    settings, logged = with_logged_parameters(settle(options))
     listener.on_settings(settings)
     _check_place(options, settings, place_for(out, resume=resume))
     job, findings = prepared(settings)
@@ -157,7 +157,7 @@ def _fit(
     if job is not found.job or fitted is not found.fitted:
         validation = _flown(job, fitted, vehicle, listener)
     explanation.notice(_of_flights(job, validation))
-    explanation.notice(voltage_taken(settings.vehicle, vehicle))
+    explanation.notice(reference_voltage_findings(settings.vehicle, vehicle))
     sources = _known(fitted, examination, explanation)
 
     def written(
@@ -211,13 +211,13 @@ def _fit(
 def prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
     """Return the job of some settings, and what there is to say of it before it is simulated."""
     with span("reading"):
-        recordings, left_out = read_usable(settings)
+        recordings, left_out = read_recordings(settings)
     with span("check"):
-        recordings, changed = used_up_to_changes(recordings, settings.vehicle)
-        recordings = with_inputs_on_time(recordings, settings.vehicle)
+        recordings, changed = cut_at_rotor_changes(recordings, settings.vehicle)
+        recordings = with_input_lags(recordings, settings.vehicle)
         job, said = with_accelerations(job_of(settings, recordings))
         job = with_first_terms(job)
-        return job, (*left_out, *changed, *inputs_late(job), *said, *check_recordings(job))
+        return job, (*left_out, *changed, *late_input_findings(job), *said, *check_recordings(job))
 
 
 def _fitted(
@@ -281,7 +281,7 @@ def _of_flights(job: Job, validation: Validation) -> tuple[Finding, ...]:
         *flights_worse(validation.initial, validation.best),
         *flights_not_flown(job, validation.best),
         *holding_better(job, validation),
-        *turning_unexplained(job, validation.turning_explained),
+        *turning_findings(job, validation.turning_explained),
     )
 
 

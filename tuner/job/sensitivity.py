@@ -23,10 +23,17 @@ from tuner.report import render
 from tuner.report.contents import About, Recording, write_traces
 from tuner.result import RunResult, forget, place_for
 from tuner.search.continuation import SWITCH_GAIN
-from tuner.search.findings import UNMATCHED, loop_findings
-from tuner.search.job_flights import as_logged, read_usable
+from tuner.search.findings import UNMATCHED_RATIO, loop_findings
+from tuner.search.job_flights import read_recordings, with_logged_parameters
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Fitted, beginning, by_flight, loop_of, plain_criterion, with_loop
+from tuner.search.progress import (
+    Fitted,
+    by_flight,
+    initial_progress,
+    loop_of,
+    plain_criterion,
+    with_loop,
+)
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.model_error import alternatives_of
@@ -55,7 +62,7 @@ def _simulated(job: Job, objective: Objective) -> Fitted:
     """Return a problem at the job's vehicle, its noise scaled to residuals that are larger."""
     start = initial_values(job.settings.vehicle, job.settings.controller, job.space.free)
     vector = job.space.vector_of(start)
-    points = beginning(objective, vector[None]).points
+    points = initial_progress(objective, vector[None]).points
     unscaled = plain_criterion(objective, objective.samples)
     sums = sums_at(objective, points, unscaled, derivatives=False)
     residual = root_mean_squares(objective, sums)
@@ -79,7 +86,7 @@ def _simulated(job: Job, objective: Objective) -> Fitted:
 def _poorly_met(scales: Mapping[str, Mapping[str, float]]) -> Iterator[Finding]:
     for name, of_channels in scales.items():
         worst, multiple = max(of_channels.items(), key=lambda item: item[1])
-        if multiple > UNMATCHED:
+        if multiple > UNMATCHED_RATIO:
             yield Finding(Code.POORLY_MET, "warning", name, {"noise_multiple": multiple}, (worst,))
 
 
@@ -115,12 +122,12 @@ def examine_vehicle(
     InputError
         The input cannot be used; nothing was written.
     """
-    settings, logged = as_logged(settle(asked, fits=False))
+    settings, logged = with_logged_parameters(settle(asked, fits=False))
     room = None if arena is None else Arena.of(arena)
     check_names(asked.profile or (), "--profile")
     if exists(place_for(asked.out) / RunResult.FILE):
         raise InputError("--out", f"{asked.out} holds the result of a fit", "name another folder")
-    recordings, noticed = read_usable(settings, holdout=())
+    recordings, noticed = read_recordings(settings, holdout=())
     job = job_of(settings, recordings)
     with result_folder(asked.out) as out:
         fitted = unfitted(job)

@@ -22,7 +22,7 @@ from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, wri
 from tuner.job.listener import SILENT, Listener
 from tuner.recordings.loader import InertialFlight
 from tuner.result import place_for
-from tuner.search.job_flights import left_out_of
+from tuner.search.job_flights import left_out_finding
 from tuner.vehicle import VehicleFile, values_of, with_values
 
 BY_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
@@ -115,7 +115,7 @@ def _measured(
     if not used:
         what, to_do = "holds out all flights that can be used", "leave one to fit"
         raise errors[0][1] if errors else InputError("--holdout", what, to_do)
-    return measured, used, [left_out_of(name, error) for name, error in errors]
+    return measured, used, [left_out_finding(name, error) for name, error in errors]
 
 
 def _combined(measurements: Sequence[Measurement], known: Mapping[str, float]) -> Combination:

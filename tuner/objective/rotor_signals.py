@@ -42,7 +42,7 @@ FEWEST = 100
 
 
 @dataclass(frozen=True)
-class Explained:
+class TorqueCorrelation:
     """What the rotors explain of a flight's angular acceleration.
 
     Attributes
@@ -66,7 +66,7 @@ class Explained:
         return 0.5 * (self.correlation[0] + self.correlation[1])
 
 
-def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> Explained | None:
+def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> TorqueCorrelation | None:
     """Return what a recorded signal of the rotors explains; None if too little was recorded."""
     if not flight.has(source) or "body_rate" not in flight.series:
         return None
@@ -85,7 +85,7 @@ def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> Explained
     found = (after(delay) for delay in range(-1, max(1, round(LATEST / step)) + 1))
     best = max(found, key=lambda correlation: correlation[0] + correlation[1]).tolist()
     rates = flight.series[source].rate, flight.series["body_rate"].rate
-    return Explained(source, (best[0], best[1], best[2]), *rates)
+    return TorqueCorrelation(source, (best[0], best[1], best[2]), *rates)
 
 
 def _turning(

@@ -1,1 +1,1 @@
-"""Each search takes an objective and returns a result: Levenberg-Marquardt, CMA-ES, multi-start."""
+"""Search for the coefficients of least loss: Levenberg-Marquardt, CMA-ES, growing horizons."""

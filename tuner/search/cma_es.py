@@ -1,4 +1,4 @@
-"""CMA-ES for when the slope misleads: a population on the unit box, flown as one batch."""
+"""CMA-ES, where gradients lead to false minima: a population on the unit box, one batch each."""
 
 from __future__ import annotations
 
@@ -12,20 +12,19 @@ from tuner.objective.normal_equations import CHUNK, evaluate, position_rmse
 from tuner.search.progress import Iterate, StageProblem, point_of
 
 POPULATION = CHUNK
-"""Vectors in one generation."""
-SPREAD = 0.5
+"""Vectors in one generation: those that are simulated at once."""
+INITIAL_SD = 0.5
 """First standard deviation, in those of the coefficients' priors."""
-WIDEST = 0.25
-"""First standard deviation at most, as a share of the coefficient's range."""
-FLAT = 1e-3
-"""A stage ends when the best losses of the last generations differ by less than this share."""
+MAX_INITIAL_SD = 0.25
+"""Largest first standard deviation, as a share of the coefficient's range."""
+LOSS_TOLERANCE = 1e-3
+"""Relative difference of the last generations' best losses at which a stage ends."""
 
 
 def evolve(problem: StageProblem) -> Iterator[Iterate]:
     """Minimise a stage's loss by pycma from the best start; the flights' offsets stay as they are.
 
-    The population is as wide as the coefficients' priors. The best vector so far takes the place of
-    the start that it came from.
+    The population is as wide as the coefficients' priors. Its best vector replaces the start.
     """
     import cma  # noqa: PLC0415 (takes its time)
 
@@ -37,11 +36,11 @@ def evolve(problem: StageProblem) -> Iterator[Iterate]:
     losses[start] = np.inf
     options = {
         "bounds": [0.0, 1.0],
-        "CMA_stds": np.minimum(SPREAD * (space.prior_sd / space.width)[moves], WIDEST),
+        "CMA_stds": np.minimum(INITIAL_SD * (space.prior_sd / space.width)[moves], MAX_INITIAL_SD),
         "seed": problem.seed,
         "popsize": POPULATION,
         "maxiter": problem.stage.steps,
-        "tolfunrel": FLAT,
+        "tolfunrel": LOSS_TOLERANCE,
         "verbose": -9,
     }
     share = space.share(point.coefficients)

@@ -1,8 +1,8 @@
-"""The growing horizon: fit the gentle beginning first, then more and more of every flight.
+"""Continuation in the horizon: fit the first fraction of a second, then more and more of a flight.
 
-A flight begins gently, where the problem is nearly linear; each stage starts from where the last
-ended, so that the simulation never strays far enough from the recording to fall into a false
-minimum. Noise is inflated at first, since the model is still wrong by more than noise.
+A flight begins gently, where the problem is nearly linear; each stage starts at the end of the
+last, so that the simulation stays close enough to the recording to avoid false minima. Noise is
+inflated at first, since the model is still wrong by more than noise.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tuner.objective.normal_equations import (
 from tuner.objective.segments import CLOCKS
 from tuner.search.cma_es import evolve
 from tuner.search.iteration import Iteration
-from tuner.search.levenberg_marquardt import descend, starts_asked_for
+from tuner.search.levenberg_marquardt import descend, estimated_states
 from tuner.search.progress import (
     Free,
     Iterate,
@@ -42,29 +42,25 @@ from tuner.search.progress import (
 from tuner.search.stages import Stage
 
 OPTIMISERS: dict[str, Optimiser] = {"gradient": descend, "cma": evolve}
-"""What runs the stages that name it."""
-NO_OFFSET = np.array([0.0005, 0.0005, 0.002, 0.002, 0.002])
-"""s: clocks that differ by less are taken to agree. A recording's clocks either share a source or
-differ by much more, and a tenth of a millisecond of freedom costs a percent of inertia. rad/s: a
-gyro that reads so little when at rest is taken to have no bias."""
-
-MATERIAL = 0.01
-"""Share of the loss by which it may rise, over all clocks that are set right."""
+"""Name in a stage -> optimiser."""
+NEGLIGIBLE_OFFSET = np.array([0.0005, 0.0005, 0.002, 0.002, 0.002])
+"""Offsets below which clocks, s, agree and gyros, rad/s, have no bias. A recording's clocks either
+share a source or differ by much more, and 0.1 ms of freedom costs a percent of inertia."""
+CLOCK_LOSS_TOLERANCE = 0.01
+"""Largest relative rise of the loss by setting clock offsets to zero: simulators differ by more."""
 RIDGE = 1e-12
 """Added to a Hessian of unit diagonal."""
 SWITCH_GAIN = 1.2
-"""The controller file's own choice is given up only for one that lowers the loss of the flights
-that tell by this factor."""
-FROM_START = ("sees_markers",)
-"""Choices that the markers' coefficients take up while a hover is all that is seen: the other way
-is tried from where the search began. From markers that meet a hover as it did not fly, it flies
-worse than the wrong way, and no step leads out."""
+"""Least factor on the loss of informative flights that overrules the controller file."""
+RESTARTED_CHOICES = ("sees_markers",)
+"""Choices whose alternative is searched from the start: during a hover the markers' coefficients
+absorb the wrong choice, and from there the right one has a false minimum."""
 
 OnProgress = Callable[[Progress], None]
 Undecided = Mapping[str, NDArray[np.bool_]]
 
 
-def grow(
+def run_stages(
     objective: Objective,
     stages: tuple[Stage, ...],
     progress: Progress,
@@ -76,7 +72,7 @@ def grow(
     worth_polishing: Callable[[Progress], bool] = lambda _: True,
     start: Progress | None = None,
 ) -> Progress:
-    """Run the remaining stages and return where the search ended.
+    """Run the remaining stages and return the progress at their end.
 
     Parameters
     ----------
@@ -85,31 +81,31 @@ def grow(
     stages
         The schedule.
     progress
-        Where to begin: `beginning`, or a checkpoint.
+        Where to begin: `initial_progress`, or a checkpoint.
     free
         What may move.
     undecided
-        The choices of a `Loop` that are tried both ways, and the flights that tell.
+        The choices of a `Loop` that are tried both ways -> the informative flights (N,).
     on_progress
-        Called after every iteration with where the search then stands.
+        Called after every iteration.
     seed
-        Of an optimiser that draws at random.
+        Seed of an optimiser that draws at random.
     worth_polishing
-        Whether to go on where the search stands before its first polish.
+        Whether to go on to the first polish.
     start
-        Where the search began, if not at ``progress``.
+        Progress at the search's start, if not ``progress``.
     """
     search = _Search(objective, free, on_progress, seed)
     start = progress if start is None else start
     while progress.stage < len(stages):
         stage = stages[progress.stage]
         last = progress.stage + 1 == len(stages)
-        polished = progress.stage > 0 and stages[progress.stage - 1].prunes
-        if stage.prunes and not polished and not worth_polishing(progress):
+        polished = progress.stage > 0 and stages[progress.stage - 1].drops_offsets
+        if stage.drops_offsets and not polished and not worth_polishing(progress):
             break
-        if stage.decides:
+        if stage.tries_choices:
             before = stages[start.stage : progress.stage]
-            progress = search.decided(stage, progress, undecided, start, before, last=last)
+            progress = search.run_choices(stage, progress, undecided, start, before, last=last)
         else:
             progress = search.run(stage, progress, last=last)
     return progress
@@ -117,7 +113,7 @@ def grow(
 
 @dataclass(frozen=True)
 class _Search:
-    """What stays the same from stage to stage, as of `grow`."""
+    """The arguments of `run_stages` that are the same for all stages."""
 
     objective: Objective
     free: Free
@@ -126,12 +122,12 @@ class _Search:
 
     def run(self, stage: Stage, progress: Progress, *, last: bool) -> Progress:
         """Run one stage to its end for every start at once."""
-        return _finished(*self.stepped(stage, progress, last=last))
+        return _finished(*self.run_steps(stage, progress, last=last))
 
-    def stepped(
+    def run_steps(
         self, stage: Stage, progress: Progress, *, last: bool
     ) -> tuple[StageProblem, Progress]:
-        """Return a stage's problem, and where its last step led."""
+        """Return a stage's problem, and the progress after its last step."""
         problem = _problem(self, stage, progress, last=last)
         for iterate in islice(OPTIMISERS[stage.optimiser](problem), stage.steps):
             progress = _advanced(problem, progress, iterate)
@@ -140,7 +136,7 @@ class _Search:
                 break
         return problem, progress
 
-    def decided(
+    def run_choices(
         self,
         stage: Stage,
         progress: Progress,
@@ -150,16 +146,16 @@ class _Search:
         *,
         last: bool,
     ) -> Progress:
-        """Run one stage as the loop flies and with each choice the other way; keep the best.
+        """Run one stage with the loop's choices and with each switched; keep the best.
 
-        Choices of `FROM_START` go through the stages before it too, from the start.
+        Switched `RESTARTED_CHOICES` run the stages before it again, from the start.
         """
-        best = self.stepped(stage, progress, last=last)
-        for choice, tell in choices.items():
-            begin, earlier = (start, before) if choice in FROM_START else (progress, ())
+        best = self.run_steps(stage, progress, last=last)
+        for choice, informative in choices.items():
+            begin, earlier = (start, before) if choice in RESTARTED_CHOICES else (progress, ())
 
             def on_progress(rival: Progress, begin: Progress = begin) -> None:
-                # a checkpoint begins with all of them again
+                # a checkpoint here resumes with all of them again
                 made = rival.iterations[len(begin.iterations) :]
                 shown = replace(
                     progress,
@@ -174,9 +170,9 @@ class _Search:
             switched = replace(begin, loop=best[1].loop.switched(choice))
             for one in earlier:
                 switched = other.run(one, switched, last=False)
-            rival = other.stepped(stage, switched, last=last)
+            rival = other.run_steps(stage, switched, last=last)
             evaluations = best[1].evaluations + rival[1].evaluations - begin.evaluations
-            own, others = (_loss_of(tell, *end) for end in (best, rival))
+            own, others = (_loss_of(informative, *end) for end in (best, rival))
             problem, end = best if own <= SWITCH_GAIN * others else rival
             best = problem, replace(end, evaluations=evaluations)
         return _finished(*best)
@@ -192,12 +188,12 @@ def _loss_of(flights: NDArray[np.bool_], problem: StageProblem, progress: Progre
 
 
 def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -> StageProblem:
-    """Return what the stage's optimiser minimises, from where the search stands."""
+    """Return the problem of a stage's optimiser."""
     points, free, best = progress.points, search.free, int(np.argmin(progress.losses))
     kept = np.ones(points.offsets.shape[1:], bool)
-    if stage.prunes:  # what surrounds a flight is no clock
-        offsets = np.asarray(points.offsets[best])[: len(NO_OFFSET)]
-        kept[: len(NO_OFFSET)] = np.abs(offsets) * OFFSET_UNIT >= NO_OFFSET[:, None]
+    if stage.drops_offsets:  # per-flight conditions follow in later rows
+        offsets = np.asarray(points.offsets[best])[: len(NEGLIGIBLE_OFFSET)]
+        kept[: len(NEGLIGIBLE_OFFSET)] = np.abs(offsets) * OFFSET_UNIT >= NEGLIGIBLE_OFFSET[:, None]
         points = Point(points.coefficients, points.offsets * kept)
     problem = StageProblem(
         objective=with_loop(search.objective, progress.loop),
@@ -210,7 +206,7 @@ def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -
         damping=progress.damping,
         last=last,
     )
-    if not stage.prunes or not problem.free.offsets[: len(CLOCKS)].any():
+    if not stage.drops_offsets or not problem.free.offsets[: len(CLOCKS)].any():
         return problem
     sums = sums_at(problem.objective, points, problem.criterion)
     stay = _clocks_that_differ(problem, best, sums)
@@ -223,15 +219,15 @@ def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -
 
 
 def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> NDArray[np.bool_]:
-    """Return (offsets, N) which offsets stay: those that flights would be met worse without.
+    """Return (offsets, N) which offsets stay: those that lower the loss significantly.
 
-    A clock that is late looks like latency, and a tenth of a millisecond of freedom costs a percent
-    of inertia. Gusts move an estimated clock by milliseconds. So clocks are taken to agree unless
-    that makes the loss rise by more than two simulators of one vehicle differ.
+    A late clock looks like latency, and 0.1 ms of freedom costs a percent of inertia. Gusts move an
+    estimated clock by milliseconds. So clocks agree unless that raises the loss by more than two
+    simulators of one vehicle differ.
 
-    From the loss's quadratic at the best point: setting the clocks Z right, everything else
-    following, makes it rise by ``½ oᵀ(C_ZZ)⁻¹o``, o being what they are late by at the minimum and
-    C the inverse Hessian. The one that matters least goes first.
+    By the loss's quadratic at the best point, setting clock offsets Z to zero, everything else
+    following, raises it by ``½ oᵀ(C_ZZ)⁻¹o``, with o the offsets at the minimum and C the inverse
+    Hessian. The least important one goes first.
     """
     objective, free = problem.objective, problem.free
     here: SegmentSums = jax.tree.map(lambda leaf: np.asarray(leaf)[best], sums)
@@ -245,9 +241,9 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
     left: list[int] = np.flatnonzero((moves >= first) & (moves < first + clocks)).tolist()
     right: list[int] = []
     while left:
-        rises = [_rise(inverse, late, [*right, clock]) for clock in left]
+        rises = [_loss_rise(inverse, late, [*right, clock]) for clock in left]
         least = int(np.argmin(rises))
-        if rises[least] > MATERIAL * float(loss):
+        if rises[least] > CLOCK_LOSS_TOLERANCE * float(loss):
             break
         right.append(left.pop(least))
     stay = np.ones(free.offsets.size, bool)
@@ -255,13 +251,13 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
     return stay.reshape(free.offsets.shape)
 
 
-def _rise(inverse: Array, late: Array, clocks: list[int]) -> float:
+def _loss_rise(inverse: Array, late: Array, clocks: list[int]) -> float:
     square = inverse[np.ix_(clocks, clocks)]
     return float(0.5 * late[clocks] @ scaled_solve(square, late[clocks]))
 
 
 def _advanced(problem: StageProblem, progress: Progress, iterate: Iterate) -> Progress:
-    """Return where the search stands after a step of the stage."""
+    """Return the progress after a step of the stage."""
     best = int(np.argmin(iterate.losses))
     iteration = Iteration(
         stage=problem.stage.name,
@@ -282,7 +278,7 @@ def _advanced(problem: StageProblem, progress: Progress, iterate: Iterate) -> Pr
 
 
 def _finished(problem: StageProblem, progress: Progress) -> Progress:
-    """Return where the search stands after the stage, the next one's weights included."""
+    """Return the progress after the stage, with the next one's weights."""
     stage, iterate = problem.stage, progress.iterate
     assert iterate is not None, "a stage takes at least one step"
     points, damping = iterate.points, np.ones(len(iterate.losses))
@@ -303,6 +299,6 @@ def _finished(problem: StageProblem, progress: Progress) -> Progress:
     best = int(np.argmin(iterate.losses))
     every = root_mean_squares(problem.objective, iterate.sums)
     residual = {name: of_starts[best] for name, of_starts in every.items()}
-    scales = misfit(residual) if stage.weighs else strays(residual, stage.noise_inflation)
-    states = starts_asked_for(iterate.sums, best, progress.states)
+    scales = misfit(residual) if stage.rescales else strays(residual, stage.noise_inflation)
+    states = estimated_states(iterate.sums, best, progress.states)
     return replace(progress, scales=scales, states=states)

@@ -1,6 +1,6 @@
-"""The search of a job, started or resumed from its checkpoint, and the same search repeated.
+"""The search of a job, started or resumed from a checkpoint, and refits with something changed.
 
-It is repeated with something changed: the last stages from where it ended, or all of it.
+Refits run the last stages from the search's end, or all stages.
 """
 
 from __future__ import annotations
@@ -29,28 +29,28 @@ from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings.content import ReadOptions
 from tuner.recordings.flight import Flight
 from tuner.recordings.loader import reading_key
-from tuner.search.continuation import Undecided, grow
+from tuner.search.continuation import Undecided, run_stages
 from tuner.search.findings import findings_at, unmatched
 from tuner.search.iteration import Iteration, Outcome
-from tuner.search.levenberg_marquardt import LEAST_DAMPING
+from tuner.search.levenberg_marquardt import MIN_DAMPING
 from tuner.search.problem import Job
 from tuner.search.progress import (
     Fitted,
     Free,
     Loop,
     Progress,
-    beginning,
     by_flight,
     criterion_of,
+    initial_progress,
     loop_of,
     point_of,
     with_loop,
 )
-from tuner.search.stages import Stage, left, plan
+from tuner.search.stages import Stage, plan, remaining_seconds
 
 
 def fingerprint(job: Job) -> str:
-    """Return a digest of everything that decides a job's numbers."""
+    """Return a digest of everything that a job's numbers depend on."""
     settings = job.settings
     parts = {
         "flights": [(flight.name, flight.sha256, *_read_by(flight, job)) for flight in job.flights],
@@ -64,7 +64,7 @@ def fingerprint(job: Job) -> str:
 
 
 def _read_by(flight: Flight, job: Job) -> tuple[str, ...]:
-    """Return how a flight's recording is read: a map or a side-car may have changed since."""
+    """Return the files that a flight is read by: a topic map or a side-car may change."""
     given = job.settings.job
     return reading_key(ReadOptions.of(Path(flight.path), given.topics, given.namespace))
 
@@ -95,7 +95,7 @@ def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
 
 
 def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
-    """Return where a search stood and the s that it had taken.
+    """Return a checkpoint's progress and the s that the search had taken.
 
     Raises
     ------
@@ -128,15 +128,15 @@ def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
 
 CHECKPOINT = "checkpoint.npz"
 SECOND_CHECKPOINT = "checkpoint_hybrid.npz"
-FAR_OFF = 3.0
-"""Multiple of the noise beyond which a flight is not met well enough to be polished at once."""
-AGREE = 0.01
-"""Starts whose losses differ by less than this share have reached the same minimum."""
-INSIDE = 0.02
+FAR_OFF_RATIO = 3.0
+"""Residuals over noise beyond which a flight is too far off for a polish before terms are tried."""
+SAME_MINIMUM_TOLERANCE = 0.01
+"""Relative difference of losses below which starts have reached the same minimum."""
+BOUND_MARGIN = 0.02
 """Share of its range by which a start keeps away from a bound."""
-LAST_TWO, LAST, ROUGHLY = slice(-2, None), slice(-1, None), slice(-2, -1)
-"""Stages: polish and polish again, the latter alone where the weights are known, or the former."""
-ROUGH = 1e-3
+BOTH_POLISHES, LAST_POLISH, FIRST_POLISH = slice(-2, None), slice(-1, None), slice(-2, -1)
+"""Stages of a refit: the first polish finds the weights of the last."""
+ROUGH_TOLERANCE = 1e-3
 """Share of the loss that a rough fit leaves to a linear step: a tenth of a term's least gain."""
 
 OnProgress = Callable[[Job, Progress], None]
@@ -151,9 +151,9 @@ def search(
     findings: tuple[Finding, ...] = (),
     provisional: bool = False,
 ) -> Fitted:
-    """Look for the best coefficients of a job.
+    """Search for the best coefficients of a job.
 
-    With the method ``auto``, least squares is followed by ``hybrid`` where its end is doubtful.
+    With the method ``auto``, ``hybrid`` follows least squares where its end is doubtful.
 
     Parameters
     ----------
@@ -166,10 +166,10 @@ def search(
     on_progress
         Called after every iteration.
     findings
-        Of the check before the search, to be handed on.
+        Findings of the check before the search, kept in the result.
     provisional
         Whether to end before the polish where most flights are still far off: the model may lack
-        something, and the search can be gone on with.
+        terms. The search can be resumed.
 
     Raises
     ------
@@ -200,9 +200,9 @@ def search(
 
 
 def _doubt(job: Job, fitted: Fitted) -> Finding | None:
-    """Return why the end of least squares is doubtful, if it is."""
+    """Return the finding that the end of least squares is doubtful, if it is."""
     losses = np.array([np.inf if end.loss is None else end.loss for end in fitted.outcomes])
-    if len(losses) > 2 and (losses < (1.0 + AGREE) * losses.min()).sum() < 2:
+    if len(losses) > 2 and (losses < (1.0 + SAME_MINIMUM_TOLERANCE) * losses.min()).sum() < 2:
         return Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": len(losses)})
     lost = unmatched(fitted.scales)
     if all(INLETS[inlet].closed_loop for inlet in job.inlets) and len(lost) > len(job.fitted) / 2:
@@ -212,13 +212,13 @@ def _doubt(job: Job, fitted: Fitted) -> Finding | None:
 
 
 def _is_far_off(progress: Progress) -> bool:
-    """Return whether most flights are met much worse than noise would have it, by some channel."""
+    """Return whether a channel of most flights has residuals far above the noise."""
     worst = np.max(list(progress.scales.values()), axis=0)
-    return bool(np.median(worst) > FAR_OFF)
+    return bool(np.median(worst) > FAR_OFF_RATIO)
 
 
 def _misfit(fitted: Fitted) -> float:
-    """Return how far all channels of all flights are met, each by its own noise."""
+    """Return the mean logarithm of residuals over noise, of all channels of all flights."""
     return float(np.mean([np.log(s) for scale in fitted.scales.values() for s in scale.values()]))
 
 
@@ -232,13 +232,13 @@ def _attempt(
     findings: tuple[Finding, ...],
     provisional: bool,
 ) -> Fitted:
-    """Run one method from the starts, or from where its checkpoint stands."""
+    """Run one method from the starts, or from its checkpoint."""
     key, starts = fingerprint(job), starting_vectors(job)
     stages = stages_of(job, job.objective, method)
-    if job.windows is not None:  # flights that windows prepare are flown whole at once
+    if job.windows is not None:  # windows replace the stages of short horizons
         stages = tuple(stage for stage in stages if stage.horizon == job.objective.samples)
     free = Free(np.ones(len(job.space), bool), free_offsets(job))
-    start, spent = beginning(job.objective, starts), 0.0
+    start, spent = initial_progress(job.objective, starts), 0.0
     progress = start
     if resume:
         progress, spent = load(checkpoint, key, start)
@@ -247,12 +247,12 @@ def _attempt(
     def keep(progress: Progress) -> None:
         seconds = time.perf_counter() - began
         save(checkpoint, key, progress, seconds)
-        remaining = left(stages, progress.stage, progress.steps, seconds)
+        remaining = remaining_seconds(stages, progress.stage, progress.steps, seconds)
         on_progress(job, replace(progress, left=remaining))
 
     if job.windows is not None and not resume:
-        progress = beginning(job.objective, _through_windows(job, starts, free))
-    progress = grow(
+        progress = initial_progress(job.objective, _through_windows(job, starts, free))
+    progress = run_stages(
         job.objective,
         stages,
         progress,
@@ -286,7 +286,7 @@ def _attempt(
 
 
 def _end(job: Job, objective: Objective, stage: Stage, progress: Progress) -> dict[str, Any]:
-    """Return what a `Fitted` says of where a search ended in a last stage."""
+    """Return the fields of a `Fitted` at the end of a search's last stage."""
     best = int(np.argmin(progress.losses))
     point = point_of(progress.points, best)
     return {
@@ -315,12 +315,12 @@ def stages_of(job: Job, objective: Objective, method: str = "gradient") -> tuple
 
 
 def _through_windows(job: Job, starts: Array, free: Free) -> Array:
-    """Return where windows lead each start (S, K), for flights that do not begin gently."""
+    """Return the starts (S, K) after a search in windows, for flights that do not begin gently."""
     assert job.windows is not None
-    progress = grow(
+    progress = run_stages(
         job.windows,
         stages_of(job, job.windows)[:-1],
-        beginning(job.windows, starts),
+        initial_progress(job.windows, starts),
         free=free,
         undecided={},
         on_progress=lambda _: None,
@@ -331,8 +331,7 @@ def _through_windows(job: Job, starts: Array, free: Free) -> Array:
 def free_offsets(job: Job) -> NDArray[np.bool_]:
     """Return (offsets, N) which offsets of which flight are fitted.
 
-    What enters below the reference does so on the flight controller's clock, which then is the
-    simulation's own.
+    Inputs below the reference have the flight controller's stamps, which are then the simulation's.
     """
     free = np.ones((len(job.objective.of_flight), len(job.fitted)), bool)
     known = [r.time_offset is not None for r in job.recordings if not r.holdout]
@@ -357,7 +356,7 @@ def starting_vectors(job: Job) -> Array:
     centre, width = space.share(first), space.width
     reach = np.where(space.is_log, np.log(settings.spread), space.prior_sd) / width
     drawn = generator.uniform(-1.0, 1.0, (settings.starts - 1, len(space)))
-    shares = np.clip(centre + drawn * reach, INSIDE, 1.0 - INSIDE)
+    shares = np.clip(centre + drawn * reach, BOUND_MARGIN, 1.0 - BOUND_MARGIN)
     return np.vstack([first, space.at_share(shares)])
 
 
@@ -368,7 +367,7 @@ def polished(
     free: Free,
     title: str,
     on_progress: Callable[[Progress], None],
-    stages: slice = LAST_TWO,
+    stages: slice = BOTH_POLISHES,
     left: float | None = None,
 ) -> Fitted:
     """Return a fit polished again, by the last stages from its point.
@@ -382,18 +381,18 @@ def polished(
     free
         What may move.
     title
-        What stands before the stages' names in messages.
+        Prefix of the stages' names in messages.
     on_progress
         Called after every iteration.
     stages
-        Which of the stages: of the last two the first weighs what the second polishes.
+        Which of the stages to run.
     left
-        Share of the loss that may be left to gain: a rough fit.
+        Share of the loss that may be left to gain, for a rough fit.
     """
     names, point = [flight.name for flight in job.fitted], fitted.point
     last = fitted.iterations[-1].damping if fitted.iterations else None
     progress = replace(
-        beginning(fitted.objective, point.coefficients[None]),
+        initial_progress(fitted.objective, point.coefficients[None]),
         points=Point(point.coefficients[None], point.offsets[None]),
         scales={
             channel: np.array([fitted.scales[name][channel] for name in names])
@@ -403,9 +402,9 @@ def polished(
         losses=np.array([fitted.loss_best]),
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
-        damping=np.array([np.clip(last, LEAST_DAMPING, 1.0) if last else 1.0]),
+        damping=np.array([np.clip(last, MIN_DAMPING, 1.0) if last else 1.0]),
     )
-    return _grown(
+    return _run_again(
         job,
         fitted,
         progress,
@@ -417,7 +416,7 @@ def polished(
     )
 
 
-def searched_again(
+def search_again(
     job: Job,
     fitted: Fitted,
     vector: Array,
@@ -426,25 +425,23 @@ def searched_again(
     title: str,
     on_progress: Callable[[Progress], None],
 ) -> Fitted:
-    """Return a fit searched for again by all stages from a start vector (K,).
+    """Return a rough fit by all stages but the last polish, from a start vector (K,).
 
-    The other arguments are those of `polished`. What terms that were missing did to a fit, a
-    coefficient at its bound say, is forgotten that way; what is undecided of the loop, too, is
-    tried both ways again. The fit is rough: the last polish is left to one of what proves to be
-    needed.
+    The other arguments are those of `polished`. A search from the start forgets the bias by missing
+    terms, such as a coefficient at its bound; the loop's choices are tried both ways again.
     """
     progress = replace(
-        beginning(fitted.objective, vector[None]),
+        initial_progress(fitted.objective, vector[None]),
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
         loop=loop_of(job.objective),
     )
     *stages, polish, _ = stages_of(job, fitted.objective)
-    return _grown(
+    return _run_again(
         job,
         fitted,
         progress,
-        (*stages, _rough(polish, ROUGH)),
+        (*stages, _rough(polish, ROUGH_TOLERANCE)),
         free=free,
         undecided=job.undecided(fitted.objective),
         title=title,
@@ -458,7 +455,7 @@ def _rough(stage: Stage, left: float | None) -> Stage:
     return replace(stage, tolerance=max(stage.tolerance, left), rough=True)
 
 
-def _grown(
+def _run_again(
     job: Job,
     fitted: Fitted,
     progress: Progress,
@@ -470,7 +467,7 @@ def _grown(
     on_progress: Callable[[Progress], None],
 ) -> Fitted:
     stages = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in stages)
-    progress = grow(
+    progress = run_stages(
         fitted.objective, stages, progress, free=free, undecided=undecided, on_progress=on_progress
     )
     return replace(fitted, **_end(job, fitted.objective, stages[-1], progress), polished=True)

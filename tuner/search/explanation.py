@@ -1,4 +1,4 @@
-"""What explains a fit: findings, each told once, and parts that may fail without the rest."""
+"""The findings of a fit, each reported once, and parts of a run that may fail by themselves."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class Explanation:
-    """What is computed of a fit once it is found, and what is noticed on the way.
+    """Findings of a fit, and parts of its examination.
 
     Parameters
     ----------
@@ -26,19 +26,19 @@ class Explanation:
     Attributes
     ----------
     findings
-        Those that came up after the search.
+        Findings after the search.
     """
 
     def __init__(self, on_message: Callable[[str], None]) -> None:
         self._on_message = on_message
-        self._told: list[Finding] = []
+        self._reported: list[Finding] = []
         self.findings: tuple[Finding, ...] = ()
 
     def tell(self, findings: Sequence[Finding]) -> None:
-        """Report findings, all but those that already were."""
+        """Report findings that were not reported yet."""
         for finding in findings:
-            if finding not in self._told:
-                self._told.append(finding)
+            if finding not in self._reported:
+                self._reported.append(finding)
                 self._on_message(one_line(finding))
 
     def notice(self, findings: Sequence[Finding]) -> None:
@@ -46,17 +46,17 @@ class Explanation:
         self.tell(findings)
         self.findings = (*self.findings, *findings)
 
-    def part(self, name: str, compute: Callable[[], T], otherwise: T) -> T:
-        """Return what a part comes to, or something else where it fails, which is a finding.
+    def part(self, name: str, compute: Callable[[], T], fallback: T) -> T:
+        """Return the result of a part, or a fallback and a finding where it fails.
 
         Parameters
         ----------
         name
-            Of the part, as a user and a profile read it.
+            Name of the part in messages and profiles.
         compute
-            Computes it.
-        otherwise
-            What a run goes on with where that fails.
+            Computes the result.
+        fallback
+            Returned where that fails.
 
         Raises
         ------
@@ -72,4 +72,4 @@ class Explanation:
             logger.error("%s failed", name, exc_info=error)
             names = (type(error).__name__, " ".join(str(error).split())[:200])
             self.notice([Finding(Code.PART_FAILED, "warning", name, names=names)])
-            return otherwise
+            return fallback

@@ -1,4 +1,4 @@
-"""What a finished search noticed that a user should know before believing a number."""
+"""Findings of a finished search about set-up, flights, clocks and inputs."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.problem import Job
-from tuner.search.progress import COLOURED, Fitted, Loop, loop_of
+from tuner.search.progress import COLOURED_RATIO, Fitted, Loop, loop_of
 from tuner.vehicle import VehicleFile
 
-UNMATCHED = 10.0
-"""Multiple of the noise beyond which a channel counts as not matched."""
-EXPLAINED = 0.9
-"""Share of the turning below which moments of inertia are said to be effective ones."""
-LATE = 1e-3
-"""s of an input's lateness from which it is said."""
-ODD = 3.0
-"""A flight this many times further off than the middle one is the odd one out."""
+UNMATCHED_RATIO = 10.0
+"""Residuals over noise above which a channel is not matched."""
+MIN_TURNING_EXPLAINED = 0.9
+"""Explained share of the turning below which moments of inertia are reported as effective ones."""
+MIN_REPORTED_LATENESS_S = 1e-3
+"""Least lateness of an input that is reported."""
+OUTLIER_RATIO = 3.0
+"""Residuals over those of the median flight above which a flight is an outlier."""
 
 Scales = Mapping[str, Mapping[str, float]]
 
@@ -35,25 +35,25 @@ def unmatched(scales: Scales) -> dict[str, dict[str, float]]:
     """
     lost = {}
     for flight, channels in scales.items():
-        bad = {name: value for name, value in channels.items() if value > UNMATCHED}
+        bad = {name: value for name, value in channels.items() if value > UNMATCHED_RATIO}
         if len(bad) > len(channels) / 2:
             lost[flight] = bad
     return lost
 
 
-def odd_flights(scales: Scales) -> frozenset[str]:
-    """Return the flights that are not matched while all others are, to the noise.
+def outlying_flights(scales: Scales) -> frozenset[str]:
+    """Return the flights that are not matched while all others are matched to the noise.
 
-    Another vehicle flew them, or something disturbed them alone: what is missing there is missing
-    in none of the others. Scales are those of `unmatched`.
+    Another vehicle flew them, or something disturbed them alone: the model's errors there are in
+    none of the others. Scales are those of `unmatched`.
     """
     lost = unmatched(scales)
     others = [max(channels.values()) for name, channels in scales.items() if name not in lost]
-    return frozenset(lost if len(lost) < len(others) and max(others) < COLOURED else ())
+    return frozenset(lost if len(lost) < len(others) and max(others) < COLOURED_RATIO else ())
 
 
 def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:
-    """Return what a fit shows about the set-up, the flights, their clocks and their gyros."""
+    """Return a fit's findings on the set-up, the flights, their clocks and their gyros."""
     findings = [*end_findings(job, loop_of(fitted.objective), fitted.scales)]
     offsets = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
     for number, flight in enumerate(job.fitted):
@@ -68,21 +68,21 @@ def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:
 
 
 def end_findings(job: Job, loop: Loop, scales: Scales) -> tuple[Finding, ...]:
-    """Return what the end of a search shows about the set-up and the flights.
+    """Return the findings on set-up and flights at the end of a search.
 
     Parameters
     ----------
     job
-        What was searched.
+        The problem.
     loop
-        How the loop flies with which the search ended.
+        The loop's choices at the end.
     scales
         As of `unmatched`.
     """
     findings = list(loop_findings(job, loop, "warning"))
     lost = unmatched(scales)
     typical = float(np.median([_size(channels) for channels in scales.values()]))
-    alone = {name for name in lost if _size(scales[name]) > ODD * typical}
+    alone = {name for name in lost if _size(scales[name]) > OUTLIER_RATIO * typical}
     findings += [
         Finding(Code.FLIGHT_UNMATCHED, "warning", name, lost[name]) for name in sorted(alone)
     ]
@@ -94,7 +94,7 @@ def end_findings(job: Job, loop: Loop, scales: Scales) -> tuple[Finding, ...]:
 
 
 def loop_findings(job: Job, loop: Loop, level: Level) -> Iterator[Finding]:
-    """Return in what the recordings contradict the controller file."""
+    """Return the choices in which the recordings contradict the controller file."""
     controller = job.settings.controller
     if loop.saturation_feedback != float(controller.mixer.saturation_feedback):
         numbers = {"feedback": loop.saturation_feedback}
@@ -103,42 +103,40 @@ def loop_findings(job: Job, loop: Loop, level: Level) -> Iterator[Finding]:
         yield Finding(Code.SEES_MARKERS, level, "sees_markers", {"seen": loop.sees_markers})
 
 
-def inputs_late(job: Job) -> tuple[Finding, ...]:
-    """Return which fitted flights' inputs are stamped late against their states."""
+def late_input_findings(job: Job) -> tuple[Finding, ...]:
+    """Return findings on fitted flights whose inputs are stamped later than their states."""
     return tuple(
         Finding(Code.INPUT_LATE, "info", r.flight.name, {"seconds": r.input_late})
         for r in job.recordings
-        if not r.holdout and abs(r.input_late) > LATE
+        if not r.holdout and abs(r.input_late) > MIN_REPORTED_LATENESS_S
     )
 
 
-def turning_unexplained(job: Job, explained: Mapping[str, float]) -> tuple[Finding, ...]:
+def turning_findings(job: Job, explained: Mapping[str, float]) -> tuple[Finding, ...]:
     """Warn where recorded inputs explain too little of how fitted flights turn.
 
-    Where no moment of inertia is fitted, as where attitudes are followed, there is nothing to warn
-    of.
-
-    Noise of the inputs, and the loop's own answer to what disturbs the vehicle, shrink the torque
-    that a fit finds behind an input, by up to the share that it explains (errors in variables).
+    Noise of the inputs, and the loop's response to disturbances, shrink the torque that a fit finds
+    per input, by up to the share that it explains (errors in variables). There is no warning where
+    no moment of inertia is fitted.
 
     Parameters
     ----------
     job
-        Which flights are fitted, and what is free.
+        Gives the fitted flights and the free coefficients.
     explained
-        Flight -> share of the squared change of body rate that is predicted.
+        Flight -> predicted share of the squared change of body rate.
     """
     of_fitted = [explained[flight.name] for flight in job.fitted if flight.name in explained]
     turns = any(name.startswith("inertia_") for name in job.space.names)
     share = float(np.median(of_fitted)) if of_fitted and turns else 1.0
-    if share >= EXPLAINED:
+    if share >= MIN_TURNING_EXPLAINED:
         return ()
     numbers = {"explained": share}
     return (Finding(Code.TURNING_UNEXPLAINED, "warning", "moments of inertia", numbers),)
 
 
-def voltage_taken(given: VehicleFile, best: VehicleFile) -> tuple[Finding, ...]:
-    """Tell at which voltage the motors' curve holds, where the vehicle file left that open."""
+def reference_voltage_findings(given: VehicleFile, best: VehicleFile) -> tuple[Finding, ...]:
+    """Return the finding on the reference voltage, where the vehicle file has none."""
     volts = best.battery.reference_voltage
     if given.battery.reference_voltage or not volts or not best.effects.get("battery_exponent"):
         return ()

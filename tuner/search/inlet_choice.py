@@ -1,4 +1,4 @@
-"""Which inlet a recording can bear: seen from the data, and said why."""
+"""The choice of a recording's inlet from its data, and the reason as a finding."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from tuner.equation_error.recorded_accelerations import Steps, rows_of, steps_of
 from tuner.equation_error.regression import convolved, summing
 from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.inlets import INLETS
-from tuner.objective.rotor_signals import Explained, Source, explained, levers, motor_order
+from tuner.objective.rotor_signals import Source, TorqueCorrelation, explained, levers, motor_order
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
 from tuner.recordings.flight import Flight
 from tuner.recordings.notes import NoteCode
 from tuner.vehicle import ControllerFile, VehicleFile
 
-AHEAD = 0.1
-"""s after which a predicted body rate is compared with the one that it began with."""
+PREDICTION_S = 0.1
+"""Time ahead for which a predicted body rate is compared with holding the current one."""
 
 
 def predicts_turning(flight: Flight, vehicle: VehicleFile) -> bool:
     """Return whether a regression on one half of a flight predicts the other better than holding.
 
-    Roll and pitch rate, `AHEAD` s later; the regression knows nothing but where rotors sit.
+    It predicts roll and pitch rate `PREDICTION_S` ahead, from rotor speeds and places alone.
     """
     steps = steps_of(flight)
     if steps is None:
@@ -41,16 +41,17 @@ def predicts_turning(flight: Flight, vehicle: VehicleFile) -> bool:
             weights = np.linalg.lstsq(columns[inside], turning[inside], rcond=None)[0]
             left = np.stack([turning - columns @ weights, turning], axis=1)[~fitted]
             squares += np.sum(
-                convolved(left, steps.known[~fitted], summing(steps.step, AHEAD)) ** 2, axis=0
+                convolved(left, steps.known[~fitted], summing(steps.step, PREDICTION_S)) ** 2,
+                axis=0,
             )
     return bool(squares[0] < squares[1])
 
 
 def regressors(steps: Steps, vehicle: VehicleFile) -> tuple[Array, Array, Array]:
-    """Return about x, y and z what angular acceleration is regressed on, (N, k).
+    """Return the regressors (N, k) of angular acceleration about x, y and z.
 
-    The rotors' torque up to a factor, air velocity across and body rate times the sum of the
-    rotors' speeds, and a steady part.
+    They are the rotors' torque up to a factor, air velocity across and body rate times the sum of
+    the rotors' speeds, and a constant.
     """
     speed, motion = steps.rotor_speed, steps.motion
     body = rows_of(motion.attitude.to_body(motion.velocity))
@@ -65,30 +66,29 @@ def regressors(steps: Steps, vehicle: VehicleFile) -> tuple[Array, Array, Array]
     return x, y, np.stack([torque[:, 2], rate[:, 2] * total, steady], axis=1)
 
 
-EXPLAINS = 0.15
-"""Correlation of torque and angular acceleration about roll and pitch from which a recording of the
-rotors can be fed into a simulation that turns: real 100 Hz logs of commands that fly well have 0.3
-to 0.5, one at 41 Hz of a faster loop has 0.0. Measured speeds may also explain it only together
-with what air does to rotors (`tuner.search.inlet_choice`)."""
+MIN_TORQUE_CORRELATION = 0.15
+"""Least correlation of torque and angular acceleration about roll and pitch of rotor signals that
+are fed in: real 100 Hz logs of good commands have 0.3 to 0.5, one at 41 Hz of a faster loop has 0.
+Measured speeds below it pass if they predict turning together with air velocity."""
 
 REFERENCE = ("reference_position", "reference_velocity", "reference_acceleration")
-DROPPED = (
+DROPPED_SAMPLES = (
     NoteCode.OUT_OF_RANGE,
     NoteCode.UNIT_UNKNOWN,
     NoteCode.NOT_A_NUMBER,
     NoteCode.OUTLIERS,
 )
-"""What reading says of samples that it dropped for their values."""
-FED_BY: dict[InletName, Source] = {"actuator": "command", "rotor_speed": "rotor_speed"}
-"""Inlet in which the simulated vehicle turns by what was recorded of its rotors -> that signal."""
+"""Notes of samples that the reader dropped for their values."""
+SIGNAL_OF_INLET: dict[InletName, Source] = {"actuator": "command", "rotor_speed": "rotor_speed"}
+"""Inlet at which recorded rotor signals turn the simulated vehicle -> that signal."""
 
 
 def choose_inlet(
     flight: Flight, requested: str, vehicle: VehicleFile, controller: ControllerFile
 ) -> tuple[InletName, Finding | None]:
-    """Return where a flight enters: as requested, or for ``auto`` as its recording can bear.
+    """Return the inlet of a flight: the requested one, or for ``auto`` the best for its recording.
 
-    And why it is not the most upstream place whose signals were recorded; None if it is.
+    And the finding why it is not the most upstream one whose signals were recorded; None if it is.
 
     Parameters
     ----------
@@ -97,12 +97,12 @@ def choose_inlet(
     requested
         An inlet's name, or ``auto``.
     vehicle, controller
-        Whose rotors turn it, and what commands them where the reference enters.
+        The vehicle's rotors, and the controller that commands them above the inlet.
 
     Raises
     ------
     RecordingError
-        The recording does not hold what the inlet needs.
+        The recording lacks signals that the inlet needs.
     """
     first = inlet_for(flight, requested)
     if requested == "auto" and first == "reference":
@@ -112,23 +112,23 @@ def choose_inlet(
                 return below, Finding(Code.PX4_LOOPS, "info", flight.name, names=(below,))
         match = match_setpoints(flight, controller)
         if match is not None and not match.is_ours:
-            (because,) = setpoint_findings(flight, controller)
+            (inlet_finding,) = setpoint_findings(flight, controller)
             below, _ = choose_inlet(_without_reference(flight), "auto", vehicle, controller)
-            return below, because
-    if requested != "auto" or first not in FED_BY:
+            return below, inlet_finding
+    if requested != "auto" or first not in SIGNAL_OF_INLET:
         return first, None
-    doubt: Explained | None = None
-    for name, source in FED_BY.items():
+    doubt: TorqueCorrelation | None = None
+    for name, source in SIGNAL_OF_INLET.items():
         if not INLETS[name].can_be_fed(flight):
             continue
-        told = explained(flight, vehicle, source)
+        correlation = explained(flight, vehicle, source)
         if (
-            told is None
-            or told.tilting >= EXPLAINS
+            correlation is None
+            or correlation.tilting >= MIN_TORQUE_CORRELATION
             or (source == "rotor_speed" and predicts_turning(flight, vehicle))
         ):
             return name, None if doubt is None else _finding(flight, name, doubt, vehicle)
-        doubt = doubt or told
+        doubt = doubt or correlation
     assert doubt is not None
     if not INLETS["attitude"].can_be_fed(flight):
         return first, None
@@ -139,8 +139,10 @@ def _without_reference(flight: Flight) -> Flight:
     return replace(flight, signals={n: s for n, s in flight.signals.items() if n not in REFERENCE})
 
 
-def _finding(flight: Flight, inlet: InletName, doubt: Explained, vehicle: VehicleFile) -> Finding:
-    """Return why a flight enters further down, and whether its motors are in another order."""
+def _finding(
+    flight: Flight, inlet: InletName, doubt: TorqueCorrelation, vehicle: VehicleFile
+) -> Finding:
+    """Return the finding on an inlet further down, and on motors in another order."""
     numbers = {
         "correlation": round(doubt.tilting, 2) + 0.0,
         "recorded": round(doubt.rate),
@@ -190,7 +192,10 @@ def inlet_for(flight: Flight, requested: str) -> InletName:
 def _dropped(flight: Flight, signals: Sequence[str]) -> str:
     """Return how many samples of some signals were dropped as corrupt, as a clause."""
     counts = [
-        (signal, sum(n.count for n in flight.notes if n.code in DROPPED and signal in n.names))
+        (
+            signal,
+            sum(n.count for n in flight.notes if n.code in DROPPED_SAMPLES and signal in n.names),
+        )
         for signal in signals
     ]
     parts = [f"{count} {name.replace('_', ' ')} samples" for name, count in counts if count]

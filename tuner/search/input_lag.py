@@ -1,10 +1,10 @@
-"""By how much recorded rotor speeds or commands are stamped later than the state they make.
+"""Lag of recorded rotor speeds or commands behind the accelerations that they cause.
 
-What disturbs a vehicle is answered by its loop with its rotors, and what the rotors do then goes
-with the turning that they answer: later, and against it. To a spectrum that is a lateness, and the
-slower the larger. So a lateness that spectra show is believed only if the innovations of the same
-regression say so too: the part of each acceleration that those before it do not predict, of which
-no answer is (`tuner.equation_error.regression`).
+The loop responds to a disturbance with the rotors: their speeds correlate with the turning that
+they oppose, later. In spectra that looks like a lag, the larger the slower. So a lag found from
+spectra is accepted only if the innovations of the same regression confirm it: the part of each
+acceleration that earlier ones do not predict, which holds no response
+(`tuner.equation_error.regression`).
 """
 
 from __future__ import annotations
@@ -26,41 +26,38 @@ from tuner.search.inlet_choice import regressors
 from tuner.search.job_flights import Recording
 from tuner.vehicle import VehicleFile
 
-BAND = (0.7, 8.0)
-"""Hz between which accelerations are compared."""
-GRID = np.arange(-24, 25) * 0.0025
-"""s of lateness that are tried: five samples at 100 Hz, and as much again for a rotor's lag."""
-KNOWN = 0.003
-"""s of standard deviation up to which a lateness is believed."""
-SURE = 2.81
-"""Standard deviations that a lateness must differ by: by chance one flight of 200 does."""
-ENDS = 10
-"""Ticks at either end of a flight, where its derivatives are worse."""
-ROUNDS = 3
-"""In which a regression and the filter of its errors are found in turn."""
-INDEPENDENT = 3.0
-"""Neighbouring frequencies that say the same, on average: the taper and the filter join them."""
+BAND_HZ = (0.7, 8.0)
+"""Frequencies at which accelerations are compared."""
+LAGS_S = np.arange(-24, 25) * 0.0025
+"""Lags that are tried: five samples at 100 Hz, and as much again for a rotor's lag."""
+MAX_LAG_SD_S = 0.003
+"""Largest standard deviation of a lag that is used."""
+SIGNIFICANT_SD = 2.81
+"""Standard deviations from zero of a significant lag: one flight of 200 has that by chance."""
+TRIMMED_SAMPLES = 10
+"""Samples at either end of a flight that are left out: their derivatives are worse."""
+WHITENING_ROUNDS = 3
+"""Rounds of regression and whitening filter (Cochrane and Orcutt)."""
+CORRELATED_FREQUENCIES = 3.0
+"""Mean number of correlated neighbouring frequencies, by the taper and the filter."""
 
 Spectrum = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
 class Lag:
-    """A lateness and its standard deviation, in s."""
+    """A lag and its standard deviation, in s."""
 
     seconds: float
     sd: float
 
 
-def with_inputs_on_time(
-    recordings: Sequence[Recording], vehicle: VehicleFile
-) -> tuple[Recording, ...]:
-    """Return recordings with the lateness of what is fed in, where it can be told.
+def with_input_lags(recordings: Sequence[Recording], vehicle: VehicleFile) -> tuple[Recording, ...]:
+    """Return recordings with the lags of their inputs, where they can be estimated.
 
-    Rotor speeds are late by themselves, unless that may be chance, or the loop's answer to what
-    disturbs the vehicle; commands are by what their flight's lateness differs from the flights'
-    mean, which is the vehicle's own lag. A flight that does not tell has the mean of the others,
-    and so have flights that are held out: nothing is fitted to them.
+    Rotor speeds have the lag itself, if it is significant and no response of the loop. Commands
+    have their flight's lag less the flights' mean, which is the vehicle's own. Flights without an
+    estimate, and held-out ones, have the mean of the others.
     """
     late: dict[str, float] = {}
     for inlet in {recording.inlet for recording in recordings}:
@@ -91,21 +88,22 @@ def with_inputs_on_time(
 
 
 def _is_late(flight: Flight, vehicle: VehicleFile, lag: Lag) -> bool:
-    """Return whether rotor speeds are stamped late or early, chance and answers apart.
+    """Return whether a lag of rotor speeds is significant, and confirmed by innovations.
 
-    Innovations are those of steps, within which rotors answer, too: less of a lateness may be what
-    they like, none, or a part of it. Then it is not believed.
+    Rotors respond within a step, too: a lag is not confirmed where none or half of it is as likely.
     """
-    if abs(lag.seconds) <= SURE * lag.sd:
+    if abs(lag.seconds) <= SIGNIFICANT_SD * lag.sd:
         return False
-    late, *others = _of_turning(flight, vehicle, (lag.seconds, 0.5 * lag.seconds, 0.0))
-    return late - max(others) > 0.5 * SURE**2
+    late, *others = _turning_log_likelihoods(flight, vehicle, (lag.seconds, 0.5 * lag.seconds, 0.0))
+    return late - max(others) > 0.5 * SIGNIFICANT_SD**2
 
 
-def _of_turning(flight: Flight, vehicle: VehicleFile, at: Sequence[float]) -> list[float]:
-    """Return the log-likelihood of the turning's innovations at each of some latenesses in s.
+def _turning_log_likelihoods(
+    flight: Flight, vehicle: VehicleFile, at: Sequence[float]
+) -> list[float]:
+    """Return the log-likelihood of the innovations of angular accelerations at some lags in s.
 
-    Of the turning alone: the velocity, of which forces are, is filtered.
+    Forces are left out: the velocity that they come from is filtered.
     """
     rotors = flight.series["rotor_speed"]
     there = np.isfinite(rotors.values).all(axis=1)
@@ -118,7 +116,7 @@ def _of_turning(flight: Flight, vehicle: VehicleFile, at: Sequence[float]) -> li
     order = max(1, round(MEMORY / steps.step))
     new = [
         [
-            _innovation(steps.accelerations[:, 3 + axis], columns, known, order)
+            _innovation_variance(steps.accelerations[:, 3 + axis], columns, known, order)
             for axis, columns in enumerate(regressors(part, vehicle))
         ]
         for part in parts
@@ -126,27 +124,27 @@ def _of_turning(flight: Flight, vehicle: VehicleFile, at: Sequence[float]) -> li
     return [-0.5 * float(known.sum() * np.log(of_axes).sum()) for of_axes in new]
 
 
-def _innovation(answer: Array, columns: Array, known: Mask, order: int) -> float:
-    """Return the mean square of what is new in the errors of a regression."""
+def _innovation_variance(answer: Array, columns: Array, known: Mask, order: int) -> float:
+    """Return the mean square of the innovations of a regression's errors."""
     rows = np.column_stack([answer, columns])
     filtered = rows[known]
-    for _ in range(ROUNDS):
+    for _ in range(WHITENING_ROUNDS):
         weights = np.linalg.lstsq(filtered[:, 1:], filtered[:, 0], rcond=None)[0]
         kernel = whitening_filter(answer - columns @ weights, known, order)
         filtered = convolved(rows, known, kernel)
         if not len(filtered):  # gaps everywhere
             return 1.0
-    left, _ = _left(filtered[:, 1:], filtered[:, 0])
+    left, _ = _residual(filtered[:, 1:], filtered[:, 0])
     return left / len(filtered)
 
 
 def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
-    """Return by how much a flight's rotor speeds or commands are stamped later than its state.
+    """Return the lag of a flight's rotor speeds or commands behind its state.
 
     Parameters
     ----------
     flight
-        With a pose; the lateness counts from the stamps of its body rate.
+        A flight with a pose; the lag counts from the stamps of its body rate.
     signal
         ``rotor_speed`` or ``command``.
     vehicle
@@ -155,9 +153,9 @@ def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
     Returns
     -------
     Lag or None
-        None where the flight does not tell.
+        None where it cannot be estimated.
     """
-    clock = flight.time[ENDS:-ENDS]
+    clock = flight.time[TRIMMED_SAMPLES:-TRIMMED_SAMPLES]
     rows = flight.series[signal]
     if len(clock) < 200 or not np.isfinite(rows.values).any(axis=0).all():
         return None
@@ -192,11 +190,11 @@ def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
             for axis in range(4)
         ]
     )
-    return _peak(of_axes / INDEPENDENT)
+    return _likeliest_lag(of_axes / CORRELATED_FREQUENCIES)
 
 
 def _thrust_like(inputs: Array, signal: str, vehicle: VehicleFile) -> Array:
-    """Return what goes with the rotors' thrust (n, 4)."""
+    """Return the rotors' thrust (n, 4) up to a factor."""
     if signal == "command":
         motor = vehicle.motor
         inputs = motor.zero_position_armed + motor.input_scaling * inputs
@@ -204,9 +202,9 @@ def _thrust_like(inputs: Array, signal: str, vehicle: VehicleFile) -> Array:
 
 
 def _likelihoods(answer: Array, driven: Array, damping: Array, rate: float) -> Array:
-    """Return the log-likelihood of every lateness of `GRID` for one axis."""
+    """Return the log-likelihood of every lag of `LAGS_S` for one axis."""
     frequency = np.fft.rfftfreq(len(answer), 1.0 / rate)
-    inside = (frequency > BAND[0]) & (frequency < BAND[1])
+    inside = (frequency > BAND_HZ[0]) & (frequency < BAND_HZ[1])
     taper = np.hanning(len(answer))[:, None]
 
     def spectrum(columns: Array) -> Spectrum:
@@ -216,16 +214,16 @@ def _likelihoods(answer: Array, driven: Array, damping: Array, rate: float) -> A
 
     there, moved = _real(spectrum(answer[:, None]))[:, 0], spectrum(driven[:, None])
     others, turn = _real(spectrum(damping)), 2j * np.pi * frequency[inside][:, None]
-    left, _ = _left(others, there)
+    left, _ = _residual(others, there)
     gains = []
-    for late in GRID:
-        remains, weight = _left(np.hstack([others, _real(moved * np.exp(turn * late))]), there)
+    for late in LAGS_S:
+        remains, weight = _residual(np.hstack([others, _real(moved * np.exp(turn * late))]), there)
         gains.append(inside.sum() * np.log(left / remains) if weight > 0 else 0.0)
     return np.array(gains)
 
 
-def _left(matrix: Array, there: Array) -> tuple[float, float]:
-    """Return the sum of squares that is left of a column, and the last regressor's weight."""
+def _residual(matrix: Array, there: Array) -> tuple[float, float]:
+    """Return the residual sum of squares of a column, and the last regressor's weight."""
     weights = np.linalg.lstsq(matrix, there, rcond=None)[0]
     return float(np.sum((there - matrix @ weights) ** 2)), float(weights[-1])
 
@@ -234,27 +232,22 @@ def _real(columns: Spectrum) -> Array:
     return np.concatenate([columns.real, columns.imag])
 
 
-def _peak(of_axes: Array) -> Lag | None:
-    """Return the likeliest lateness of all axes, by the parabola through the peak of their sum.
+def _likeliest_lag(of_axes: Array) -> Lag | None:
+    """Return the likeliest lag of all axes, by the parabola through the peak of their sum.
 
-    None for no sharp one. Where the axes contradict each other by more than chance, its standard
-    deviation grows by Birge's ratio.
-
-    Parameters
-    ----------
-    of_axes
-        (axes, latenesses) log-likelihoods.
+    None for no sharp peak. Where the axes contradict each other by more than chance, the standard
+    deviation grows by Birge's ratio. ``of_axes`` (axes, lags) are log-likelihoods.
     """
     likelihood = of_axes.sum(axis=0)
     at = int(np.argmax(likelihood))
-    if at in (0, len(GRID) - 1):
+    if at in (0, len(LAGS_S) - 1):
         return None
     before, top, after = likelihood[at - 1 : at + 2]
-    bend, step = before - 2.0 * top + after, float(GRID[1] - GRID[0])
+    bend, step = before - 2.0 * top + after, float(LAGS_S[1] - LAGS_S[0])
     if bend >= 0.0:
         return None
     fallen = 2.0 * np.sum(of_axes.max(axis=1) - of_axes[:, at])
     birge = np.sqrt(max(fallen / (len(of_axes) - 1), 1.0))
     sd = birge * step / np.sqrt(-bend)
-    place = float(GRID[at] + 0.5 * (before - after) / bend * step)
-    return Lag(place, float(sd)) if sd < KNOWN else None
+    place = float(LAGS_S[at] + 0.5 * (before - after) / bend * step)
+    return Lag(place, float(sd)) if sd < MAX_LAG_SD_S else None

@@ -1,4 +1,4 @@
-"""What is told of a search: its steps, where its starts ended, and what it estimates."""
+"""Records of a search: its iterations, the ends of its starts, and its estimates."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Iteration(Part):
 
 
 class Outcome(Part):
-    """Where one start of a search ended.
+    """The end of one start of a search.
 
     Attributes
     ----------

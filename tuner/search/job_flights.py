@@ -1,8 +1,4 @@
-"""Which flights a job uses, where each enters the simulated loop, and how late its clocks are.
-
-All commands take their flights from here: the fit, the comparison, the sensitivity, the export's
-check and the cross-validation.
-"""
+"""The flights of a job with their inlets, clock offsets and holdout, for all commands."""
 
 from __future__ import annotations
 
@@ -33,13 +29,13 @@ from tuner.recordings.frames import contradiction_in
 from tuner.recordings.loader import InertialFlight, load_flights, read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import parameters_of
-from tuner.search.inlet_choice import FED_BY, choose_inlet
+from tuner.search.inlet_choice import SIGNAL_OF_INLET, choose_inlet
 from tuner.vehicle.controller import PLACES, with_parameters
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A flight, and what a job does with it.
+    """A flight with its settings in a job.
 
     Attributes
     ----------
@@ -52,11 +48,11 @@ class Recording:
     holdout
         Whether it is evaluated and never fitted.
     conditions
-        What surrounded it, of `tuner.vehicle.conditions`, as far as that is known.
-    because
-        Why it does not enter at the most upstream place whose signals were recorded.
+        Known values of its `tuner.vehicle.conditions`.
+    inlet_finding
+        Why its inlet is not the most upstream one whose signals were recorded; None if it is.
     input_late
-        s by which what is fed in is stamped later than the recorded state.
+        s by which its inputs are stamped later than its recorded state.
     """
 
     flight: Flight
@@ -64,18 +60,12 @@ class Recording:
     time_offset: float | None = 0.0
     holdout: bool = False
     conditions: Mapping[str, float] = field(default_factory=dict)
-    because: Finding | None = None
+    inlet_finding: Finding | None = None
     input_late: float = 0.0
 
 
-def as_logged(settings: Settings) -> tuple[Settings, tuple[Finding, ...]]:
-    """Return settings with the rate loop that PX4 logs among the flights tell by their parameters.
-
-    Returns
-    -------
-    tuple
-        The settings, and what the controller file had.
-    """
+def with_logged_parameters(settings: Settings) -> tuple[Settings, tuple[Finding, ...]]:
+    """Return settings with the rate loop of the parameters in PX4 logs, and findings on changes."""
     logs = {path: parameters for path in settings.flights if (parameters := parameters_of(path))}
     if not logs:
         return settings, ()
@@ -96,28 +86,26 @@ def as_logged(settings: Settings) -> tuple[Settings, tuple[Finding, ...]]:
     return changed, tuple(findings)
 
 
-def read_usable(
+def read_recordings(
     settings: Settings, *, holdout: Sequence[str] | None = None, fits: bool = True
 ) -> tuple[tuple[Recording, ...], tuple[Finding, ...]]:
-    """Read every mission of the settled files that can be simulated, and name the others.
-
-    Each is assigned what the job file says of it.
+    """Read every mission of a job's files that can be simulated, with findings on the others.
 
     Parameters
     ----------
     settings
-        Of the job.
+        Settings of the job.
     holdout
         Names of the flights that are held out; None takes the job's.
     fits
-        Whether one that is not held out has to be left.
+        Whether at least one flight must remain to fit.
 
     Returns
     -------
     tuple
-        The recordings, and a finding for each that is left out because it cannot be read, because
-        nothing flies in it, because it contradicts itself, or because it does not hold what its
-        inlet needs, and for each that enters further down than its signals would let it.
+        The recordings, and a finding for each flight that is left out because it cannot be read,
+        nothing flies in it, it contradicts itself, or it lacks signals of its inlet, and for each
+        that enters further down than its signals allow.
 
     Raises
     ------
@@ -135,7 +123,7 @@ def read_usable(
             if not exists(path):
                 raise
             left_out.append((path.stem, error))
-    flights, passed_over = _chosen(flights)
+    flights, passed_over = _fitted_manoeuvres(flights)
     names = [*(flight.name for flight in flights), *(name for name, _ in left_out)]
     for name in job.holdout:
         if name not in names:
@@ -145,23 +133,27 @@ def read_usable(
     for flight in flights:
         try:
             known = _with_reference(flight, settings)
-            recordings.append(_assigned(settings, known, flight.name in held_out))
+            recordings.append(_recording_of(settings, known, flight.name in held_out))
         except RecordingError as error:
             left_out.append((flight.name, error))
     none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
     if left_out and (not recordings or (fits and none_to_fit)):
         raise left_out[0][1]
-    recordings = [_as_fitted(recording, recordings, settings) for recording in recordings]
-    chosen = (recording.because for recording in recordings if recording.because is not None)
+    recordings = [
+        _with_inlet_of_fitted(recording, recordings, settings) for recording in recordings
+    ]
+    chosen = (
+        recording.inlet_finding for recording in recordings if recording.inlet_finding is not None
+    )
     return tuple(recordings), (
         *passed_over,
-        *(left_out_of(name, error) for name, error in left_out),
+        *(left_out_finding(name, error) for name, error in left_out),
         *chosen,
     )
 
 
-def _chosen(flights: Sequence[Flight]) -> tuple[list[Flight], list[Finding]]:
-    """Return the flights without the manoeuvres of long recordings that are not fitted."""
+def _fitted_manoeuvres(flights: Sequence[Flight]) -> tuple[list[Flight], list[Finding]]:
+    """Return the flights without unselected manoeuvres of long recordings, and findings."""
     chosen = {
         flight.name
         for flight in flights
@@ -177,46 +169,45 @@ def _chosen(flights: Sequence[Flight]) -> tuple[list[Flight], list[Finding]]:
     return [flight for flight in flights if flight.name in chosen], findings
 
 
-def left_out_of(name: str, error: RecordingError) -> Finding:
-    """Return the finding that a flight takes no part, and why."""
+def left_out_finding(name: str, error: RecordingError) -> Finding:
+    """Return the finding that a flight is left out, and why."""
     return Finding(Code.LEFT_OUT, "warning", name, names=(error.what, error.remedy))
 
 
 def recordings_of(
     settings: Settings, flights: Iterable[Flight], *, holdout: Sequence[str] | None = None
 ) -> tuple[Recording, ...]:
-    """Assign flights the inlet, the clock offset and the part that a job's settings give them.
+    """Return flights with the inlet, clock offset and holdout of a job's settings.
 
     Parameters
     ----------
     settings, holdout
-        As of `read_usable`.
+        As of `read_recordings`.
     flights
         With a reference where one is named.
 
     Raises
     ------
     RecordingError
-        A flight contradicts itself, or does not hold what its inlet needs, or hardly ever all of it
-        together.
+        A flight contradicts itself, or lacks signals of its inlet, or has too few of them together.
     ConfigError
-        The vehicle has rotors that the mixer above an inlet cannot fly.
+        The mixer above an inlet cannot fly the vehicle's rotors.
     """
     held_out = settings.job.holdout if holdout is None else holdout
-    return tuple(_assigned(settings, flight, flight.name in held_out) for flight in flights)
+    return tuple(_recording_of(settings, flight, flight.name in held_out) for flight in flights)
 
 
 def with_known(
     recordings: Sequence[Recording], **known: Mapping[str, Any]
 ) -> tuple[Recording, ...]:
-    """Return recordings of which more is known: a `Recording`'s field = flight name -> value."""
+    """Return recordings with fields replaced: a `Recording`'s field = flight name -> value."""
     return tuple(
         replace(r, **{field: of_flight[r.flight.name] for field, of_flight in known.items()})
         for r in recordings
     )
 
 
-def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
+def _recording_of(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     job, flight_settings = settings.job, settings.job.flights.get(flight.name)
     inlet, offset = job.inlet, job.time_offset
     if flight_settings is not None:
@@ -238,34 +229,34 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
         )
     flight = flight_in_rotor_order(flight, settings.vehicle)
     flight = with_speeds_in_si(with_commands(flight, settings.vehicle), settings.vehicle)
-    chosen, because = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
+    chosen, inlet_finding = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
     if not INLETS[chosen].closed_loop:
         seconds = window_seconds([chosen], job.search.window)
         require_windows(flight, seconds, INLETS[chosen].fed(flight))
     late = None if offset == "free" else float(offset)
-    return Recording(flight, chosen, late, holdout, because=because)
+    return Recording(flight, chosen, late, holdout, inlet_finding=inlet_finding)
 
 
-def _as_fitted(
+def _with_inlet_of_fitted(
     recording: Recording, recordings: Sequence[Recording], settings: Settings
 ) -> Recording:
-    """Return a held-out flight with its attitude followed where that of all fitted ones is.
+    """Return a held-out flight with the attitude inlet where all fitted ones have it.
 
-    Nothing would be fitted of how it turns.
+    Otherwise its turning would be simulated with coefficients that nothing was fitted to.
     """
     job, flight = settings.job, recording.flight
     own = job.flights.get(flight.name)
     asked = (None if own is None else own.inlet) or job.inlet
     fitted = {other.inlet for other in recordings if not other.holdout}
-    turns = recording.inlet in FED_BY and fitted == {"attitude"}
+    turns = recording.inlet in SIGNAL_OF_INLET and fitted == {"attitude"}
     if not (recording.holdout and asked == "auto" and turns):
         return recording
     try:
         require_windows(flight, window_seconds(["attitude"], job.search.window), ("attitude",))
     except RecordingError:
         return recording
-    because = Finding(Code.ATTITUDE_FOLLOWED, "info", flight.name, names=(recording.inlet,))
-    return replace(recording, inlet="attitude", because=because)
+    inlet_finding = Finding(Code.ATTITUDE_FOLLOWED, "info", flight.name, names=(recording.inlet,))
+    return replace(recording, inlet="attitude", inlet_finding=inlet_finding)
 
 
 def _with_reference(flight: Flight, settings: Settings) -> Flight:
@@ -279,10 +270,12 @@ def _with_reference(flight: Flight, settings: Settings) -> Flight:
     return flight
 
 
-def without_pose(settings: Settings) -> tuple[tuple[InertialFlight, ...], tuple[Finding, ...]]:
-    """Return the flights of a job, if none of its recordings holds a pose, and what is left out.
+def read_inertial_flights(
+    settings: Settings,
+) -> tuple[tuple[InertialFlight, ...], tuple[Finding, ...]]:
+    """Return the flights of a job if none of its recordings has a pose, and findings on others.
 
-    Where one does there are none: the others take no part (`tuner.recordings` names them).
+    There are none where one has a pose.
 
     Raises
     ------
@@ -308,4 +301,4 @@ def without_pose(settings: Settings) -> tuple[tuple[InertialFlight, ...], tuple[
         flights.append(flight)
     if left_out and not flights:
         raise left_out[0][1]
-    return tuple(flights), tuple(left_out_of(path.stem, error) for path, error in left_out)
+    return tuple(flights), tuple(left_out_finding(path.stem, error) for path, error in left_out)

@@ -1,4 +1,4 @@
-"""From settled options to the problem that is searched: flights, noise, segments."""
+"""The problem of a job: free coefficients, noise and objective of its recordings."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from tuner.search.job_flights import Recording
 from tuner.vehicle import conditions
 from tuner.vehicle.model import model_of, schedule_of
 
-#: What a yaw spin that is not held level is compared by: nothing holds its position, so that a gust
-#: or a tilt of a hundredth of a degree moves it by metres without meaning anything.
+#: Channels of a yaw spin that is not held level: nothing holds its position, so that a gust or a
+#: tilt of a hundredth of a degree moves it by metres.
 SPIN_CHANNELS = ("body_rate", "rotor_speed", "command")
 
-OVERLAP = 0.5
+WINDOW_STRIDE = 0.5
 """Share of a window after which the next one begins, where windows start as recorded."""
-CLIPPED = 0.005
+CLIPPED_COMMAND = 0.005
 """A recorded command below this is a rotor clipped low."""
 #: Closer to the simulator's floor than this, in m, a recording does not end at the floor.
-CLEARANCE = 0.3
+FLOOR_CLEARANCE_M = 0.3
 
 
 @dataclass(frozen=True)
 class Job:
-    """A problem and what it was made of.
+    """A problem with its settings and recordings.
 
     Attributes
     ----------
     settings
-        The user's.
+        Settings of the search.
     recordings
         The fitted ones, then those held out.
     noise
@@ -52,17 +52,17 @@ class Job:
     space
         Free coefficients.
     objective
-        What is searched: whole flights where all enter as reference, else windows.
+        The loss: of whole flights where all enter as reference, else of windows.
     windows
         The same flights in windows, searched first where one does not begin gently; None where
         all do.
     first_terms
         Groups of terms that are free from the beginning of the search.
-    asked
-        The user's settings, where others are searched with.
+    user_settings
+        The user's settings, if ``settings`` differ.
     accelerations
-        What a regression of the flights' accelerations said, where physical coefficients are its
-        (`tuner.job.accelerations`).
+        Estimates by regression of the flights' accelerations, if physical coefficients are taken
+        from it (`tuner.job.accelerations`).
     """
 
     settings: Settings
@@ -72,13 +72,13 @@ class Job:
     objective: Objective
     windows: Objective | None = None
     first_terms: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    asked: Settings | None = None
+    user_settings: Settings | None = None
     accelerations: Estimate | None = None
 
     @property
     def given(self) -> Settings:
         """The user's settings."""
-        return self.settings if self.asked is None else self.asked
+        return self.settings if self.user_settings is None else self.user_settings
 
     @property
     def flights(self) -> tuple[Flight, ...]:
@@ -96,10 +96,10 @@ class Job:
         return tuple(recording.inlet for recording in self.recordings if not recording.holdout)
 
     def undecided(self, objective: Objective) -> dict[str, NDArray[np.bool_]]:
-        """Return the choices of a `Loop` that matter to a problem of this job.
+        """Return the choices of a `Loop` that matter to a problem -> informative flights (N,).
 
-        And which of its N flights tell. Where no rotor was clipped nothing saturates, and where the
-        markers sit at the centre of mass and along the body's axes it is the same who sees them.
+        Nothing saturates where no rotor was clipped, and markers at the centre of mass and along
+        the body's axes make no difference.
         """
         marked = any(
             name.startswith("marker_")
@@ -107,12 +107,16 @@ class Job:
         )
         matters = {
             "saturation_feedback": [
-                flight.has("command") and bool((flight.signals["command"] < CLIPPED).any())
+                flight.has("command") and bool((flight.signals["command"] < CLIPPED_COMMAND).any())
                 for flight in self.fitted
             ],
             "sees_markers": [marked and INLETS[inlet].closed_loop for inlet in self.inlets],
         }
-        return {choice: np.array(tell) for choice, tell in matters.items() if any(tell)}
+        return {
+            choice: np.array(informative)
+            for choice, informative in matters.items()
+            if any(informative)
+        }
 
 
 def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
@@ -178,7 +182,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
 
     seconds = window_seconds(inlets, job.search.window)
     windows, free_starts = None, _free_starts(job.search.criterion, inlets)
-    stride = None if free_starts else OVERLAP * seconds
+    stride = None if free_starts else WINDOW_STRIDE * seconds
     if not closed or not all(begins_gently(flight) for flight in fitted):
         segments = window_segments(
             compared,
@@ -195,10 +199,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         windows = problem(segments, min(longest, seconds + 1.0 / fitted[0].rate), AIRBORNE)
     if closed:
         whole = segments_of(
-            compared,
-            noise=noise,
-            weights=_weights(settings, fitted, whole=True),
-            schedule=schedule,
+            compared, noise=noise, weights=_weights(settings, fitted, whole=True), schedule=schedule
         )
         objective = problem(whole, longest, limits_of(fitted))
         return Job(settings, recordings, noise, space, objective, windows)
@@ -207,12 +208,12 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
 
 
 def _free_starts(criterion: ErrorOf, inlets: Sequence[InletName]) -> bool:
-    """Return whether windows begin where the vehicle meets them best, or at recorded states.
+    """Return whether windows have free initial states, rather than recorded ones.
 
     Raises
     ------
     ConfigError
-        Predictions are asked for, and no recording holds all that they begin with.
+        Predictions are asked for, and the recordings lack some of the initial states.
     """
     if criterion == "auto":
         return not all(INLETS[inlet].starts_recorded for inlet in inlets)
@@ -228,9 +229,9 @@ def _free_starts(criterion: ErrorOf, inlets: Sequence[InletName]) -> bool:
 
 
 def _conditions(job: JobFile, channels: Collection[str]) -> tuple[str, ...]:
-    """Return what the job estimates of each flight's surroundings.
+    """Return the per-flight conditions to estimate: those of the job's terms.
 
-    What its terms name, and the accelerometer's bias where that is compared.
+    And the accelerometer's bias where acceleration is compared.
     """
     named = set() if isinstance(job.terms, str) else set(job.terms)
     if "acceleration" in channels:
@@ -241,7 +242,7 @@ def _conditions(job: JobFile, channels: Collection[str]) -> tuple[str, ...]:
 def _weights(
     settings: Settings, flights: Sequence[Flight], *, whole: bool
 ) -> dict[str, dict[str, float]]:
-    """Return flight -> channel -> factor; a whole free yaw spin's position means nothing."""
+    """Return flight -> channel -> factor, zero for the position of a whole free yaw spin."""
     weights: dict[str, dict[str, float]] = {}
     for flight in flights:
         flight_settings = settings.job.flights.get(flight.name)
@@ -254,15 +255,15 @@ def _weights(
 
 
 def limits_of(flights: Sequence[Flight]) -> Limits:
-    """Return the space in which these flights count as flying.
+    """Return the limits outside which a simulation counts as crashed.
 
-    The simulator's own arena, unless a recording itself comes near its floor or leaves it.
+    Those of the simulator, unless a recording itself comes near its floor or leaves them.
     """
     arena = Limits()
     for flight in flights:
         places = flight.series["position"].between(0.0, flight.duration).values
         places = places[np.isfinite(places).all(axis=1)]
-        low = places[:, 2].min() < arena.floor + CLEARANCE
+        low = places[:, 2].min() < arena.floor + FLOOR_CLEARANCE_M
         if low or np.abs(places).max() > arena.half_width / 2:
             return AIRBORNE
     return arena

@@ -1,7 +1,7 @@
-"""Where a search stands and where it ended; what an optimiser is asked and answers.
+"""Progress and result of a search, and the interface of an optimiser.
 
 An optimiser runs one stage of the search: a function that yields an `Iterate` after each step, at
-least one, until the stage has had enough of them. `tuner.search.continuation.OPTIMISERS` names it.
+least one, until the stage ends. `tuner.search.continuation.OPTIMISERS` names it.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from tuner.search.stages import Stage
 
 HUBER = 4.0
 """Standard deviations beyond which a residual counts linearly, in the polish."""
-COLOURED = 1.2
-"""Residuals over measurement noise from which something else than noise must be in them."""
+COLOURED_RATIO = 1.2
+"""Residuals over measurement noise above which they hold more than noise."""
 
 
 class Loop(NamedTuple):
-    """How the loop flies where set-ups differ and controller files are often wrong, 1 or 0 each.
+    """Choices of the control loop in which controller files are often wrong, 1 or 0 each.
 
-    By default as PX4 does, with an estimator that knows where the markers sit. The names are those
-    of the controller's leaves.
+    The defaults are PX4's, with an estimator that knows the markers' places. The names are those of
+    the controller's leaves.
 
     Attributes
     ----------
@@ -44,8 +44,8 @@ class Loop(NamedTuple):
         Whether the mixer desaturates and the rate integrator stops where rotors are clipped, as in
         PX4. A saturated yaw step shows it.
     sees_markers
-        Whether position and attitude control see the motion capture's frame. A hover shows it: who
-        sees a frame that is tilted keeps away from where it was sent.
+        Whether position and attitude control see the motion capture's frame. A hover shows it: with
+        a tilted frame it keeps an offset from its set-point.
     """
 
     saturation_feedback: float = 1.0
@@ -57,12 +57,12 @@ class Loop(NamedTuple):
 
 
 def loop_of(objective: Objective) -> Loop:
-    """Return how an objective's loop flies."""
+    """Return the choices of an objective's loop."""
     return Loop(*map(float, _leaves(objective.model.controller)))
 
 
 def with_loop(objective: Objective, loop: Loop) -> Objective:
-    """Return the objective whose loop flies so."""
+    """Return the objective with these choices."""
     changed: Objective = eqx.tree_at(
         lambda o: _leaves(o.model.controller), objective, [np.asarray(choice) for choice in loop]
     )
@@ -75,7 +75,7 @@ def _leaves(controller: Controller) -> list[Scalar]:
 
 @dataclass(frozen=True)
 class Free:
-    """What a search may move.
+    """The parameters that a search may move.
 
     Attributes
     ----------
@@ -91,14 +91,14 @@ class Free:
 
 @dataclass(frozen=True)
 class StageProblem:
-    """What an optimiser minimises in one stage.
+    """The problem of one stage.
 
     Attributes
     ----------
     objective, criterion
         The loss as a function of a point.
     stage
-        How far to look, and when enough is gained.
+        Horizon and tolerances.
     points
         The S points to start from.
     losses
@@ -110,9 +110,9 @@ class StageProblem:
     damping
         (S,) λ to begin with, for an optimiser that damps its steps.
     last
-        Whether no stage follows, so that what is found has to stand.
+        Whether no stage follows.
     sums
-        The segments' at the points, where these were flown already.
+        The segments' sums at the points, if known.
     """
 
     objective: Objective
@@ -134,7 +134,7 @@ class StageProblem:
 
 @dataclass(frozen=True)
 class Iterate:
-    """Where an optimiser stands after a step.
+    """The state of an optimiser after a step.
 
     Attributes
     ----------
@@ -154,8 +154,8 @@ class Iterate:
         The segments' sums at the best points, S first; None where they were not computed. The next
         stage's weights and starts follow from those of the last step.
     next_start
-        What the next stage begins with, if there is one: S points, of which one predicted to differ
-        by little has not been tried, and (S,) λ. None for ``points`` and a damping of 1.
+        Start of the next stage: S points, some of them predicted and not tried yet, and (S,) λ.
+        None for ``points`` and a damping of 1.
     """
 
     points: Point
@@ -173,7 +173,7 @@ Optimiser: TypeAlias = Callable[[StageProblem], Iterator[Iterate]]
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a growing-horizon search stands: all that is needed to go on.
+    """The state of a growing-horizon search: all that is needed to resume it.
 
     Attributes
     ----------
@@ -194,7 +194,7 @@ class Progress:
     converged
         Whether the last stage ended by itself.
     loop
-        How the loop flies where the controller file may be wrong.
+        The loop's choices.
     left
         s that the search may still take; NaN where that is unknown.
     damping
@@ -225,7 +225,7 @@ class Progress:
         return point_of(self.iterate.points, int(np.argmin(self.iterate.losses)))
 
 
-def beginning(objective: Objective, vectors: Array) -> Progress:
+def initial_progress(objective: Objective, vectors: Array) -> Progress:
     """Return the state before the first stage for S start vectors (S, K)."""
     offsets = np.zeros((len(vectors), *objective.start(vectors[0]).offsets.shape))
     freedom = objective.segments.freedom
@@ -243,12 +243,9 @@ def beginning(objective: Objective, vectors: Array) -> Progress:
 
 
 def criterion_of(
-    stage: Stage,
-    scales: dict[str, Array],
-    offsets: Array,
-    states: Array | None = None,
+    stage: Stage, scales: dict[str, Array], offsets: Array, states: Array | None = None
 ) -> Criterion:
-    """Return what the solver needs to know of a stage.
+    """Return the criterion of a stage.
 
     Parameters
     ----------
@@ -257,7 +254,7 @@ def criterion_of(
     offsets
         (offsets, N) at which commands are read exactly, as in a `Point`.
     states
-        (L, F) starts around which is linearised.
+        (L, F) initial states of the linearisation.
     """
     return Criterion(
         horizon=stage.horizon,
@@ -275,7 +272,7 @@ def plain_criterion(
 
     Residuals count in multiples of the noise, or of ``scales`` times the noise, as in a `Progress`.
     """
-    start = beginning(objective, objective.space.initial[None])
+    start = initial_progress(objective, objective.space.initial[None])
     return criterion_of(
         Stage("plain", horizon), scales or start.scales, start.points.offsets[0], start.states
     )
@@ -319,7 +316,7 @@ class Fitted:
         Whether the search went to its end: a model that is far off is not polished before terms
         have been tried.
     findings
-        Everything noticed on the way.
+        Findings of the search.
     held
         Coefficient that the flights do not identify -> the one kept at its initial value for it:
         itself, or one that it trades off against.
@@ -350,7 +347,7 @@ class Fitted:
     @property
     def residuals_at_noise_level(self) -> bool:
         """Whether residuals hold no more than measurement noise, on any flight and channel."""
-        return max(max(scale.values()) for scale in self.scales.values()) < COLOURED
+        return max(max(scale.values()) for scale in self.scales.values()) < COLOURED_RATIO
 
 
 def by_flight(

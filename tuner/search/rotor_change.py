@@ -1,16 +1,16 @@
-"""A change within a flight: a rotor that from some time on turns otherwise for the same motion.
+"""Detection of a change of a rotor within a flight, as by a damaged propeller.
 
-The motion of a rigid body demands a force and a moment, and four rotors share them in one way. So
+The motion of a rigid body determines force and moment, and four rotors produce them in one way. So
 each rotor's share of the squared speeds is a function of the motion (angular acceleration, velocity
-through the air, body rate, heading for a steady wind), whatever disturbs the flight and however the
-loop answers. Where a propeller breaks or a motor slackens, that rotor's share rises from one sample
-to the next and stays there, and those of the others fall alike.
+through the air, body rate, heading for a steady wind), whatever the disturbances and the loop's
+response. Where a propeller breaks or a motor weakens, that rotor's share rises from one sample to
+the next and stays there, and those of the others fall equally.
 
-Per flight the shares are regressed on the motion, in windows of `WINDOW`, with a step at each time
-in turn. What is left is autocorrelated, as gusts are: a first-order autoregression is estimated
-with the likeliest step in, and steps are judged by generalised least squares. The statistic is the
-largest of all times' (Andrews, "Tests for parameter instability and structural change with unknown
-change point", Econometrica 61, 1993).
+For each flight the shares are regressed on the motion, in windows of `WINDOW_S`, with a step at
+each time in turn. Residuals are autocorrelated, as gusts are: a first-order autoregression is
+estimated with the likeliest step, and steps are tested by generalised least squares. The statistic
+is the largest over all times (Andrews, "Tests for parameter instability and structural change with
+unknown change point", Econometrica 61, 1993).
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from tuner.recordings.states import local_parabolas, states_at
 from tuner.search.job_flights import Recording
 from tuner.vehicle import VehicleFile
 
-WINDOW = 0.25
-"""s over which signals are averaged."""
-INSIDE = 10
-"""Times in each window at which rotors are read."""
-SHORTEST = 4.0
-"""s on either side of a change: what is less is neither found nor used."""
-LIKELY = 100.0
-"""Twice the log-likelihood that a step must gain. On 47 flights without a change, simulated ones in
-gusts and real ones among them, the likeliest gained 64; 5 % of a rotor gain a thousand."""
-SMALLEST = 0.02
-"""Share of its thrust that a rotor must lose or gain."""
-STANDS_OUT = 0.5
-"""Share of the squared change of all shares that the one rotor's must explain."""
-ALIKE = 0.8
-"""A rise, over the deepest fall of a share, from which the rising one's rotor has changed."""
-READ = 3e-4
-"""Of a share: no recording is better."""
-MEMORY = 0.95
-"""Autoregression from window to window, at most."""
+WINDOW_S = 0.25
+"""Window over which signals are averaged."""
+READS_PER_WINDOW = 10
+"""Samples of rotor signals in each window."""
+MIN_SIDE_S = 4.0
+"""Least duration on either side of a change: a shorter one is neither tested nor used."""
+MIN_STATISTIC = 100.0
+"""Least value of twice the log-likelihood ratio. On 47 flights without a change, simulated ones in
+gusts and real ones, the largest was 64; 5 % of a rotor's thrust have a thousand."""
+MIN_THRUST_CHANGE = 0.02
+"""Least relative change of a rotor's thrust."""
+MIN_SHARE_EXPLAINED = 0.5
+"""Least share of the squared step of all rotors that a change of one explains."""
+RISE_RATIO = 0.8
+"""Least rise over the deepest fall of a share for which the rising rotor is the changed one."""
+SHARE_SD = 3e-4
+"""Standard deviation of a share in the best recordings."""
+MAX_AUTOREGRESSION = 0.95
+"""Largest autoregression from window to window."""
 
 
 @dataclass(frozen=True)
-class Change:
+class RotorChange:
     """A rotor that changes within a flight.
 
     Attributes
     ----------
     seconds
-        s since the flight's start at which.
+        Time of the change since the flight's start, s.
     rotor
         Its number, from 0.
     loss
@@ -68,13 +68,13 @@ class Change:
     loss: float
 
 
-def used_up_to_changes(
+def cut_at_rotor_changes(
     recordings: Sequence[Recording], vehicle: VehicleFile
 ) -> tuple[tuple[Recording, ...], tuple[Finding, ...]]:
-    """Return recordings, held-out ones too, that end before a rotor changes; which ones do."""
+    """Return recordings cut off before a rotor changes, and findings on those changes."""
     kept, findings = [], []
     for recording in recordings:
-        flight, change = recording.flight, change_of(recording.flight, vehicle)
+        flight, change = recording.flight, rotor_change_of(recording.flight, vehicle)
         if change is None:
             kept.append(recording)
         else:
@@ -82,29 +82,29 @@ def used_up_to_changes(
             place = f"{'front' if x > 0.0 else 'rear'} {'left' if y > 0.0 else 'right'}"
             numbers = {"seconds": change.seconds, "rotor": change.rotor + 1, "loss": change.loss}
             findings.append(Finding(Code.ROTOR_CHANGED, "warning", flight.name, numbers, (place,)))
-            kept.append(replace(recording, flight=flight.until(change.seconds - WINDOW)))
+            kept.append(replace(recording, flight=flight.until(change.seconds - WINDOW_S)))
     return tuple(kept), tuple(findings)
 
 
-def change_of(flight: Flight, vehicle: VehicleFile) -> Change | None:
-    """Return the rotor that changes within a flight; None if none does, or nothing can be told.
+def rotor_change_of(flight: Flight, vehicle: VehicleFile) -> RotorChange | None:
+    """Return the rotor that changes within a flight; None if none does, or signals are missing.
 
     Parameters
     ----------
     flight
-        With a pose, body rates, and rotor speeds or commands.
+        A flight with a pose, body rates, and rotor speeds or commands.
     vehicle
         Gives the curve from command to speed, where only commands were recorded.
     """
     source: Source = "rotor_speed" if flight.tells_speeds else "command"
     known = {"position", "attitude", "body_rate", source} <= set(flight.series)
-    if not known or len(vehicle.rotors) != 4 or flight.duration < 2.0 * SHORTEST:
+    if not known or len(vehicle.rotors) != 4 or flight.duration < 2.0 * MIN_SIDE_S:
         return None
-    edges = np.arange(0.0, flight.duration, WINDOW)
+    edges = np.arange(0.0, flight.duration, WINDOW_S)
     shares = _shares(flight, vehicle, source, edges)
     motion = _motion(flight, edges)
     whole = np.isfinite(shares).all(axis=1) & np.isfinite(motion).all(axis=1)
-    least = round(SHORTEST / WINDOW)
+    least = round(MIN_SIDE_S / WINDOW_S)
     if whole.sum() < max(2 * least, 2 * motion.shape[1]):
         return None
     return _step(shares[whole], motion[whole], edges[:-1][whole], flight.duration)
@@ -113,18 +113,20 @@ def change_of(flight: Flight, vehicle: VehicleFile) -> Change | None:
 def _shares(flight: Flight, vehicle: VehicleFile, source: Source, edges: Array) -> Array:
     """Return each rotor's squared speed over the mean of all (n, 4), window by window."""
     series = flight.series[source]
-    fine = (edges[:-1, None] + (np.arange(INSIDE) + 0.5) * WINDOW / INSIDE).ravel()
+    fine = (
+        edges[:-1, None] + (np.arange(READS_PER_WINDOW) + 0.5) * WINDOW_S / READS_PER_WINDOW
+    ).ravel()
     read = np.full((len(fine), 4), np.nan)
     for rotor, column in enumerate(series.values.T):
         there = np.isfinite(column)
         if there.sum() > len(edges):
             read[:, rotor] = np.interp(fine, series.time[there], column[there])
-    squares = squared_speed(vehicle, source, read).reshape(-1, INSIDE, 4).mean(axis=1)
+    squares = squared_speed(vehicle, source, read).reshape(-1, READS_PER_WINDOW, 4).mean(axis=1)
     return np.asarray(squares / squares.mean(axis=1, keepdims=True))
 
 
 def _motion(flight: Flight, edges: Array) -> Array:
-    """Return what shares depend on (n, k), window by window."""
+    """Return the regressors (n, k) of the shares, window by window."""
     middle = 0.5 * (edges[1:] + edges[:-1])
     rates = local_parabolas(flight.series["body_rate"], edges)
     state = states_at(flight.series, middle)
@@ -137,7 +139,7 @@ def _motion(flight: Flight, edges: Array) -> Array:
     wind = np.column_stack([np.cos(heading), np.sin(heading)])
     rate = state.body_rate
     columns = [
-        np.diff(rates, axis=0) / WINDOW,
+        np.diff(rates, axis=0) / WINDOW_S,
         through,
         fast * through,
         rate,
@@ -148,7 +150,7 @@ def _motion(flight: Flight, edges: Array) -> Array:
     return np.hstack(columns)
 
 
-def _step(shares: Array, motion: Array, begins: Array, end: float) -> Change | None:
+def _step(shares: Array, motion: Array, begins: Array, end: float) -> RotorChange | None:
     """Return the likeliest step of shares (n, 4) at one of the windows' begins (n,), if any."""
     memory, found = 0.0, None
     for _ in range(3):
@@ -158,17 +160,23 @@ def _step(shares: Array, motion: Array, begins: Array, end: float) -> Change | N
         found = max(steps, key=lambda step: step[0])
         left = shares - motion @ found[2] - (begins >= found[1])[:, None] * found[3]
         before, after = left[:-1], left[1:]
-        memory = float(np.clip(np.sum(before * after) / max(np.sum(before**2), 1e-300), 0, MEMORY))
+        memory = float(
+            np.clip(np.sum(before * after) / max(np.sum(before**2), 1e-300), 0, MAX_AUTOREGRESSION)
+        )
     assert found is not None
     gain, seconds, _, moved = found
-    rises = moved.max() > -ALIKE * moved.min()
+    rises = moved.max() > -RISE_RATIO * moved.min()
     rotor = int(np.argmax(moved) if rises else np.argmin(moved))
     alone = np.eye(4)[rotor] - 0.25
     loss = float(alone @ moved / (alone @ alone))
     left_over = np.sum((moved - loss * alone) ** 2) / max(np.sum(moved**2), 1e-300)
-    if gain < LIKELY or abs(loss) < SMALLEST or left_over > 1.0 - STANDS_OUT:
+    if (
+        gain < MIN_STATISTIC
+        or abs(loss) < MIN_THRUST_CHANGE
+        or left_over > 1.0 - MIN_SHARE_EXPLAINED
+    ):
         return None
-    return Change(seconds, rotor, loss)
+    return RotorChange(seconds, rotor, loss)
 
 
 def _steps(
@@ -176,10 +184,10 @@ def _steps(
 ) -> Iterator[tuple[float, float, Array, Array]]:
     """Return gain, time, coefficients (k, 4) and step (4,) of a step at each time in turn."""
 
-    def new(rows: Array) -> Array:
+    def whitened(rows: Array) -> Array:
         return np.concatenate([np.sqrt(1.0 - memory**2) * rows[:1], rows[1:] - memory * rows[:-1]])
 
-    answers, columns = new(shares), new(motion)
+    answers, columns = whitened(shares), whitened(motion)
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
     basis, values, across = np.linalg.svd(columns / size, full_matrices=False)
     kept = values > 1e-6 * values[0]
@@ -187,15 +195,15 @@ def _steps(
     left = answers - basis @ (basis.T @ answers)
     freedom = len(answers) - basis.shape[1] - 1
     three = np.linalg.qr(np.eye(4) - 0.25)[0][:, :3]  # shares add up to four
-    for seconds in begins[(begins >= SHORTEST) & (begins <= end - SHORTEST)]:
-        step = new((begins >= seconds).astype(float)[:, None])[:, 0]
+    for seconds in begins[(begins >= MIN_SIDE_S) & (begins <= end - MIN_SIDE_S)]:
+        step = whitened((begins >= seconds).astype(float)[:, None])[:, 0]
         alone = step - basis @ (basis.T @ step)
         square = alone @ alone
         if square < 1e-3 * (step @ step):
             continue  # the motion changes with it
         moved = alone @ left / square
         after = (left - np.outer(alone, moved)) @ three
-        scatter = after.T @ after / freedom + READ**2 * np.eye(3)
+        scatter = after.T @ after / freedom + SHARE_SD**2 * np.eye(3)
         gain = float(square * (moved @ three) @ np.linalg.solve(scatter, moved @ three))
         theta = inverse @ (basis.T @ (answers - np.outer(step, moved)))
         yield gain, float(seconds), theta, moved

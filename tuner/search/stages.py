@@ -1,40 +1,38 @@
-"""The stages of a search: how far each looks, how it inflates the noise, by which optimiser."""
+"""The stages of a search: horizon, noise inflation and optimiser of each."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-HORIZONS = (0.2, 0.4, 0.8, 1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 26.0)
-"""s that the stages of the continuation look ahead; the whole flights follow. The first are so
-short that even a vehicle with a third of the thrust is still near where it began, so that a bad
-start has a slope to go down."""
+HORIZONS_S = (0.2, 0.4, 0.8, 1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 26.0)
+"""Horizons of the stages before whole flights. In the first even a vehicle with a third of the
+thrust stays close to its start, so that a bad start has a useful gradient."""
 NOISE_INFLATION = (20.0, 20.0, 20.0, 20.0, 10.0, 5.0, 3.0, 2.0, 1.5, 1.0)
 """Factor on every standard deviation, stage by stage; it is 1 on whole flights."""
 WINDOWS = ((0.3, 20.0, False), (0.6, 5.0, True))
-"""Share of a window, noise inflation and whether offsets are free, before the windows are whole."""
-GENTLE = 1.0
-"""s of horizon below which a Jacobian costs so little that a stage may take its time."""
-ENOUGH = 0.01
-"""Loss at which such a stage has done its part: the next sees further."""
-OFFSETS_FROM = 5.0
-"""s of horizon from which the clocks' offsets are free: before, they look like lag."""
-EVOLVED = (0.8, 3.0)
-"""s of horizon at which CMA-ES looks for where to begin."""
-GENERATIONS = 60
-"""Generations of CMA-ES in one stage, at most."""
-DECIDES_AT = 3.0
-"""s of horizon at which what is undecided of the loop is tried both ways."""
-WEIGHED = 1e-3
-"""Tolerance of windows' first polish, which is there for the residuals that it leaves: these are
-the last one's weights. Open loops meet no recording so well that less would change them."""
-LAST = 60
-"""Iterations of the last stage at most: where coefficients hardly differ in what they do, their
-valley is long."""
-WHOLE = "whole length"
-USUAL = 5
-"""Steps that a stage usually takes: predicts the time that is left."""
-PAUSE = 4000
-"""Samples whose simulation takes as long as the rest of a step."""
+"""Share of a window, noise inflation and whether offsets are free, before whole windows."""
+CHEAP_HORIZON_S = 1.0
+"""Horizon below which a Jacobian is cheap, so that a stage may take more steps."""
+TARGET_LOSS = 0.01
+"""Loss that ends such a stage."""
+OFFSETS_FREE_FROM_S = 5.0
+"""Horizon from which clock offsets are free: in shorter ones they look like lag."""
+CMA_HORIZONS_S = (0.8, 3.0)
+"""Horizons at which CMA-ES searches for a start."""
+MAX_GENERATIONS = 60
+"""Largest number of CMA-ES generations in one stage."""
+CHOICES_AT_S = 3.0
+"""Horizon at which the loop's choices are tried both ways."""
+WINDOW_TOLERANCE = 1e-3
+"""Tolerance of windows' first polish, which finds the last one's weights: in open loop residuals
+are so large that less would not change them."""
+MAX_LAST_STEPS = 60
+"""Largest number of iterations of the last stage: correlated coefficients make a long valley."""
+WHOLE_LENGTH = "whole length"
+USUAL_STEPS = 5
+"""Usual number of steps of a stage, for the remaining time."""
+OVERHEAD_SAMPLES = 4000
+"""Cost of a step beside its simulation, in simulated samples."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class Stage:
     Attributes
     ----------
     name
-        What messages call it.
+        Name in messages.
     horizon
         Samples of the simulation.
     noise_inflation
@@ -54,25 +52,24 @@ class Stage:
     offsets
         Whether clock offsets are free; in the polish, those that matter.
     steps
-        How many iterations it takes at most.
+        Largest number of iterations.
     tolerance
         The stage ends when no start's loss falls by more than this share.
-    weighs
+    rescales
         Whether its residuals rescale each channel of each flight for the next stage; otherwise they
-        rescale only flights that are met far worse than the rest.
-    prunes
-        Whether offsets too small to matter are set to zero before it.
+        rescale only flights with far larger residuals than the rest.
+    drops_offsets
+        Whether insignificant offsets are set to zero before it.
     optimiser
         Name of an `tuner.search.optimiser.Optimiser`.
     coefficients
         Whether the coefficients are free.
-    enough
-        Loss, in inflated standard deviations, below which the next stage may as well begin.
-    decides
-        Whether what is undecided of the loop is tried both ways.
+    target_loss
+        Loss, in inflated standard deviations, below which the next stage begins.
+    tries_choices
+        Whether the loop's choices are tried both ways.
     rough
-        Whether it ends where the normal equations predict less than the tolerance: a linear step is
-        left.
+        Whether it ends where the normal equations predict a gain below the tolerance.
     """
 
     name: str
@@ -82,19 +79,19 @@ class Stage:
     offsets: bool = False
     steps: int = 1
     tolerance: float = 1.0
-    weighs: bool = False
-    prunes: bool = False
+    rescales: bool = False
+    drops_offsets: bool = False
     optimiser: str = "gradient"
     coefficients: bool = True
-    enough: float = 0.0
-    decides: bool = False
+    target_loss: float = 0.0
+    tries_choices: bool = False
     rough: bool = False
 
 
 def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:
     """Return the stages for flights of at most so many samples at a rate in Hz."""
     stages = []
-    for seconds, noise_inflation in zip(HORIZONS, NOISE_INFLATION, strict=True):
+    for seconds, noise_inflation in zip(HORIZONS_S, NOISE_INFLATION, strict=True):
         horizon = round(seconds * rate)
         if horizon < samples:
             stages.append(
@@ -102,11 +99,11 @@ def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple
                     name=f"first {seconds:g} s",
                     horizon=horizon,
                     noise_inflation=noise_inflation,
-                    offsets=seconds >= OFFSETS_FROM,
-                    steps=min(16 if seconds < GENTLE else 8, steps),
-                    tolerance=0.005 if seconds < GENTLE else 0.02,
-                    enough=ENOUGH if seconds < GENTLE else 0.0,
-                    decides=seconds == DECIDES_AT,
+                    offsets=seconds >= OFFSETS_FREE_FROM_S,
+                    steps=min(16 if seconds < CHEAP_HORIZON_S else 8, steps),
+                    tolerance=0.005 if seconds < CHEAP_HORIZON_S else 0.02,
+                    target_loss=TARGET_LOSS if seconds < CHEAP_HORIZON_S else 0.0,
+                    tries_choices=seconds == CHOICES_AT_S,
                 )
             )
     return (*stages, *_whole_stages(samples, robust=robust, steps=steps))
@@ -122,26 +119,28 @@ def window_schedule(samples: int, rate: float, *, robust: bool, steps: int) -> t
             offsets=offsets,
             steps=min(12, steps),
             tolerance=0.01,
-            weighs=True,
+            rescales=True,
         )
         for share, noise_inflation, offsets in WINDOWS
     ]
     whole, polish, last = _whole_stages(samples, robust=robust, steps=steps)
-    return (*stages, whole, replace(polish, tolerance=WEIGHED), last)
+    return (*stages, whole, replace(polish, tolerance=WINDOW_TOLERANCE), last)
 
 
 def _whole_stages(samples: int, *, robust: bool, steps: int) -> tuple[Stage, Stage, Stage]:
-    whole = Stage(WHOLE, samples, offsets=True, steps=min(10, steps), tolerance=1e-3, weighs=True)
-    polish = replace(whole, robust=robust, tolerance=1e-5, prunes=True, steps=min(15, steps))
+    whole = Stage(
+        WHOLE_LENGTH, samples, offsets=True, steps=min(10, steps), tolerance=1e-3, rescales=True
+    )
+    polish = replace(whole, robust=robust, tolerance=1e-5, drops_offsets=True, steps=min(15, steps))
     return (
         whole,
         replace(polish, name="polish"),
-        replace(polish, name="polish again", steps=min(LAST, steps)),
+        replace(polish, name="polish again", steps=min(MAX_LAST_STEPS, steps)),
     )
 
 
-def left(stages: tuple[Stage, ...], stage: int, steps: int, spent: float) -> float:
-    """Return the s that a search may still take, extrapolated from what it took so far.
+def remaining_seconds(stages: tuple[Stage, ...], stage: int, steps: int, spent: float) -> float:
+    """Return the remaining s of a search, extrapolated from those spent.
 
     Parameters
     ----------
@@ -152,9 +151,11 @@ def left(stages: tuple[Stage, ...], stage: int, steps: int, spent: float) -> flo
     spent
         s so far.
     """
-    work = [min(planned.steps, USUAL) * (planned.horizon + PAUSE) for planned in stages]
+    work = [
+        min(planned.steps, USUAL_STEPS) * (planned.horizon + OVERHEAD_SAMPLES) for planned in stages
+    ]
     under_way = (
-        work[stage] * min(steps / min(stages[stage].steps, USUAL), 1.0)
+        work[stage] * min(steps / min(stages[stage].steps, USUAL_STEPS), 1.0)
         if stage < len(stages)
         else 0
     )
@@ -163,13 +164,7 @@ def left(stages: tuple[Stage, ...], stage: int, steps: int, spent: float) -> flo
 
 
 def plan(
-    method: str,
-    samples: int,
-    rate: float,
-    *,
-    windows: bool,
-    robust: bool,
-    steps: int,
+    method: str, samples: int, rate: float, *, windows: bool, robust: bool, steps: int
 ) -> tuple[Stage, ...]:
     """Return the stages of a method.
 
@@ -194,7 +189,7 @@ def plan(
     evolving = [
         _by_cma(stage, f"CMA-ES, {stage.name}", steps)
         for stage in stages
-        if windows or stage.horizon / rate in EVOLVED
+        if windows or stage.horizon / rate in CMA_HORIZONS_S
     ][:2]
     if method == "hybrid":
         horizon = evolving[-1].horizon if evolving and not windows else 0
@@ -204,7 +199,7 @@ def plan(
     return (
         *evolving,
         _by_cma(whole, "CMA-ES, whole length", steps),
-        replace(polish, name="offsets", coefficients=False, prunes=False),
+        replace(polish, name="offsets", coefficients=False, drops_offsets=False),
         _by_cma(last, "CMA-ES, polish", steps),
     )
 
@@ -214,8 +209,8 @@ def _by_cma(stage: Stage, name: str, steps: int) -> Stage:
         stage,
         name=name,
         optimiser="cma",
-        steps=min(GENERATIONS, steps),
+        steps=min(MAX_GENERATIONS, steps),
         offsets=False,
-        prunes=False,
-        decides=False,
+        drops_offsets=False,
+        tries_choices=False,
     )

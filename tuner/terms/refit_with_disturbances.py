@@ -15,9 +15,9 @@ from tuner.disturbances.predictor import Predictor, hidden
 from tuner.disturbances.ticks import FLIGHT_CONTROLLER
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
-from tuner.search.estimation import LAST, free_offsets, polished
+from tuner.search.estimation import LAST_POLISH, free_offsets, polished
 from tuner.search.explanation import Explanation
-from tuner.search.findings import odd_flights
+from tuner.search.findings import outlying_flights
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
 from tuner.terms.candidates import Selected, names_of
@@ -57,7 +57,7 @@ def refit_and_examine(
     """
     refit = partial(with_disturbances, on_progress=on_progress, on_message=on_message)
     found, asked = None, selected.job.settings.job.disturbances
-    if not (selected.refuted or (asked == "auto" and odd_flights(selected.fitted.scales))):
+    if not (selected.refuted or (asked == "auto" and outlying_flights(selected.fitted.scales))):
         found = explanation.part("disturbances", partial(refit, selected), None)
     if found is not None and (
         refuted := set(refuted_by_commands(*found[:2])).difference(selected.kept)
@@ -137,7 +137,7 @@ def with_disturbances(
         free=Free(np.zeros(len(job.space), bool), offsets),
         title="clocks",
         on_progress=partial(on_progress, job),
-        stages=LAST,
+        stages=LAST_POLISH,
     )
     again = replace(
         again,

@@ -23,13 +23,13 @@ from tuner.objective.criterion import Point, units_of
 from tuner.objective.information import begun
 from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.search.estimation import (
-    LAST,
-    ROUGH,
-    ROUGHLY,
+    FIRST_POLISH,
+    LAST_POLISH,
+    ROUGH_TOLERANCE,
     OnProgress,
     free_offsets,
     polished,
-    searched_again,
+    search_again,
 )
 from tuner.search.findings import findings_at
 from tuner.search.problem import Job
@@ -254,7 +254,7 @@ class Selection:
         if anew:
             start[: len(self.job.space)] = self.job.space.initial
             start = begun(objective.space, start, wanted)
-            return searched_again(
+            return search_again(
                 self.job, from_here, start, free=free_ones, title=title, on_progress=on_progress
             )
         return polished(
@@ -263,8 +263,8 @@ class Selection:
             free=free_ones,
             title=title,
             on_progress=on_progress,
-            stages=ROUGHLY if roughly else LAST,
-            left=ROUGH if roughly else None,
+            stages=FIRST_POLISH if roughly else LAST_POLISH,
+            left=ROUGH_TOLERANCE if roughly else None,
         )
 
     def linearised(self, fitted: Fitted, added: Groups) -> LinearisedFit:

@@ -23,7 +23,7 @@ from tuner.core.numerics import scaled_solve
 from tuner.core.phrases import listed
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import normal_equations
-from tuner.search.estimation import LAST, LAST_TWO, free_offsets, polished
+from tuner.search.estimation import BOTH_POLISHES, LAST_POLISH, free_offsets, polished
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
 from tuner.uncertainty.estimates import Uncertainty
@@ -84,7 +84,9 @@ def hold_undetermined(
             f"The flights do not identify {listed(names)}: held at the initial value, and the "
             "others are fitted again."
         )
-        rest = hold(job, fitted, stand_ins, on_progress, stages=LAST if predicts else LAST_TWO)
+        rest = hold(
+            job, fitted, stand_ins, on_progress, stages=LAST_POLISH if predicts else BOTH_POLISHES
+        )
         if not _loss_ratio(fitted, rest) < (
             1.0 + SEARCH_TOLERANCE if predicts else CLOSED_LOOP_TOLERANCE
         ):
@@ -186,7 +188,7 @@ def hold(
     stand_ins: Mapping[str, str],
     on_progress: Callable[[Job, Progress], None],
     *,
-    stages: slice = LAST_TWO,
+    stages: slice = BOTH_POLISHES,
 ) -> Fitted:
     """Return the fit with the stand-ins held at their initial values and the others refitted.
 

@@ -45,7 +45,7 @@ from tuner.objective.normal_equations import Objective
 from tuner.objective.simulation import MOTION, SETPOINTS, SPEEDS, TURNED, Flown, environment_of, fly
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
-from tuner.search.findings import odd_flights
+from tuner.search.findings import outlying_flights
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import (
     LIMIT,
@@ -125,7 +125,7 @@ class ModelErrors:
 def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | None:
     """Return the errors of a fit's model; None if there are none, or they cannot be estimated.
 
-    They are estimated from all flights but crashed ones and those of `odd_flights`.
+    They are estimated from all flights but crashed ones and those of `outlying_flights`.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
         channels=(*_CHANNELS, MOTION, TURNED, SETPOINTS),
     )
     rate = float(schedule.log_rate)
-    odd = odd_flights(fitted.scales)
+    odd = outlying_flights(fitted.scales)
     usable = ~np.isfinite(np.asarray(flown.crash_time))
     usable[[number for number, name in enumerate(fitted.scales) if name in odd]] = False
     estimates = _controller_estimates(flights, flown, model.controller.mixer, rate, usable)

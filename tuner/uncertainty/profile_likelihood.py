@@ -14,7 +14,7 @@ import numpy as np
 from tuner.core.numerics import Array
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal_equations import Objective
-from tuner.search.levenberg_marquardt import advance, begin
+from tuner.search.levenberg_marquardt import advance, initial_step
 from tuner.uncertainty.covariance import PRIOR_WIDENING
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import FullProblem
@@ -93,7 +93,7 @@ def _refitted(
     free[index] = 0.0
     weak_priors = replace(criterion, prior=1.0 / PRIOR_WIDENING)
     points = Point(starts, np.repeat(offsets[None], len(starts), axis=0))
-    step, previous = begin(points), np.full(len(starts), np.inf)
+    step, previous = initial_step(points), np.full(len(starts), np.inf)
     for _ in range(MAX_ITERATIONS):
         step = advance(objective, step, weak_priors, free)
         assert step.sums is not None

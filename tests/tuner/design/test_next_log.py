@@ -17,8 +17,8 @@ from tuner.objective.information import information_at
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
-from tuner.search.progress import beginning, criterion_of, point_of
-from tuner.search.stages import WHOLE, Stage
+from tuner.search.progress import criterion_of, initial_progress, point_of
+from tuner.search.stages import WHOLE_LENGTH, Stage
 from tuner.vehicle import values_of
 
 FREE = ("input_scaling", "zero_position_armed", "motor_constant", "inertia_xx")
@@ -27,8 +27,8 @@ FREE = ("input_scaling", "zero_position_armed", "motor_constant", "inertia_xx")
 def at_truth(job, updated):
     """Return a fit that ended at the truth."""
     vector = job.space.vector_of(values_of(updated))
-    stage = Stage(WHOLE, job.objective.samples, 1.0, False, False, 1, 1e-3, True, False)
-    start = beginning(job.objective, vector[None])
+    stage = Stage(WHOLE_LENGTH, job.objective.samples, 1.0, False, False, 1, 1e-3, True, False)
+    start = initial_progress(job.objective, vector[None])
     point = point_of(start.points, 0)
     return ended(
         objective=job.objective,

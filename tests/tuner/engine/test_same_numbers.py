@@ -17,7 +17,7 @@ from tuner.evaluate.closed_loop import simulate
 from tuner.job.sensitivity import unfitted
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import evaluate, sums_at
-from tuner.search.job_flights import read_usable
+from tuner.search.job_flights import read_recordings
 from tuner.search.problem import job_of
 from tuner.uncertainty.refits import (
     BOOTSTRAP_FILE,
@@ -45,7 +45,7 @@ def two_flights(bag, tmp_path_factory):
         "flights: {two: {weight: 0.5}}\n"
     )
     settings = settle(Options(names, vehicle="hovergames", config=str(job)))
-    prepared = job_of(settings, read_usable(settings)[0])
+    prepared = job_of(settings, read_recordings(settings)[0])
     return prepared, unfitted(prepared)
 
 

@@ -31,7 +31,7 @@ from tuner.equation_error.regression import (
 from tuner.job.accelerations import with_accelerations
 from tuner.recordings.flight import Series
 from tuner.search.inlet_choice import predicts_turning, regressors
-from tuner.search.job_flights import read_usable
+from tuner.search.job_flights import read_recordings
 from tuner.search.problem import job_of
 
 SECONDS = 7.0
@@ -51,7 +51,7 @@ def flown(request, racer, tmp_path_factory):
     vehicle, signals = racer
     paths = fast_flights.write(vehicle, signals, folder, seed=4, rotor_rate=rate)
     settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
-    recordings, _ = read_usable(settings)
+    recordings, _ = read_recordings(settings)
     return vehicle, settings, recordings
 
 
@@ -262,7 +262,7 @@ def commanded(request, racer, tmp_path_factory):
     folder = tmp_path_factory.mktemp("commanded")
     paths = fast_flights.write(*racer, folder, seed=4, rotor_rate=request.param, fed="command")
     settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
-    given = job_of(settings, read_usable(settings)[0])
+    given = job_of(settings, read_recordings(settings)[0])
     return given, with_accelerations(given)
 
 

@@ -12,7 +12,7 @@ from tuner.config import Options, settle
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.validation import flights_not_flown
 from tuner.findings.findings import Code, remedy, sentence
-from tuner.search.job_flights import read_usable
+from tuner.search.job_flights import read_recordings
 from tuner.vehicle import COEFFICIENTS, with_values
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
@@ -24,7 +24,7 @@ def flown():
     names = ("lemniscate_4mps", "circle_3mps", "diagonal_3mps")
     paths = [str(FLIGHTS / f"{name}.bag") for name in names]
     settings = settle(Options(paths, config=str(FLIGHTS / "tune.yaml")))
-    recordings = read_usable(settings, holdout=())[0]
+    recordings = read_recordings(settings, holdout=())[0]
     truth = yaml.safe_load((FLIGHTS / "truth.yaml").read_text())
     known = {name: value for name, value in truth.items() if name in COEFFICIENTS}
     comparison = Comparison(recordings, settings.controller)

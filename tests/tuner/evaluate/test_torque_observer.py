@@ -13,7 +13,7 @@ from tuner.evaluate.prediction import predict
 from tuner.evaluate.torque_observer import TICKS, TorqueObserver
 from tuner.recordings.flight import Series
 from tuner.recordings.states import MIN_HALF_WIDTH_S
-from tuner.search.job_flights import read_usable
+from tuner.search.job_flights import read_recordings
 from tuner.vehicle import ControllerFile, with_values
 
 LASTS = 0.08
@@ -32,7 +32,7 @@ def flown(request, flights, tmp_path_factory):
     folder, (racer, signals) = tmp_path_factory.mktemp("fast"), flights
     paths = fast_flights.write(racer, signals, folder, seed=4, fed=request.param)
     settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
-    recordings, _ = read_usable(settings)
+    recordings, _ = read_recordings(settings)
     motor = {
         "input_scaling": fast_flights.FASTEST - fast_flights.IDLE,
         "zero_position_armed": fast_flights.IDLE,

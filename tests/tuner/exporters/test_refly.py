@@ -27,8 +27,8 @@ def test_recordings_are_read_as_the_run_read_them(run, monkeypatch):
         seen.append(settings.vehicle)
         return reading(settings, fits=fits)
 
-    seen, reading = [], effective.read_usable
-    monkeypatch.setattr(effective, "read_usable", read)
+    seen, reading = [], effective.read_recordings
+    monkeypatch.setattr(effective, "read_recordings", read)
     refly(run, with_values(run.vehicle, {"motor_constant": 2e-5}))
     (began_with,) = seen  # by it commands follow from a commanded wrench, and inlets are chosen
     assert values_of(began_with)["rotor_drag_coefficient"] == 4e-4

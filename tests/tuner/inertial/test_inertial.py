@@ -25,7 +25,7 @@ from tuner.recordings.notes import NoteCode
 from tuner.report.contents import read_contents
 from tuner.report.outcome import outcome
 from tuner.result import BEST_FIT_FILE
-from tuner.search.job_flights import read_usable, without_pose
+from tuner.search.job_flights import read_inertial_flights, read_recordings
 from tuner.uncertainty.verdict import Verdict
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, with_values
 
@@ -53,7 +53,7 @@ def simulation(flown):
 def measured(simulation, flown, tmp_path_factory):
     """What the flight says: of tests about what is made of it."""
     path = log_file(simulation, tmp_path_factory.mktemp("measured") / "log00")
-    ((flight,), _) = without_pose(settings_for(path, flown))
+    ((flight,), _) = read_inertial_flights(settings_for(path, flown))
     return measure_inertial(flight, flown)
 
 
@@ -79,7 +79,7 @@ def test_a_simulated_log_without_noise_is_fitted_or_refused(name, flown, tmp_pat
     simulation = next(iter(simulate(flown, ControllerFile(), shape, duration=14.0, rate=400.0)))
     path = log_file(simulation, tmp_path / "log00", noise=0.0)
     settings = settings_for(path, flown)
-    flights, _ = without_pose(settings)
+    flights, _ = read_inertial_flights(settings)
     if name == "hover":
         with pytest.raises(RecordingError, match="nothing turns it"):
             fit_without_pose(settings, flights, out=tmp_path / "run")
@@ -108,7 +108,7 @@ def test_intervals_hold_the_vehicle_that_flew(simulation, flown, tmp_path):
     start = with_values(flown, {n: truth[n] * factor for n, factor in WRONG.items()})
     path = log_file(simulation, tmp_path / "log00", order=(1, 3, 4, 2))
     settings = settings_for(path, with_values(start, {"actuator_latency": 0.0}))
-    ((flight,), _) = without_pose(settings)
+    ((flight,), _) = read_inertial_flights(settings)
     assert flight.flying[0][1] > 13.0
     fitted = fit_without_pose(settings, [flight], out=tmp_path / "run")
     result = fitted.result.coefficients
@@ -140,7 +140,7 @@ def test_air_that_drags_at_the_rotors_is_not_taken_for_inertia(name, tmp_path):
         SimulationOptions(trajectory=name, vehicle=vehicle, speed=4.0, duration=30.0, rate=400.0)
     )
     settings = settings_for(log_file(flown, tmp_path / "log00", noise=0.0), vehicle)
-    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
+    fitted = fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "run")
     truth = values_of(vehicle)
     for coefficient in SHOWN:
         found = fitted.result.coefficients[coefficient]
@@ -157,7 +157,7 @@ def test_a_motor_constant_is_known_only_with_the_curve_of_rotor_speeds(simulatio
     truth = values_of(flown)
     slower = {name: 0.8 * truth[name] for name in ("input_scaling", "zero_position_armed")}
     settings = settings_for(log_file(simulation, tmp_path / "log00"), with_values(flown, slower))
-    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
+    fitted = fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "run")
     result = fitted.result.coefficients
     motor, curve = result["motor_constant"], result["input_scaling"]
     assert motor.verdict is curve.verdict is Verdict.NOT_IDENTIFIABLE
@@ -177,7 +177,7 @@ def test_a_vehicle_file_of_another_size_gives_a_rigid_body(simulation, flown, tm
     truth = values_of(flown)
     wrong = {name: 9.0 * truth[name] for name in ("inertia_xx", "inertia_yy", "inertia_zz")}
     settings = settings_for(log_file(simulation, tmp_path / "log00"), with_values(flown, wrong))
-    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
+    fitted = fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "run")
     best = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
     assert best["inertia_xx"] == pytest.approx(truth["inertia_xx"], rel=0.1)
     assert best["inertia_zz"] == pytest.approx(truth["inertia_zz"], rel=0.1)  # the proportion's
@@ -190,7 +190,7 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
     shape = TrajectorySettings(name="lemniscate", radius=1.0, omega=1.0, speed_scale=4.0)
     simulation = next(iter(simulate(trimmed, ControllerFile(), shape, duration=14.0, rate=400.0)))
     settings = settings_for(log_file(simulation, tmp_path / "log00"), flown)
-    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
+    fitted = fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "run")
     best = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
     for name, truth in {"torque_trim_x": moment, "torque_trim_y": -2.0 * moment}.items():
         assert best[name] == pytest.approx(truth, rel=0.1), name
@@ -199,7 +199,7 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
         assert least_noticed(name, flown) < 0.1 * moment
         assert least_noticed(name, flown.replace(mass=1e-3)) < 1e-3 * moment
     # the file that leaves the trims out foretells the body rate worse
-    ((flight,), _) = without_pose(settings)
+    ((flight,), _) = read_inertial_flights(settings)
     stretches = stretches_of(flight.series, flight.flying)
     *_, foretold = rate_errors(stretches, flown, read_vehicle(fitted.folder / BEST_FIT_FILE))
     assert foretold.fitted < 0.5 * foretold.initial
@@ -212,7 +212,7 @@ def test_a_fit_that_foretells_worse_says_so(simulation, flown, measured, tmp_pat
     wrong = with_values(flown, {"inertia_xx": 2.0 * values_of(flown)["inertia_xx"]})
     monkeypatch.setattr("tuner.job.without_pose.vehicle_of", lambda *_: wrong)
     monkeypatch.setattr("tuner.job.without_pose.measure_inertial", lambda *_: measured)
-    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
+    fitted = fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "run")
     (worse,) = [f for f in fitted.result.findings if f.code is Code.RATE_WORSE]
     assert worse.level == "warning"
     assert worse.numbers["after"] > worse.numbers["before"]
@@ -225,7 +225,7 @@ def test_a_moment_that_commands_do_not_say_adds_up_until_holding_is_better(
     settings = settings_for(log_file(simulation, tmp_path / "log00"), wrong)
     monkeypatch.setattr("tuner.job.without_pose.vehicle_of", lambda *_: wrong)
     monkeypatch.setattr("tuner.job.without_pose.measure_inertial", lambda *_: measured)
-    ((flight,), _) = without_pose(settings)
+    ((flight,), _) = read_inertial_flights(settings)
     fitted = fit_without_pose(settings, [flight], out=tmp_path / "run")
     (held,) = [f for f in fitted.result.findings if f.code is Code.RATE_NOT_PREDICTED]
     for errors in rate_errors(stretches_of(flight.series, flight.flying), wrong, wrong):
@@ -239,10 +239,10 @@ def test_a_heavier_vehicle_scales_thrust_and_inertia_alike(
 ):
     path = log_file(simulation, tmp_path / "log00")
     settings = settings_for(path, flown.replace(mass=2.0 * flown.mass))
-    heavy = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "heavy")
+    heavy = fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "heavy")
     settings = settings_for(path, flown)
     monkeypatch.setattr("tuner.job.without_pose.measure_inertial", lambda *_: measured)
-    light = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "light")
+    light = fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "light")
     for name in ("motor_constant", "inertia_xx", "inertia_yy"):
         pair = [run.result.coefficients[name].best for run in (light, heavy)]
         assert pair[1] / pair[0] == pytest.approx(2.0, rel=1e-6), name
@@ -254,7 +254,7 @@ def test_commands_of_other_motors_are_refused_in_one_line(simulation, flown, tmp
     settings = settings_for(path, flown)
     # the map lists m1, m3, m4, m2: the rotors from front right on are now m3, m1, m2, m4
     with pytest.raises(RecordingError, match="2, 1, 4 and 3 of the columns that the topic map"):
-        fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
+        fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -263,7 +263,7 @@ def test_rotors_that_spin_the_other_way_are_noticed(simulation, flown, tmp_path)
     mirrored = replace(simulation, signals={**simulation.signals, "body_rate": rate})
     settings = settings_for(log_file(mirrored, tmp_path / "log00"), flown)
     with pytest.raises(RecordingError, match=r"(?s)yaw.*spins"):
-        fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
+        fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "run")
 
 
 def test_a_log_on_the_ground_is_refused(tmp_path):
@@ -309,7 +309,7 @@ def test_what_cannot_be_used_is_left_out_and_what_is_held_out_is_predicted(
     paths = [str(path) for path in (on_ground, fitted, held_out, mixed_up)]
     start = with_values(flown, {"inertia_xx": 0.7 * values_of(flown)["inertia_xx"]})
     settings = settle(Options(paths, vehicle=start, holdout=["log01"]))
-    flights, left_out = without_pose(settings)
+    flights, left_out = read_inertial_flights(settings)
     assert [flight.name for flight in flights] == ["log00", "log01", "log02"]
     run = fit_without_pose(settings, flights, left_out=left_out, out=tmp_path / "run")
     assert [m.experiment for m in run.measurements] == ["log00"]
@@ -319,7 +319,7 @@ def test_what_cannot_be_used_is_left_out_and_what_is_held_out_is_predicted(
     (foretold,) = [f for f in run.result.findings if f.subject == "log01"]
     assert foretold.numbers["after"] < foretold.numbers["before"]
     with pytest.raises(RecordingError, match="the motors only idle"):
-        without_pose(settle(Options([str(on_ground)], vehicle=flown)))
+        read_inertial_flights(settle(Options([str(on_ground)], vehicle=flown)))
     with pytest.raises(InputError, match="holds out all flights that can be used"):
         fit_without_pose(settings, flights[1:2], out=tmp_path / "run")
 
@@ -327,8 +327,8 @@ def test_what_cannot_be_used_is_left_out_and_what_is_held_out_is_predicted(
 def test_beside_flights_with_a_pose_those_without_one_are_left_out(simulation, flown, tmp_path):
     bare, posed = log_file(simulation, tmp_path / "log00"), FLIGHTS / "circle_4mps.bag"
     settings = settle(Options([str(bare), str(posed)], vehicle=flown, holdout=[]))
-    assert without_pose(settings) == ((), ())
-    usable, (left_out,) = read_usable(settings)
+    assert read_inertial_flights(settings) == ((), ())
+    usable, (left_out,) = read_recordings(settings)
     assert [recording.flight.name for recording in usable] == ["circle_4mps"]
     assert left_out.subject == "log00"
     assert "by themselves" in one_line(left_out)

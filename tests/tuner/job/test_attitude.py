@@ -14,7 +14,7 @@ from tuner.recordings.flight import Series
 from tuner.search import job_flights as recordings
 from tuner.search.estimation import search
 from tuner.search.inlet_choice import choose_inlet
-from tuner.search.job_flights import read_usable, recordings_of
+from tuner.search.job_flights import read_recordings, recordings_of
 from tuner.search.problem import job_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, values_of, with_values
 
@@ -74,12 +74,12 @@ def settings_of(vehicle, bag, **job):
 
 
 def test_auto_follows_the_attitude_where_commands_explain_no_turn(sparse, updated):
-    inlet, because = choose_inlet(sparse, "auto", updated, ControllerFile())
+    inlet, inlet_finding = choose_inlet(sparse, "auto", updated, ControllerFile())
     assert inlet == "attitude"
-    assert because.code is Code.INLET_CHOSEN
-    line = one_line(because)
+    assert inlet_finding.code is Code.INLET_CHOSEN
+    line = one_line(inlet_finding)
     assert "Nothing of its turning is fitted: the command" in line
-    assert because.level == "warning"
+    assert inlet_finding.level == "warning"
     assert "command, logged at 45 Hz, does not explain how the vehicle turned" in line
     assert "its recorded attitude is followed" in line
     assert line.endswith("Log the command as often as its loop runs.")
@@ -105,14 +105,14 @@ def test_commands_of_motors_in_another_order_need_not_be_logged_faster(dense, up
     monkeypatch.setattr("tuner.search.inlet_choice.motor_order", lambda *_: seen)
     command = dense.series["command"]
     turned = Series(command.time, command.values[:, [1, 0, 3, 2]])
-    inlet, because = choose_inlet(
+    inlet, inlet_finding = choose_inlet(
         replace(dense, series={**dense.series, "command": turned}),
         "auto",
         updated,
         ControllerFile(),
     )
     assert inlet == "attitude"
-    line = one_line(because)
+    line = one_line(inlet_finding)
     assert "turned in the order in which it is read (correlation" in line
     assert "Log the" not in line
 
@@ -143,14 +143,14 @@ def test_a_flight_held_out_is_followed_where_all_fitted_ones_are(
 ):
     monkeypatch.setattr(recordings, "load_flights", lambda *_, **__: [sparse, dense])
     settings = settings_of(updated, full_bag)
-    (fitted, held_out), findings = read_usable(settings, holdout=[dense.name])
+    (fitted, held_out), findings = read_recordings(settings, holdout=[dense.name])
     assert fitted.inlet == held_out.inlet == "attitude"
     (followed,) = (finding for finding in findings if finding.subject == dense.name)
     assert followed.code is Code.ATTITUDE_FOLLOWED
-    both, _ = read_usable(settings, holdout=[])
+    both, _ = read_recordings(settings, holdout=[])
     assert [recording.inlet for recording in both] == ["attitude", "actuator"]
     asked = settings_of(updated, full_bag, flights={dense.name: FlightSettings(inlet="actuator")})
-    (_, held_out), findings = read_usable(asked, holdout=[dense.name])
+    (_, held_out), findings = read_recordings(asked, holdout=[dense.name])
     assert held_out.inlet == "actuator"
     assert not any(finding.subject == dense.name for finding in findings)
 

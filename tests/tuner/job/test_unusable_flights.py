@@ -22,8 +22,8 @@ from tuner.recordings.defects import LIMITS, is_outlier
 from tuner.recordings.flight import Series
 from tuner.recordings.notes import Note, NoteCode
 from tuner.search import job_flights as recordings_module
-from tuner.search.findings import turning_unexplained
-from tuner.search.job_flights import read_usable, recordings_of
+from tuner.search.findings import turning_findings
+from tuner.search.job_flights import read_recordings, recordings_of
 from tuner.vehicle import ControllerFile
 
 
@@ -100,7 +100,7 @@ def test_a_flight_most_of_whose_commands_are_corrupt_is_left_out_by_name(flight,
     corrupt = replace(without_commands(flight, 2.0, 11.0), name="corrupt")
     monkeypatch.setattr(recordings_module, "load_flights", lambda *_, **__: [flight, corrupt])
     settings = settings_for(bag)
-    usable, (left_out,) = read_usable(settings)
+    usable, (left_out,) = read_recordings(settings)
     assert [recording.flight.name for recording in usable] == [flight.name]
     assert (left_out.code, left_out.subject) == (Code.LEFT_OUT, "corrupt")
     assert "lacks a continuous command in 75 %" in left_out.names[0]
@@ -109,7 +109,7 @@ def test_a_flight_most_of_whose_commands_are_corrupt_is_left_out_by_name(flight,
     # nothing is left to fit: the reason is the error
     holding = replace(settings, job=settings.job.replace(holdout=(flight.name,)))
     with pytest.raises(RecordingError, match="lacks a continuous command"):
-        read_usable(holding)
+        read_recordings(holding)
 
 
 def test_coefficients_that_an_inlet_bypasses_are_not_fitted(updated, flight):
@@ -192,8 +192,8 @@ def test_inputs_that_hardly_explain_how_a_flight_turns_are_named():
 
     turning = job("inertia_xx", "motor_constant")
     shares = {"a": 0.4, "b": 0.5, "c": 0.99, "held out": 0.1}
-    (weak,) = turning_unexplained(turning, shares)
+    (weak,) = turning_findings(turning, shares)
     assert (weak.code, weak.numbers["explained"]) == (Code.TURNING_UNEXPLAINED, 0.5)
-    assert turning_unexplained(turning, {"a": 0.97, "held out": 0.1}) == ()
-    assert turning_unexplained(turning, {}) == ()
-    assert turning_unexplained(job("motor_constant"), shares) == ()
+    assert turning_findings(turning, {"a": 0.97, "held out": 0.1}) == ()
+    assert turning_findings(turning, {}) == ()
+    assert turning_findings(job("motor_constant"), shares) == ()

@@ -19,8 +19,8 @@ from tuner.recordings.unit_detection import UNIT_PHRASES, UNITS, to_si
 from tuner.search.estimation import search
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
-from tuner.search.progress import beginning, criterion_of
-from tuner.search.stages import WHOLE, plan
+from tuner.search.progress import criterion_of, initial_progress
+from tuner.search.stages import WHOLE_LENGTH, plan
 from tuner.uncertainty.identifiability import hold_undetermined
 from tuner.vehicle import values_of, with_values
 
@@ -81,8 +81,8 @@ def test_flights_may_enter_through_different_inlets(full_flight, full_bag, updat
 
 
 def stage_for(job):
-    progress = beginning(job.objective, job.space.initial[None])
-    (stage,) = [stage for stage in plan_of(job) if stage.name == WHOLE]
+    progress = initial_progress(job.objective, job.space.initial[None])
+    (stage,) = [stage for stage in plan_of(job) if stage.name == WHOLE_LENGTH]
     return criterion_of(
         stage, progress.scales, np.asarray(progress.points.offsets[0]), progress.states
     )

@@ -23,7 +23,7 @@ from tuner.recordings.frames import contradiction, contradiction_in, correct_fra
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
-from tuner.search.job_flights import load_flights, read_usable
+from tuner.search.job_flights import load_flights, read_recordings
 
 SHARED = Path(__file__).parents[4] / "shared"
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", SHARED / "flights"))
@@ -63,7 +63,7 @@ def reversed_circle(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def test_a_recording_that_runs_backwards_is_named_and_left_out(
     short: Path, reversed_circle: Path
 ) -> None:
-    usable, findings = read_usable(settle(Options([str(short), str(reversed_circle)])))
+    usable, findings = read_recordings(settle(Options([str(short), str(reversed_circle)])))
     assert [recording.flight.name for recording in usable] == ["short"]
     (left_out,) = (finding for finding in findings if finding.code is Code.LEFT_OUT)
     assert (left_out.subject, left_out.level) == ("reversed", "warning")
@@ -75,7 +75,7 @@ def test_where_nothing_else_flew_the_run_ends_with_one_line(
     reversed_circle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(RecordingError, match=r"reversed.bag: its attitude and its body_rate"):
-        read_usable(settle(Options([str(reversed_circle)])))
+        read_recordings(settle(Options([str(reversed_circle)])))
     assert main(["--flights", str(reversed_circle), "--out", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert len([line for line in said if "contradict each other" in line]) == 1

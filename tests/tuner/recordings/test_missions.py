@@ -22,7 +22,7 @@ from tuner.recordings.missions import (
     split_into_manoeuvres,
     yaw_spin,
 )
-from tuner.search.job_flights import load_flights, read_usable
+from tuner.search.job_flights import load_flights, read_recordings
 
 TIME = np.arange(0, 40, 0.01)
 
@@ -241,7 +241,7 @@ def test_missions_of_a_long_log(long_log: Path) -> None:
     assert all(flight.duration < 60 for flight in flights)
     (inspection,), _ = inspect_recordings([long_log])
     assert sum(mission.fitted for mission in inspection.missions) in (4, 5)
-    recordings, findings = read_usable(settle(Options([str(long_log)])))
+    recordings, findings = read_recordings(settle(Options([str(long_log)])))
     assert len(recordings) == sum(mission.fitted for mission in inspection.missions)
     (chosen,) = [f for f in findings if f.code is Code.MANOEUVRES_CHOSEN]
     assert chosen.numbers["flights"] == 10
@@ -251,7 +251,7 @@ def test_a_side_car_names_the_missions(long_log: Path) -> None:
     beside = long_log.with_suffix(".yaml")
     beside.write_text("missions: [2, 7]\n")
     try:
-        recordings, _ = read_usable(settle(Options([str(long_log)])))
+        recordings, _ = read_recordings(settle(Options([str(long_log)])))
     finally:
         beside.unlink()
     assert [recording.flight.name for recording in recordings] == ["long-2", "long-7"]

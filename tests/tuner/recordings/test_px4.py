@@ -18,7 +18,7 @@ from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import logger_settings, logging_advice
-from tuner.search.job_flights import as_logged, read_usable
+from tuner.search.job_flights import read_recordings, with_logged_parameters
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.motor_orders import motor_order_of
 
@@ -57,7 +57,7 @@ def log(
 
 def test_the_rate_loop_is_the_logs(messages, tmp_path: Path) -> None:
     path = log(messages, tmp_path / "log.ulg", PARAMETERS)
-    settings, (finding,) = as_logged(settle(Options([str(path)])))
+    settings, (finding,) = with_logged_parameters(settle(Options([str(path)])))
     flew = settings.controller
     assert (flew.rate.roll.p, flew.rate.roll.i, flew.rate.pitch.d) == (0.15, 0.2, 0.0036)
     assert (flew.rate.yaw.ff, flew.rate.rate, flew.physics.rate) == (0.05, 800, 800)
@@ -69,7 +69,9 @@ def test_the_rate_loop_is_the_logs(messages, tmp_path: Path) -> None:
     assert "filters.dgyro_cutoff no filter (IMU_DGYRO_CUTOFF; the file has 20)" in line
     assert "integrator_limit" not in line
     assert finding.level == "info"
-    named, (finding,) = as_logged(settle(Options([str(path)], controller="hovergames")))
+    named, (finding,) = with_logged_parameters(
+        settle(Options([str(path)], controller="hovergames"))
+    )
     assert (named.controller, finding.level) == (flew, "warning")
 
 
@@ -78,7 +80,7 @@ def test_logs_that_differ_are_named(messages, tmp_path: Path) -> None:
         log(messages, tmp_path / f"{name}.ulg", PARAMETERS | {"MC_ROLLRATE_P": gain})
         for name, gain in (("a", 0.15), ("b", 0.18))
     ]
-    _, findings = as_logged(settle(Options([str(path) for path in paths])))
+    _, findings = with_logged_parameters(settle(Options([str(path) for path in paths])))
     (differ,) = [finding for finding in findings if finding.code is Code.LOGS_DIFFER]
     assert differ.names == ("MC_ROLLRATE_P",)
 
@@ -86,16 +88,16 @@ def test_logs_that_differ_are_named(messages, tmp_path: Path) -> None:
 def test_parameters_that_no_controller_has_change_nothing(messages, tmp_path: Path) -> None:
     path = log(messages, tmp_path / "log.ulg", {"IMU_GYRO_CUTOFF": 1e9, "MC_ROLLRATE_P": np.nan})
     settings = settle(Options([str(path)]))
-    assert as_logged(settings) == (settings, ())
+    assert with_logged_parameters(settings) == (settings, ())
 
 
 def test_flights_of_px4s_own_loops_enter_below_them(messages, tmp_path: Path) -> None:
     path = log(messages, tmp_path / "log.ulg")
-    (recording,), (finding,) = read_usable(settle(Options([str(path)])))
+    (recording,), (finding,) = read_recordings(settle(Options([str(path)])))
     assert (recording.inlet, finding.code) == ("body_rate", Code.PX4_LOOPS)
     (tmp_path / "job.yaml").write_text("inlet: reference\n")
     asked = settle(Options([str(path)], config=str(tmp_path / "job.yaml")))
-    ((recording,), _) = read_usable(asked)
+    ((recording,), _) = read_recordings(asked)
     assert recording.inlet == "reference"
 
 

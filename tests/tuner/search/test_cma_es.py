@@ -5,8 +5,8 @@ import pytest
 
 from tests.tuner.uncertainty.making import problem
 from tuner.objective.segments import OFFSETS
-from tuner.search.continuation import grow
-from tuner.search.progress import Free, beginning
+from tuner.search.continuation import run_stages
+from tuner.search.progress import Free, initial_progress
 from tuner.search.stages import Stage, plan
 
 FREE = ("inertia_zz", "motor_constant", "moment_constant")
@@ -29,10 +29,10 @@ def evolved(fit, *, seed, free=None):
         }
     )
     reports = []
-    end = grow(
+    end = run_stages(
         fit,
         (stage,),
-        beginning(fit, start[None]),
+        initial_progress(fit, start[None]),
         free=free,
         undecided={},
         on_progress=reports.append,

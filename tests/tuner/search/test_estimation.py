@@ -14,10 +14,15 @@ from tuner.findings.findings import Code, sentence
 from tuner.objective.space import space_of
 from tuner.search import estimation as module
 from tuner.search.estimation import fingerprint, starting_vectors
-from tuner.search.findings import end_findings, odd_flights, unmatched, voltage_taken
+from tuner.search.findings import (
+    end_findings,
+    outlying_flights,
+    reference_voltage_findings,
+    unmatched,
+)
 from tuner.search.iteration import Outcome
 from tuner.search.progress import Loop
-from tuner.search.stages import left, plan
+from tuner.search.stages import plan, remaining_seconds
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.vehicle import ControllerFile
 
@@ -88,9 +93,9 @@ def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
         )
     )
     one_stray = {"a": {"position": 1.0}, "b": {"position": 1.1}, "c": {"position": 90.0}}
-    assert set(unmatched(one_stray)) == odd_flights(one_stray) == {"c"}
-    assert not odd_flights(one_stray | {"b": {"position": 1.5}})
-    assert not odd_flights({name: one_stray[name] for name in "ac"})
+    assert set(unmatched(one_stray)) == outlying_flights(one_stray) == {"c"}
+    assert not outlying_flights(one_stray | {"b": {"position": 1.5}})
+    assert not outlying_flights({name: one_stray[name] for name in "ac"})
     (finding,) = end_findings(job, Loop(), one_stray)
     assert (finding.code, finding.subject) == (Code.FLIGHT_UNMATCHED, "c")
     all_far = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}
@@ -119,18 +124,18 @@ def test_a_curve_of_motors_says_at_which_voltage_it_holds(updated):
     best = updated.replace(
         effects={"battery_exponent": 1.0}, battery=updated.battery.replace(reference_voltage=16.36)
     )
-    (finding,) = voltage_taken(updated, best)
+    (finding,) = reference_voltage_findings(updated, best)
     assert "16.36 V" in sentence(finding)
-    assert voltage_taken(best, best) == ()  # given
-    assert voltage_taken(updated, best.replace(effects={})) == ()
+    assert reference_voltage_findings(best, best) == ()  # given
+    assert reference_voltage_findings(updated, best.replace(effects={})) == ()
 
 
 def test_time_left_falls_to_nothing():
     stages = plan("gradient", 4000, 400.0, windows=False, robust=True, steps=50)
-    remaining = [left(stages, stage, 0, 10.0) for stage in range(1, len(stages) + 1)]
+    remaining = [remaining_seconds(stages, stage, 0, 10.0) for stage in range(1, len(stages) + 1)]
     assert remaining == sorted(remaining, reverse=True)
     assert remaining[-1] == 0.0
-    assert np.isnan(left(stages, 0, 0, 0.0))
+    assert np.isnan(remaining_seconds(stages, 0, 0, 0.0))
 
 
 def test_a_checkpoint_is_of_flights_that_are_read_alike(bag, tmp_path):

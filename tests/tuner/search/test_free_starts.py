@@ -10,9 +10,9 @@ from tests.tuner.uncertainty.making import PHYSICS, problem, truth, with_data
 from tuner.objective.criterion import Point
 from tuner.objective.initial_conditions import ROWS, freedom_of_spin
 from tuner.objective.segments import OFFSETS
-from tuner.search.continuation import grow
-from tuner.search.levenberg_marquardt import FAR, are_far, starts_asked_for
-from tuner.search.progress import Free, beginning, criterion_of
+from tuner.search.continuation import run_stages
+from tuner.search.levenberg_marquardt import MAX_STATE_SD, estimated_states, need_relinearising
+from tuner.search.progress import Free, criterion_of, initial_progress
 from tuner.search.stages import plan
 
 FREE = ("inertia_zz", "moment_constant", "rotor_drag_coefficient")
@@ -50,10 +50,10 @@ def test_a_search_ends_where_its_loss_is_least_from_the_start_that_it_found(away
     rate = float(fit.schedule.log_rate)
     *_, last = plan("gradient", fit.samples, rate, windows=False, robust=False, steps=60)
     true = np.asarray(truth(fit).coefficients)
-    progress = grow(
+    progress = run_stages(
         fit,
         (last,),
-        beginning(fit, true[None] + away),
+        initial_progress(fit, true[None] + away),
         free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={},
         on_progress=lambda _: None,
@@ -81,9 +81,9 @@ def test_a_start_is_believed_within_reason_and_left_where_nothing_tells_it():
     sums = fit.sums(truth(fit), criterion, derivatives=False)
     before = np.array([[0.5, 0.0], [0.0, 0.0], [0.0, 0.0]])
     asked = replace(sums, states=np.array([[[np.nan, 1e9], [1.0, -2.0], [0.0, 0.0]]]))
-    expected = [[0.5, FAR], [1.0, -2.0], [0.0, 0.0]]
-    np.testing.assert_array_equal(starts_asked_for(asked, 0, before), expected)
-    assert starts_asked_for(asked, 0, None) is None
-    assert are_far(before, np.zeros((3, 2)))
-    assert not are_far(before, before + 0.1)
-    assert not are_far(None, None)
+    expected = [[0.5, MAX_STATE_SD], [1.0, -2.0], [0.0, 0.0]]
+    np.testing.assert_array_equal(estimated_states(asked, 0, before), expected)
+    assert estimated_states(asked, 0, None) is None
+    assert need_relinearising(before, np.zeros((3, 2)))
+    assert not need_relinearising(before, before + 0.1)
+    assert not need_relinearising(None, None)

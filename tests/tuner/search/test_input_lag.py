@@ -15,8 +15,8 @@ from tuner.job.check import _motor_orders
 from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
-from tuner.search.input_lag import Lag, _is_late, input_lag, with_inputs_on_time
-from tuner.search.job_flights import Recording, read_usable
+from tuner.search.input_lag import Lag, _is_late, input_lag, with_input_lags
+from tuner.search.job_flights import Recording, read_recordings
 
 RATE = 500.0
 
@@ -103,7 +103,7 @@ def test_each_fitted_flight_has_its_own_lateness_and_a_held_out_one_the_mean(bro
         Recording(late_by(broadband, 0.02, name="d"), "rotor_speed", 0.0),
         Recording(replace(broadband, name="e"), "reference", None),
     ]
-    late = [r.input_late for r in with_inputs_on_time(recordings, updated)]
+    late = [r.input_late for r in with_input_lags(recordings, updated)]
     assert late[0] == pytest.approx(0.015, abs=0.002)
     assert late[1] == pytest.approx(-0.005, abs=0.002)
     assert late[2] == pytest.approx((late[0] + late[1]) / 2)
@@ -119,7 +119,7 @@ def test_what_commands_are_late_by_together_is_the_vehicles_own_lag(broadband, u
         }
         return Recording(replace(broadband, series=series, name=name), "actuator", None)
 
-    first, second = with_inputs_on_time([moved(0.0, "a"), moved(0.012, "b")], updated)
+    first, second = with_input_lags([moved(0.0, "a"), moved(0.012, "b")], updated)
     assert first.input_late == pytest.approx(-second.input_late)
     assert second.input_late - first.input_late == pytest.approx(0.012, abs=0.002)
 
@@ -145,13 +145,13 @@ def test_what_the_loop_answers_to_hidden_torques_is_no_lateness(tmp_path):
     paths = fast_flights.write(racer, signals, tmp_path, seed=32)
     chosen = [str(p) for p in paths if p.stem in ("circle_13mps", "lemniscate_9mps")]
     settings = settle(Options(chosen, config=str(tmp_path / "tune.yaml")))
-    recordings, _ = read_usable(settings)
+    recordings, _ = read_recordings(settings)
     lag = input_lag(recordings[0].flight, "rotor_speed", settings.vehicle)
     assert lag.seconds < -3.0 * lag.sd  # by spectra alone
 
     def believed(seconds):
         stamped = [_stamped(recording, seconds) for recording in recordings]
-        return [r.input_late for r in with_inputs_on_time(stamped, settings.vehicle)]
+        return [r.input_late for r in with_input_lags(stamped, settings.vehicle)]
 
     assert believed(0.0) == [0.0, 0.0]
     for seconds in (-0.01, 0.01):  # where the manoeuvre tells
@@ -173,4 +173,4 @@ def test_where_gaps_are_everywhere_no_lateness_is_believed(broadband, updated):
     there = np.arange(len(speed.time)) % 8 < 5
     series = dict(flight.series) | {"rotor_speed": Series(speed.time[there], speed.values[there])}
     recordings = [Recording(replace(flight, series=series), "rotor_speed", None)]
-    assert [r.input_late for r in with_inputs_on_time(recordings, updated)] == [0.0]
+    assert [r.input_late for r in with_input_lags(recordings, updated)] == [0.0]

@@ -10,7 +10,7 @@ from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import sentence
 from tuner.search.job_flights import (
     Recording,
-    read_usable,
+    read_recordings,
     recordings_of,
     with_known,
 )
@@ -27,7 +27,7 @@ def settings():
 
 @pytest.fixture(scope="module")
 def flights(settings):
-    return [recording.flight for recording in read_usable(settings)[0]]
+    return [recording.flight for recording in read_recordings(settings)[0]]
 
 
 def assigned(settings, recorded, **job):
@@ -36,11 +36,11 @@ def assigned(settings, recorded, **job):
 
 
 def test_the_shipped_job_holds_one_flight_out_and_estimates_the_clocks(settings):
-    spin, circle = read_usable(settings)[0]
+    spin, circle = read_recordings(settings)[0]
     assert (spin.holdout, circle.holdout) == (False, True)
     assert {spin.inlet, circle.inlet} == {"reference"}
     assert spin.time_offset is circle.time_offset is None
-    assert not any(recording.holdout for recording in read_usable(settings, holdout=())[0])
+    assert not any(recording.holdout for recording in read_recordings(settings, holdout=())[0])
 
 
 def test_what_is_set_for_a_flight_wins_over_what_is_set_for_all(settings, flights):
@@ -66,7 +66,7 @@ def test_a_flight_that_is_held_out_must_feed_its_inlet_too(settings, flights):
     with pytest.raises(RecordingError, match=CIRCLE):
         recordings_of(settings, bare[1:])
     with pytest.raises(InputError, match="there is no flight 'circle_4mps-2'; did you mean"):
-        read_usable(replace(settings, job=settings.job.replace(holdout=("circle_4mps-2",))))[0]
+        read_recordings(replace(settings, job=settings.job.replace(holdout=("circle_4mps-2",))))[0]
 
 
 def test_recordings_of_which_no_flight_can_be_made_are_left_out_by_name(tmp_path):
@@ -78,15 +78,17 @@ def test_recordings_of_which_no_flight_can_be_made_are_left_out_by_name(tmp_path
     settings = replace(
         settle(Options([str(too_short), circle, str(empty)], holdout=["too_short"])), job=JobFile()
     )
-    recordings, left_out = read_usable(settings)
+    recordings, left_out = read_recordings(settings)
     assert [recording.flight.name for recording in recordings] == [CIRCLE]
     assert [finding.subject for finding in left_out] == ["too_short", "empty"]
     assert sentence(left_out[1]).startswith("It is empty; the flight is left out")
     assert sentence(left_out[0]).startswith("Nothing flies in it for 2 s: no mission was found")
     with pytest.raises(RecordingError, match="nothing flies in it for 2 s"):
-        read_usable(replace(settings, flights=(too_short, empty)))
+        read_recordings(replace(settings, flights=(too_short, empty)))
     with pytest.raises(RecordingError, match="no such file"):
-        read_usable(replace(settings, flights=(*settings.flights, tmp_path / "typed_wrong.bag")))
+        read_recordings(
+            replace(settings, flights=(*settings.flights, tmp_path / "typed_wrong.bag"))
+        )
 
 
 def test_a_flight_alone_enters_as_reference_on_time(flights):

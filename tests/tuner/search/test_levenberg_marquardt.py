@@ -9,7 +9,7 @@ import pytest
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import NormalEquations
 from tuner.search import levenberg_marquardt
-from tuner.search.levenberg_marquardt import NEAR, advance, begin
+from tuner.search.levenberg_marquardt import NEAR, advance, initial_step
 
 END = np.array([1.0, 1.0])
 START = np.array([-1.2, 1.0])
@@ -44,7 +44,7 @@ def advanced(monkeypatch):
         segments = SimpleNamespace(windowed=windowed)
         objective = SimpleNamespace(space=range(2), segments=segments, flight=np.zeros(1, int))
         criterion = SimpleNamespace(states=np.zeros((unknown, 1)) if unknown else None)
-        found = [begin(Point(np.asarray(points), np.zeros((len(points), 0, 1))), damping)]
+        found = [initial_step(Point(np.asarray(points), np.zeros((len(points), 0, 1))), damping)]
         for _ in range(count):
             found.append(advance(objective, found[-1], criterion, np.array(free)))
         return found
@@ -68,7 +68,7 @@ def test_a_point_that_is_rejected_is_not_differentiated_where_flights_cost_less(
 def test_every_start_reaches_the_minimum_and_stands_still(advanced):
     *_, last = advanced([START, [3.0, -2.0]], 60)
     np.testing.assert_allclose(last.point.coefficients, [END, END], atol=1e-7)
-    assert last.still.all()
+    assert last.stalled.all()
     assert last.predicted_reduction.max() < 1e-9
 
 
@@ -98,8 +98,8 @@ def test_the_first_step_is_the_damped_one(advanced):
     gain = 0.5 * gradient @ np.linalg.solve(hessian, gradient)
     assert first.predicted_reduction[0] == pytest.approx(gain / valley(START).loss)
     change = expected - START
-    promised = -gradient @ change - 0.5 * change @ hessian @ change
-    assert first.promised[0] == pytest.approx(promised / valley(START).loss)
+    step_reduction = -gradient @ change - 0.5 * change @ hessian @ change
+    assert first.step_reduction[0] == pytest.approx(step_reduction / valley(START).loss)
 
 
 def test_what_is_held_stays(advanced):
@@ -113,17 +113,17 @@ def test_what_is_no_number_is_never_better(advanced):
     assert not last.accepted[1]
 
 
-def ends(last, gain, accepted, worst, *, promised=1.0, tries=1):
+def ends(last, gain, accepted, worst, *, step_reduction=1.0, tries=1):
     """Return whether a stage ends after so many tries at a loss of 1."""
-    stage = SimpleNamespace(tolerance=1e-4, rough=False, enough=0.0)
+    stage = SimpleNamespace(tolerance=1e-4, rough=False, target_loss=0.0)
     segments = SimpleNamespace(windowed=False)
     problem = SimpleNamespace(stage=stage, last=last, objective=SimpleNamespace(segments=segments))
     step = SimpleNamespace(
         predicted_reduction=np.array([gain]),
-        promised=np.array([promised]),
+        step_reduction=np.array([step_reduction]),
         accepted=np.array([accepted]),
         loss=np.array([1.0]),
-        still=np.array([False]),
+        stalled=np.array([False]),
         sums=SimpleNamespace(compared=np.array([1000.0])),
     )
     losses = [step.loss] * tries
@@ -142,8 +142,10 @@ def test_a_stage_ends_before_a_small_step_where_the_fit_is_near_and_the_last_was
 
 
 @pytest.mark.parametrize("last", [False, True])
-@pytest.mark.parametrize("promised", [0.9e-4, 1.1e-4, np.nan])
+@pytest.mark.parametrize("step_reduction", [0.9e-4, 1.1e-4, np.nan])
 @pytest.mark.parametrize("tries", [3, 4])
-def test_rejected_tries_end_the_last_stage_once_the_next_promises_nothing(last, promised, tries):
-    ended = ends(last, 0.1, False, 2.0 * NEAR, promised=promised, tries=tries)
-    assert ended is (tries == 4 and not (last and promised > 1e-4))
+def test_rejected_tries_end_the_last_stage_once_the_next_promises_nothing(
+    last, step_reduction, tries
+):
+    ended = ends(last, 0.1, False, 2.0 * NEAR, step_reduction=step_reduction, tries=tries)
+    assert ended is (tries == 4 and not (last and step_reduction > 1e-4))

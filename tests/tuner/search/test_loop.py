@@ -10,8 +10,8 @@ import pytest
 from tests.tuner.uncertainty.making import NOISE, problem, with_data
 from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
-from tuner.search.continuation import grow
-from tuner.search.progress import Free, Loop, beginning, loop_of, with_loop
+from tuner.search.continuation import run_stages
+from tuner.search.progress import Free, Loop, initial_progress, loop_of, with_loop
 from tuner.search.stages import schedule_of
 
 FRAME = {"marker_tilt_x": 0.0105, "marker_tilt_y": -0.0157, "motor_constant": 1.5e-5}
@@ -25,10 +25,10 @@ def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, 
     noise = np.random.default_rng(3)
     recorded = with_data(with_loop(free, Loop(sees_markers=flown)), truth, noise=noise)
     fit = with_loop(recorded, Loop(sees_markers=written))
-    progress = grow(
+    progress = run_stages(
         fit,
         schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=10),
-        beginning(fit, np.asarray(fit.space.initial)[None]),
+        initial_progress(fit, np.asarray(fit.space.initial)[None]),
         free=Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={"sees_markers": np.ones(2, bool)},
         on_progress=lambda _: None,
@@ -44,12 +44,12 @@ def test_who_sees_the_markers_is_tried_from_where_the_search_began():
     """By another choice the first seconds lead the markers to where none of them flies."""
     fit = problem(tuple(FRAME))
     stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=2)
-    at = next(number for number, stage in enumerate(stages) if stage.decides)
-    start = beginning(fit, np.asarray(fit.space.initial)[None])
+    at = next(number for number, stage in enumerate(stages) if stage.tries_choices)
+    start = initial_progress(fit, np.asarray(fit.space.initial)[None])
     astray = start.points.coefficients + 3.0
     reports, seen = [], Loop(sees_markers=1.0)
     there = replace(start, stage=at, points=Point(astray, start.points.offsets))
-    progress = grow(
+    progress = run_stages(
         with_loop(with_data(with_loop(fit, seen), fit.start(fit.space.initial)), Loop()),
         stages[: at + 1],
         there,
@@ -78,11 +78,11 @@ def test_what_saturates_is_decided_by_the_flights_that_clip(flown):
         lambda o: o.segments.measured["position"].values, recorded, replace_fn=lambda p: p + away
     )
     stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=4)
-    stages = [stage for stage in stages if stage.decides]
-    progress = grow(
+    stages = [stage for stage in stages if stage.tries_choices]
+    progress = run_stages(
         fit,
         tuple(stages),
-        beginning(fit, np.asarray(fit.space.initial)[None]),
+        initial_progress(fit, np.asarray(fit.space.initial)[None]),
         free=Free(np.ones(1, bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={"saturation_feedback": np.array([False, True])},
         on_progress=lambda _: None,

@@ -8,9 +8,9 @@ import pytest
 
 from tests.tuner.uncertainty.making import problem
 from tuner.objective.segments import OFFSETS
-from tuner.search.continuation import OPTIMISERS, grow
-from tuner.search.progress import Free, beginning
-from tuner.search.stages import WHOLE, plan
+from tuner.search.continuation import OPTIMISERS, run_stages
+from tuner.search.progress import Free, initial_progress
+from tuner.search.stages import WHOLE_LENGTH, plan
 
 FREE = ("inertia_zz", "motor_constant", "moment_constant")
 MODULE = '''
@@ -59,18 +59,18 @@ def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
     fit = problem(FREE)
     rate = float(fit.schedule.log_rate)
     stages = plan(added, fit.samples, rate, windows=False, robust=False, steps=40)
-    stages = [stage for stage in stages if stage.name in ("first 3 s", WHOLE)]
+    stages = [stage for stage in stages if stage.name in ("first 3 s", WHOLE_LENGTH)]
     reports = []
     start = np.asarray(fit.space.initial) + np.array([0.3, -0.2, 0.0])
-    progress = grow(
+    progress = run_stages(
         fit,
         tuple(stages),
-        beginning(fit, start[None]),
+        initial_progress(fit, start[None]),
         free=Free(np.array([True, True, False]), np.zeros((len(OFFSETS), 2), bool)),
         undecided={},
         on_progress=reports.append,
     )
-    assert {report.iterations[-1].stage for report in reports} == {"first 3 s", WHOLE}
+    assert {report.iterations[-1].stage for report in reports} == {"first 3 s", WHOLE_LENGTH}
     assert reports[-1].iterate.points is progress.points
     assert progress.points.coefficients[0] == pytest.approx(fit.space.initial, abs=0.01)
     assert all(iteration.damping is None for iteration in progress.iterations)
@@ -79,10 +79,10 @@ def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
 def test_least_squares_reports_its_damping():
     fit = problem(FREE)
     stage = plan("gradient", fit.samples, 200.0, windows=False, robust=False, steps=3)[3]
-    progress = grow(
+    progress = run_stages(
         fit,
         (stage,),
-        beginning(fit, np.asarray(fit.space.initial)[None] + [[0.05], [0.06]]),
+        initial_progress(fit, np.asarray(fit.space.initial)[None] + [[0.05], [0.06]]),
         free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={},
         on_progress=lambda _: None,

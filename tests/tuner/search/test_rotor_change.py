@@ -10,8 +10,8 @@ from tuner.config import Options, settle
 from tuner.findings.findings import Code
 from tuner.job.run import prepared
 from tuner.recordings.flight import Series
-from tuner.search.job_flights import read_usable
-from tuner.search.rotor_change import WINDOW, change_of, used_up_to_changes
+from tuner.search.job_flights import read_recordings
+from tuner.search.rotor_change import WINDOW_S, cut_at_rotor_changes, rotor_change_of
 
 ROOT = Path(__file__).parents[3]
 BROKEN = 20.0
@@ -21,7 +21,7 @@ BROKEN = 20.0
 def flown():
     paths = sorted(str(path) for path in (ROOT / "reference_flights").glob("*.bag"))
     settings = settle(Options(paths, config=str(ROOT / "reference_flights" / "tune.yaml")))
-    return settings, read_usable(settings)[0]
+    return settings, read_recordings(settings)[0]
 
 
 def weakened(flight, vehicle, share, *, rotor=0, seconds=BROKEN):
@@ -46,17 +46,17 @@ def test_a_rotor_that_gives_less_is_found_by_its_time(flown, share):
         flight = recording.flight
         if flight.duration < BROKEN + 5.0:
             continue
-        found = change_of(
+        found = rotor_change_of(
             weakened(flight, settings.vehicle, share * 1.1, rotor=rotor), settings.vehicle
         )
         assert found.rotor == rotor
-        assert abs(found.seconds - BROKEN) <= 2.0 * WINDOW
+        assert abs(found.seconds - BROKEN) <= 2.0 * WINDOW_S
         assert found.loss == pytest.approx(1.1 * share, abs=0.3 * abs(share))
 
 
 def test_flights_without_a_change_raise_no_alarm(flown):
     settings, recordings = flown
-    assert used_up_to_changes(recordings, settings.vehicle) == (recordings, ())
+    assert cut_at_rotor_changes(recordings, settings.vehicle) == (recordings, ())
 
 
 def test_what_wanders_is_no_change(flown):
@@ -72,7 +72,7 @@ def test_what_wanders_is_no_change(flown):
         wander *= 0.006 / wander.std()
         gusty = Series(commands.time, commands.values * (1.0 + wander))
         gusty = replace(flight, series={**flight.series, "command": gusty})
-        alarms += change_of(gusty, settings.vehicle) is not None
+        alarms += rotor_change_of(gusty, settings.vehicle) is not None
     assert alarms <= 2
 
 
@@ -81,12 +81,12 @@ def test_a_job_uses_a_flight_up_to_the_change(flown, monkeypatch):
     circle, *others = recordings
     assert circle.flight.duration > BROKEN + 5.0
     broken = replace(circle, flight=weakened(circle.flight, settings.vehicle, 0.05))
-    monkeypatch.setattr("tuner.job.run.read_usable", lambda _: ((broken, *others), ()))
+    monkeypatch.setattr("tuner.job.run.read_recordings", lambda _: ((broken, *others), ()))
     job, findings = prepared(settings)
     (finding,) = [finding for finding in findings if finding.code is Code.ROTOR_CHANGED]
     assert (finding.subject, finding.names) == (circle.flight.name, ("front right",))
     cut = next(flight for flight in job.flights if flight.name == circle.flight.name)
-    assert BROKEN - 3.0 * WINDOW < cut.duration < BROKEN
+    assert BROKEN - 3.0 * WINDOW_S < cut.duration < BROKEN
     assert all(series.time[-1] <= BROKEN for series in cut.series.values())
     assert all(len(rows) == len(cut.time) for rows in cut.signals.values())
 
@@ -95,5 +95,6 @@ def test_little_is_not_looked_at(flown):
     settings, recordings = flown
     flight = recordings[0].flight.until(7.0)
     assert (
-        change_of(weakened(flight, settings.vehicle, 0.05, seconds=3.5), settings.vehicle) is None
+        rotor_change_of(weakened(flight, settings.vehicle, 0.05, seconds=3.5), settings.vehicle)
+        is None
     )

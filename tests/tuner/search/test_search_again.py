@@ -9,7 +9,7 @@ import pytest
 from tests.tuner.uncertainty.making import FLIGHTS, NOISE, fitted_of, problem, truth
 from tuner.config import JobFile
 from tuner.search import estimation
-from tuner.search.progress import Free, Loop, beginning, loop_of, with_loop
+from tuner.search.progress import Free, Loop, initial_progress, loop_of, with_loop
 
 PLAIN = ("motor_constant", "inertia_xx", "inertia_yy")
 
@@ -35,10 +35,10 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
         loop = own.switched(choice)
         return replace(progress, loop=loop, scales=scales, losses=np.ones(1))
 
-    monkeypatch.setattr(estimation, "grow", grown)
+    monkeypatch.setattr(estimation, "run_stages", grown)
     free = Free(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
     said = {"free": free, "title": "again", "on_progress": lambda _: None}
-    again = estimation.searched_again(job, fitted, objective.space.initial, **said)
+    again = estimation.search_again(job, fitted, objective.space.initial, **said)
     assert asked == {"undecided": {choice: tell}, "loop": own}
     assert loop_of(again.objective) == own.switched(choice)
     estimation.polished(job, again, **said)
@@ -63,7 +63,7 @@ def test_a_rough_fit_ends_where_a_linear_step_is_left(left, steps):
         free=free,
         title="again",
         on_progress=lambda _: None,
-        stages=estimation.ROUGHLY,
+        stages=estimation.FIRST_POLISH,
         left=left,
     )
     made = again.iterations[len(fitted.iterations) :]
@@ -73,4 +73,4 @@ def test_a_rough_fit_ends_where_a_linear_step_is_left(left, steps):
 @pytest.mark.parametrize("own", [Loop(0.0, 1.0), Loop(1.0, 0.0)])
 def test_a_search_begins_with_the_set_ups_own_loop(own):
     objective = with_loop(problem(PLAIN), own)
-    assert beginning(objective, np.asarray(objective.space.initial)[None]).loop == own
+    assert initial_progress(objective, np.asarray(objective.space.initial)[None]).loop == own

@@ -16,7 +16,7 @@ from tuner.disturbances.disturbances import USUAL
 from tuner.disturbances.maximum_likelihood import STEPS
 from tuner.equation_error.omitted_laws import Law
 from tuner.search.problem import Job
-from tuner.search.progress import COLOURED, Fitted
+from tuner.search.progress import COLOURED_RATIO, Fitted
 from tuner.terms import refit_with_disturbances as disturbances
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import (
@@ -43,9 +43,9 @@ def fitted(scale: float) -> Fitted:
     ("fit", "asked"),
     [
         (fitted(1.05), "follow"),
-        (replace(fitted(2.0 * COLOURED), polished=False), "follow"),
-        (fitted(2.0 * COLOURED), "none"),
-        (fitted(2.0 * COLOURED), "auto"),
+        (replace(fitted(2.0 * COLOURED_RATIO), polished=False), "follow"),
+        (fitted(2.0 * COLOURED_RATIO), "none"),
+        (fitted(2.0 * COLOURED_RATIO), "auto"),
     ],
     ids=["nothing but noise is left", "the search is not at its end", "not asked for", "no terms"],
 )
@@ -69,7 +69,7 @@ def test_flights_whose_gains_would_not_fit_are_left_to_the_intervals(monkeypatch
     )
     said: list[str] = []
     with nullcontext() if says else pytest.raises(AttributeError):  # goes on with what lacks
-        selected = Selected(job, fitted(2.0 * COLOURED))
+        selected = Selected(job, fitted(2.0 * COLOURED_RATIO))
         found = with_disturbances(selected, lambda *_: None, said.append)
         assert found is None
     assert ("Disturbances are not estimated" in said[0]) == says
@@ -113,7 +113,7 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
     monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
-    begin = Selected(job, fitted(2.0 * COLOURED))
+    begin = Selected(job, fitted(2.0 * COLOURED_RATIO))
     taken, within, asked = [], [], iter(called_for)
 
     def descended(selected: Selected, there: Fitted, own: Any, steps: int = STEPS) -> Any:
@@ -147,7 +147,9 @@ def test_no_terms_are_chosen_by_innovations_of_a_filter_that_lost_a_flight(monke
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
     said: list[str] = []
-    found = with_disturbances(Selected(job, fitted(2.0 * COLOURED)), lambda *_: None, said.append)
+    found = with_disturbances(
+        Selected(job, fitted(2.0 * COLOURED_RATIO)), lambda *_: None, said.append
+    )
     assert found is None
     assert said[-1] == disturbances.FILTER_LOST
 
@@ -161,7 +163,7 @@ def test_a_fit_with_a_lag_whose_filter_loses_a_flight_is_not_taken(monkeypatch):
     monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, own, **__: (there, own))
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
-    begin = Selected(job, fitted(2.0 * COLOURED))
+    begin = Selected(job, fitted(2.0 * COLOURED_RATIO))
     seen = SimpleNamespace(selected=begin, selection=lambda *_, **__: None)
     monkeypatch.setattr(disturbances.LinearisedInnovations, "of", lambda *_: seen)
     monkeypatch.setattr(
@@ -187,7 +189,7 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
     row = SimpleNamespace(group="fuselage_drag", kept=True)
-    begin = Selected(job, fitted(2.0 * COLOURED), (cast(Any, row),))
+    begin = Selected(job, fitted(2.0 * COLOURED_RATIO), (cast(Any, row),))
     model_errors = ModelErrors((Law("force_z", "airspeed_across", 0.2),), None)
     polished, examined, read = [], [], []
     chosen = iter([replace(begin, rows=()) if others else None, None])
@@ -274,7 +276,7 @@ def test_what_no_derivative_tells_is_judged_by_a_fit_with_it(
     without.at = lambda *_: "as it was"
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
     monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, __: (there, beside))
-    begin = Selected(NOBODY, fitted(2.0 * COLOURED))
+    begin = Selected(NOBODY, fitted(2.0 * COLOURED_RATIO))
 
     def seen(selected: Selected, *_: Any) -> Any:
         def grown(group: str | None) -> Selected | None:

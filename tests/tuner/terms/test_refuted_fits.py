@@ -11,7 +11,7 @@ import pytest
 
 from tests.tuner.terms.making import unfitted_with
 from tuner.search.explanation import Explanation
-from tuner.search.progress import COLOURED, Fitted
+from tuner.search.progress import COLOURED_RATIO, Fitted
 from tuner.terms import refit_with_disturbances, search_with_terms
 from tuner.terms.candidates import Selected
 
@@ -23,7 +23,7 @@ def ended_with(thrust: float, monkeypatch: pytest.MonkeyPatch) -> tuple[Selected
     values = space.numbers(start.point.coefficients)
     values["motor_constant"] *= thrust
     point = start.objective.start(space.vector_of(values))
-    scales = {name: {"position": 2.0 * COLOURED} for name in start.scales}
+    scales = {name: {"position": 2.0 * COLOURED_RATIO} for name in start.scales}
     end = replace(start, point=point, scales=scales)
 
     def selecting(job: Any, fitted: Fitted, *_: Any) -> Selected:
@@ -66,7 +66,7 @@ def test_neither_terms_nor_disturbances_explain_a_vehicle_that_falls(thrust, fli
     assert followed(found, monkeypatch) is flies
 
 
-@pytest.mark.parametrize(("others", "follows"), [(1.0, False), (2.0 * COLOURED, True)])
+@pytest.mark.parametrize(("others", "follows"), [(1.0, False), (2.0 * COLOURED_RATIO, True)])
 def test_what_one_flight_alone_lacks_is_no_disturbance(others, follows, monkeypatch):
     found, _ = ended_with(1.0, monkeypatch)
     scales = {"a": {"position": others}, "stray": {"position": 50.0}, "b": {"position": others}}

@@ -163,7 +163,7 @@ def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
     monkeypatch.setattr(own, "_with_all", lambda *_: searched.append(True))
     monkeypatch.setattr(own, "_with_added", lambda *_: standing)
     monkeypatch.setattr(own, "_rows", lambda *_: ())
-    monkeypatch.setattr(own, "_in_doubt", lambda *_: {})
+    monkeypatch.setattr(own, "_selection_shifts", lambda *_: {})
     monkeypatch.setattr(selection, "findings_at", lambda *_: ())
     monkeypatch.setattr(selection, "with_groups", lambda base, *_, **__: base)
     groups = {"fuselage_drag": ("fuselage_drag",)}
@@ -180,9 +180,11 @@ def test_what_an_elimination_took_is_not_tried_again_unless_it_was_no_part_of_it
     monkeypatch.setattr(own, "_score", lambda *_: score)
     monkeypatch.setattr(own, "linearised", lambda *_: standing)
     monkeypatch.setattr(own, "_with_all", lambda *_: standing)
-    monkeypatch.setattr(own, "_with_added", lambda _, __, groups, ___: wanted.extend(groups) or standing)
+    monkeypatch.setattr(
+        own, "_with_added", lambda _, __, groups, ___: wanted.extend(groups) or standing
+    )
     monkeypatch.setattr(own, "_rows", lambda _, __, dropped: rows.extend(dropped) or ())
-    monkeypatch.setattr(own, "_in_doubt", lambda *_: {})
+    monkeypatch.setattr(own, "_selection_shifts", lambda *_: {})
     groups = {"fuselage_drag": ("fuselage_drag",), "linear_drag": ("linear_drag_x",)}
     own(SimpleNamespace(), fitted, groups, print, print).run()
     assert wanted == ["linear_drag"]

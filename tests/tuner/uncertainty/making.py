@@ -50,11 +50,11 @@ def controller_file() -> ControllerFile:
 def references() -> ReferenceInlet:
     """Return a swing along three axes that grows quickly, and a hover with a turn about up."""
     time = np.arange(round(SECONDS * 100)) / 100.0
-    grow = np.minimum(time / 1.5, 1.0)
+    run_stages = np.minimum(time / 1.5, 1.0)
     still = np.zeros_like(time)
-    x = np.stack([grow * 1.2 * np.sin(2.2 * time), still], axis=-1)
-    y = np.stack([grow * 1.0 * np.sin(3.1 * time), still], axis=-1)
-    z = np.stack([1.0 + grow * 0.4 * np.sin(2.7 * time), still + 1.0], axis=-1)
+    x = np.stack([run_stages * 1.2 * np.sin(2.2 * time), still], axis=-1)
+    y = np.stack([run_stages * 1.0 * np.sin(3.1 * time), still], axis=-1)
+    z = np.stack([1.0 + run_stages * 0.4 * np.sin(2.7 * time), still + 1.0], axis=-1)
     nothing = Vec3.zeros(jnp.asarray(x))
     point = ReferencePoint(Vec3(jnp.asarray(x), jnp.asarray(y), jnp.asarray(z)), nothing, nothing)
     return ReferenceInlet(point, spins=jnp.asarray([False, True]), yaw_rate=jnp.asarray([0.0, 2.0]))

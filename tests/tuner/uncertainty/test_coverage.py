@@ -5,8 +5,8 @@ import pytest
 
 from tests.tuner.uncertainty.making import fitted_of, problem, truth, with_data
 from tuner.objective.segments import OFFSETS
-from tuner.search.continuation import grow
-from tuner.search.progress import Free, beginning, point_of
+from tuner.search.continuation import run_stages
+from tuner.search.progress import Free, initial_progress, point_of
 from tuner.search.stages import plan
 from tuner.uncertainty.estimates import uncertainty_of
 
@@ -34,8 +34,8 @@ def test_intervals_cover_the_truth():
     covered = np.zeros((REPEATS, len(FREE)), bool)
     for repeat in range(REPEATS):
         noisy = with_data(exact, truth(exact), noise=np.random.default_rng(100 + repeat))
-        progress = beginning(noisy, np.asarray(exact.space.initial)[None] + 0.02)
-        progress = grow(
+        progress = initial_progress(noisy, np.asarray(exact.space.initial)[None] + 0.02)
+        progress = run_stages(
             noisy, stages, progress, free=free, undecided={}, on_progress=lambda _: None
         )
         uncertainty = uncertainty_of(fitted_of(noisy, point_of(progress.points, 0)))

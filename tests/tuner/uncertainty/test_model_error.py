@@ -59,10 +59,12 @@ FUSELAGE = {"fuselage_drag": 0.05}
 def references() -> ReferenceInlet:
     """Return swings along three axes that grow, the last with a turn about up."""
     time = np.arange(round(SECONDS * RATE)) / RATE
-    grow, still = np.minimum(time / 4.0, 1.0), np.zeros((len(time), FLIGHTS))
+    run_stages, still = np.minimum(time / 4.0, 1.0), np.zeros((len(time), FLIGHTS))
     speeds = np.array([(1.9, 2.6, 1.7), (2.4, 1.3, 1.1), (1.5, 2.2, 1.9)])
     sizes = np.array([(1.6, 1.1, 0.4), (1.0, 1.9, 0.5), (0.7, 0.5, 0.4)])
-    x, y, z = (grow[:, None] * sizes[:, a] * np.sin(time[:, None] * speeds[:, a]) for a in range(3))
+    x, y, z = (
+        run_stages[:, None] * sizes[:, a] * np.sin(time[:, None] * speeds[:, a]) for a in range(3)
+    )
     nothing = Vec3.zeros(jnp.asarray(still))
     point = ReferencePoint(Vec3(*map(jnp.asarray, (x, y, z + 1.0))), nothing, nothing)
     turns = jnp.asarray([False, False, True])
@@ -338,7 +340,7 @@ def test_a_gain_that_is_far_off_is_told_beside_the_fit(factor):
 
 def test_odd_flights_say_nothing_of_the_controller_or_the_model(monkeypatch):
     fitted, flights = flown_with_p(1.06)
-    monkeypatch.setattr("tuner.uncertainty.model_error.odd_flights", frozenset)
+    monkeypatch.setattr("tuner.uncertainty.model_error.outlying_flights", frozenset)
     assert model_errors_of(fitted, flights) is None
 
 

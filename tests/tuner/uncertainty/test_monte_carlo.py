@@ -9,7 +9,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import Objective
-from tuner.search.levenberg_marquardt import advance, begin
+from tuner.search.levenberg_marquardt import advance, initial_step
 from tuner.uncertainty.estimates import uncertainty_of
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant")
@@ -23,7 +23,7 @@ def refit(objective: Objective, start: Point) -> Point:
     offsets = np.asarray(start.offsets)
     free = np.concatenate([np.ones(len(objective.space)), np.zeros(offsets.size)])
     points = Point(np.asarray(start.coefficients)[None], offsets[None])
-    step = begin(points)
+    step = initial_step(points)
     for _ in range(ITERATIONS):
         step = advance(objective, step, criterion, free)
     return Point(jnp.asarray(step.point.coefficients[0]), jnp.asarray(offsets))
