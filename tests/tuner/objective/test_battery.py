@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.interpolate import make_smoothing_spline
 
 from sim_jax.schedule import Schedule
 from tests.tuner.uncertainty.making import (
@@ -18,6 +19,7 @@ from tests.tuner.uncertainty.making import (
 )
 from tuner.core.errors import RecordingError
 from tuner.objective.battery import (
+    FEWEST,
     IDLE,
     _resistance,
     log_voltage_of,
@@ -131,6 +133,16 @@ def test_a_load_that_the_voltage_does_not_follow_is_left_out():
     (curve,) = voltages_of([idle])
     np.testing.assert_array_equal(curve.volts, curve.without_load)
     assert np.abs(curve.volts - 16.0).max() < NOISE
+
+
+@pytest.mark.parametrize("count", [FEWEST, 200])
+def test_a_curve_is_as_stiff_as_cross_validation_by_scipy_makes_it(count):
+    random = np.random.default_rng(0)
+    time = np.cumsum(random.uniform(0.05, 0.15, count))
+    volts = sagging(time) + NOISE * random.normal(size=count)
+    (curve,) = voltages_of([flight(volts=series(time, volts))])
+    expected = make_smoothing_spline(time, volts)(time)
+    np.testing.assert_allclose(curve.volts, expected, atol=1e-5 * NOISE)
 
 
 @pytest.mark.parametrize("gap", [0.01, 0.1, 1.0])
