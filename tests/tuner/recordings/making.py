@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sqlite3
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +25,17 @@ _HEADER = get_typestore(Stores.ROS2_HUMBLE).fielddefs["std_msgs/msg/Header"]
 
 def store_of(bag: Path, *, ros2: bool) -> Any:
     """Return the message types of a bag, with the header of ROS 1 or 2."""
+    with Reader(bag) as reader:
+        definitions = tuple((c.msgdef.data, c.msgtype) for c in reader.connections)
+    return _store_of(definitions, ros2=ros2)
+
+
+@cache
+def _store_of(definitions: tuple[tuple[str, str], ...], *, ros2: bool) -> Any:
     store = get_typestore(Stores.EMPTY)
     types: dict[str, Any] = {}
-    with Reader(bag) as reader:
-        for connection in reader.connections:
-            types.update(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+    for definition, name in definitions:
+        types.update(get_types_from_msg(definition, name))
     if ros2:
         types["std_msgs/msg/Header"] = _HEADER
     store.register(types)
@@ -65,6 +71,7 @@ def rewrite(
     target: Path,
     change: Callable[[str, int, Any], list[tuple[int, Any]]] | None = None,
     *,
+    of: Collection[str] | None = None,
     compression: str = "none",
     rename: Callable[[str], str] = lambda topic: topic,
     chunk: int | None = None,
@@ -72,8 +79,9 @@ def rewrite(
 ) -> Path:
     """Write a bag again, each message passed through `change(topic, time, message)`.
 
-    It returns the messages to write instead, each with its time of recording. Those that were
-    recorded ``until`` a time, in ns, or later are left out.
+    Those ``of`` some topics alone, where topics are given. It returns the messages to write
+    instead, each with its time of recording. Those that were recorded ``until`` a time, in ns, or
+    later are left out.
     """
     store = store_of(bag, ros2=False)
     writer = BagWriter(target)
@@ -90,7 +98,7 @@ def rewrite(
         }
         for connection, time, raw in reader.messages(stop=until):
             connection_out = connections[connection.id]
-            if change is None:
+            if change is None or connection.topic not in (of or {connection.topic}):
                 writer.write(connection_out, time, raw)
                 continue
             message = store.deserialize_ros1(raw, connection.msgtype)

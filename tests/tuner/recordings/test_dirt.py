@@ -32,8 +32,9 @@ def clean(short: Path) -> Flight:
 
 @pytest.fixture
 def dirty(short: Path, tmp_path: Path) -> Callable[[Change], Flight]:
-    """Load the short bag after each message went through a change."""
-    return lambda change: load_flight(making.rewrite(short, tmp_path / "dirty.bag", change))
+    """Load the short bag after each pose and each message of the gyro went through a change."""
+    bag, topics = tmp_path / "dirty.bag", (POSE, GYRO)
+    return lambda change: load_flight(making.rewrite(short, bag, change, of=topics))
 
 
 def noted(flight: Flight, code: NoteCode, *names: str, topic: str = "") -> Note:
