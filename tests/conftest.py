@@ -9,6 +9,7 @@ traced again, which takes seconds.
 
 from __future__ import annotations
 
+import gc
 import logging
 from collections import defaultdict
 from pathlib import Path
@@ -52,6 +53,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         folders[path in slow, path.parent].append(path)
     behind = {path: len(paths) - i for paths in folders.values() for i, path in enumerate(paths)}
     items.sort(key=lambda item: (item.path not in slow, -behind[item.path]))
+
+
+def pytest_collection_finish() -> None:
+    """Have no search for garbage look through all that the tests have imported."""
+    gc.freeze()
 
 
 @pytest.fixture
