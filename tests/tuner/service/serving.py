@@ -11,7 +11,7 @@ from tuner.service.app import serve
 from tuner.service.settings import Limits, ServiceSettings
 
 ROOT = Path(__file__).parents[3]
-FAKE_WORKER = [sys.executable, str(Path(__file__).with_name("fake_worker.py"))]
+FAKE_WORKER = [sys.executable, "-S", str(Path(__file__).with_name("fake_worker.py"))]
 
 
 def found_in_a_table(*_: object) -> dict[str, object]:
