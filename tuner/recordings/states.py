@@ -100,20 +100,26 @@ def local_parabolas(series: Series, times: Array, *, derivative: int = 0) -> Arr
 
     NaN where fewer than two samples lie around a time.
     """
+    half, known = half_width(series), np.isfinite(series.values)
+    alike = bool((known == known[:, :1]).all())
+    together = [slice(None)] if alike else [slice(c, c + 1) for c in range(known.shape[1])]
     columns = []
-    half = half_width(series)
-    for column in series.values.T:
-        known = np.isfinite(column)
-        columns.append(_local_parabola(series.time[known], column[known], times, half, derivative))
-    return np.column_stack(columns)
+    for own in together:
+        there = known[:, own].all(axis=1)
+        read = series.values[there, own]
+        columns.append(_local_parabola(series.time[there], read, times, half, derivative))
+    return np.hstack(columns)
 
 
 def _local_parabola(
     time: Array, values: Array, times: Array, half: float, derivative: int
 ) -> Array:
-    """Return the values, or slopes, of local parabolas, or of lines through few samples."""
+    """Return the values (n, k), or slopes, of local parabolas, or of lines through few samples.
+
+    Of samples (m, k), all of them known.
+    """
     if len(time) < 2:
-        return np.full(len(times), np.nan)
+        return np.full((len(times), values.shape[1]), np.nan)
     first = np.searchsorted(time, times - half - 1e-9)
     behind = np.searchsorted(time, times + half + 1e-9)
     # at the ends of a recording and in gaps, the nearest two samples
@@ -124,16 +130,15 @@ def _local_parabola(
     weight = (place < behind[:, None]).astype(float)
     place = np.minimum(place, len(time) - 1)
     away = (time[place] - times[:, None]) / half
-    count = weight.sum(axis=1)
-    powers = np.stack([np.ones_like(away), away, away**2], axis=1)
-    matrix = np.einsum("tpi,ti,tqi->tpq", powers, weight, powers)
-    right = np.einsum("tpi,ti,ti->tp", powers, weight, values[place])
-    line = count < 4
+    powers = np.cumprod([weight, *[away] * 4], axis=0)
+    matrix = powers.sum(axis=2)[np.add.outer(range(3), range(3))]
+    right = np.moveaxis(powers[:3], 0, 1) @ values[place]
+    matrix, line = np.moveaxis(matrix, 2, 0), behind - first < 4
     matrix[line, 2, :], matrix[line, :, 2], matrix[line, 2, 2] = 0.0, 0.0, 1.0
     right[line, 2] = 0.0
-    found = np.linalg.solve(matrix, right[..., None])[..., 0]
+    found = np.linalg.solve(matrix, right)
     near = np.abs(time[place] - times[:, None]).min(axis=1) <= MAX_SAMPLE_DISTANCE_S
-    return np.where(near, found[:, derivative] / half**derivative, np.nan)
+    return np.where(near[:, None], found[:, derivative] / half**derivative, np.nan)
 
 
 def initial_state(series: Mapping[str, Series]) -> InitialState:
