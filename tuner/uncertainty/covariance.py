@@ -191,13 +191,16 @@ def overdispersion_factors(
     own = 1.0 / np.square(correlation).sum(axis=1)
     usual = 0.5 * np.log(expected)
     usual = usual - own @ usual / own.sum()
-    beside = log_excess[:, None] - log_excess - usual[:, None, None]
-    about = 1.0 / (1.0 + (beside / SPREAD_QUARTILE) ** 2)
-    about /= about.sum(axis=1, keepdims=True)  # (K, excess, centre): of an excess, given a centre
-    of_centre = np.log(np.einsum("kx,kxc->kc", likelihood, about))
-    centre = -np.log1p((log_excess / CENTRE_QUARTILE) ** 2) + own @ of_centre
-    centre = np.exp(centre - centre.max())
-    weight = likelihood * (about @ centre)
+    # of an excess, given a centre, by the difference of both: the grid is even
+    points, step = TAU_GRID_POINTS, log_excess[1] - log_excess[0]
+    apart = step * np.arange(1 - points, points) - usual[:, None]
+    about = 1.0 / (1.0 + (apart / SPREAD_QUARTILE) ** 2)
+    until = np.cumsum(np.pad(about, ((0, 0), (1, 0))), axis=1)[:, ::-1]
+    total = until[:, :points] - until[:, points:]
+    of_centre = [np.correlate(*pair)[::-1] for pair in zip(about, likelihood, strict=True)]
+    centre = -np.log1p((log_excess / CENTRE_QUARTILE) ** 2) + own @ np.log(of_centre / total)
+    centre = np.exp(centre - centre.max()) / total
+    weight = likelihood * [np.convolve(*pair, "valid") for pair in zip(about, centre, strict=True)]
     weight /= weight.sum(axis=1, keepdims=True)
     sd, half = np.sqrt(variance), Z95
     low, high = np.zeros_like(ratio), np.full_like(ratio, np.log(sd[-1]))
