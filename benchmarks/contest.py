@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from benchmarks.regression import Regression
-from tuner.evaluate.prediction import Predictions, hold
-from tuner.evaluate.torque_observer import Fed, TorqueObserver
+from tuner.evaluate.prediction import Predictions, hold_state
+from tuner.evaluate.torque_observer import FedFlight, TorqueObserver
 from tuner.recordings.flight import Flight
 from tuner.vehicle import ControllerFile, VehicleFile
 
@@ -35,7 +35,10 @@ class Contest:
 
 
 def rivals(
-    unfitted: VehicleFile, fitted: VehicleFile, controller: ControllerFile, flights: Sequence[Fed]
+    unfitted: VehicleFile,
+    fitted: VehicleFile,
+    controller: ControllerFile,
+    flights: Sequence[FedFlight],
 ) -> tuple[tuple[str, VehicleFile, TorqueObserver | None], ...]:
     """Return the predictors of a vehicle that was fitted to flights: from the state, and beside it.
 
@@ -62,7 +65,7 @@ def simple(
     regression = Regression.of(fitted, signal)
     pairs = list(zip(held_out, like, strict=True))
     return {
-        "hold": [hold(flight, same.begins, same.ahead) for flight, same in pairs],
+        "hold": [hold_state(flight, same.begins, same.ahead) for flight, same in pairs],
         "linear regression": [
             regression.predict(flight, same.begins, same.ahead) for flight, same in pairs
         ],

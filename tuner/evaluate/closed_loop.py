@@ -51,12 +51,12 @@ from tuner.vehicle import (
 )
 from tuner.vehicle.model import Model, model_of, schedule_of, with_coefficients
 
-#: A grid of more flights than this is taken for a mistake.
+#: A larger grid is taken for a mistake.
 MAX_FLIGHTS = 100_000
 
 
 class Plan(Section):
-    """What is flown for how long, ``duration`` in s, and written how often, ``rate`` in Hz."""
+    """A trajectory, flown for ``duration`` s, with samples at ``rate`` Hz."""
 
     trajectory: TrajectorySettings
     duration: Annotated[Number, Interval(gt=0, le=3600)]
@@ -65,26 +65,26 @@ class Plan(Section):
 
 
 def fly(
-    asked: SimulationOptions, *, grid: Mapping[str, Array] | None = None, forces: bool = False
+    options: SimulationOptions, *, grid: Mapping[str, Array] | None = None, forces: bool = False
 ) -> Iterator[Simulation]:
     """Fly a trajectory once, or with each vehicle of a grid.
 
     Parameters
     ----------
-    asked
-        What flies, for how long and along what; all but the engine, which is the one in force.
+    options
+        Vehicle, controller, trajectory, duration and so on; the engine in force is used.
 
     Raises
     ------
     InputError
-        Something named does not exist, or cannot be flown.
+        A named file or coefficient does not exist, or the vehicle cannot be flown.
     """
-    given = vars(asked)
+    given = vars(options)
     shape = {name: given[name] for name in TrajectorySettings.model_fields if name != "name"}
     plan = build(
         Plan,
         {name: given[name] for name in Plan.model_fields}
-        | {"trajectory": {"name": asked.trajectory, **shape}},
+        | {"trajectory": {"name": options.trajectory, **shape}},
         "command line",
     )
     if plan.duration * plan.rate < 1.0:
@@ -96,14 +96,14 @@ def fly(
     if len(shapes) > 1 or any(len(shape) != 1 or shape == (0,) for shape in shapes):
         sizes = listed([f"{column.size} of {name}" for name, column in grid.items()])
         raise InputError("grid", f"holds {sizes}", "give one value of each for every flight")
-    vehicle, controller = asked.vehicle, asked.controller
+    vehicle, controller = options.vehicle, options.controller
     if isinstance(vehicle, str):
         vehicle = read_vehicle(find_config("vehicles", vehicle, Path()))
     if isinstance(controller, str):
         controller = read_controller(find_config("controllers", controller, Path()))
     for values in zip(*grid.values(), strict=True):
         check_filter(with_values(vehicle, dict(zip(grid, values, strict=True))), controller)
-    trajectory, speed = plan.trajectory, asked.speed
+    trajectory, speed = plan.trajectory, options.speed
     return simulate(
         vehicle,
         controller,
@@ -127,9 +127,9 @@ def grid_of(sweeps: Sequence[str]) -> dict[str, Array]:
     Raises
     ------
     InputError
-        Says which sweep is wrong, and how to write it.
+        A sweep is wrong, or names too many flights.
     """
-    axes = dict(_axis(sweep) for sweep in sweeps)
+    axes = dict(_sweep_values(sweep) for sweep in sweeps)
     if len(axes) < len(sweeps):
         raise InputError("--sweep", "names a coefficient twice", "sweep each once")
     count = math.prod(map(len, axes.values())) if axes else 0
@@ -139,7 +139,7 @@ def grid_of(sweeps: Sequence[str]) -> dict[str, Array]:
     return {name: values.ravel() for name, values in zip(axes, mesh, strict=True)}
 
 
-def _axis(sweep: str) -> tuple[str, Array]:
+def _sweep_values(sweep: str) -> tuple[str, Array]:
     name, _, span = sweep.partition("=")
     if name not in COEFFICIENTS:
         raise InputError(
@@ -162,8 +162,8 @@ def _axis(sweep: str) -> tuple[str, Array]:
     return name, values
 
 
-#: Vehicles that fly at once; more take turns, so that memory stays bounded.
-CHUNK = 256
+#: Vehicles that fly at once, which bounds the memory.
+MAX_LANES = 256
 
 
 @dataclass(frozen=True)
@@ -180,9 +180,9 @@ class Simulation:
     crash_time
         s at which the vehicle crashed and was frozen; None if it never did.
     coefficients
-        What was varied for this flight: coefficient -> value.
+        Varied coefficient -> its value in this flight.
     forces
-        What acted until it crashed, term by term, if asked for.
+        Force and moment of each term until a crash; None unless asked for.
     """
 
     time: Array
@@ -216,9 +216,9 @@ def simulate(
     grid
         Coefficient -> (B,) values of B vehicles; None flies the vehicle alone.
     precision
-        What to compute in: single precision is twice as fast for many vehicles.
+        Of the arithmetic: single precision is twice as fast for many vehicles.
     forces
-        Whether to give what acted along each flight, term by term.
+        Whether to return force and moment of each term.
 
     Yields
     ------
@@ -227,19 +227,19 @@ def simulate(
     """
     check_rotors(vehicle)
     flown = vehicle, controller, trajectory, duration, rate, precision, forces
-    pieces = ((columns, *flown) for columns in _pieces(grid or {}))
+    pieces = ((columns, *flown) for columns in _grid_pieces(grid or {}))
     engine = current()
     here = isinstance(engine, Here)  # flights then need not be in memory all at once
-    for flights in starmap(_flights, pieces) if here else engine.stream(_flown, pieces):
+    for flights in starmap(_flights_in, pieces) if here else engine.stream(_fly_piece, pieces):
         yield from flights
 
 
-def _flown(piece: tuple[Any, ...], _report: Report) -> list[Simulation]:
-    """Return what `_flights` yields: it leaves the process all at once."""
-    return list(_flights(*piece))
+def _fly_piece(piece: tuple[Any, ...], _report: Report) -> list[Simulation]:
+    """Return the flights of a piece as a list, to leave the process together."""
+    return list(_flights_in(*piece))
 
 
-def _flights(  # noqa: PLR0917 (a piece travels as a tuple)
+def _flights_in(  # noqa: PLR0917 (a piece travels as a tuple)
     columns: dict[str, Array],
     vehicle: VehicleFile,
     controller: ControllerFile,
@@ -255,12 +255,12 @@ def _flights(  # noqa: PLR0917 (a piece travels as a tuple)
     schedule = schedule_of(controller, log_rate=round(rate) if fits else None)
     control_rate = schedule.position_control_rate
     reference = published(trajectory, duration=duration, control_rate=control_rate)
-    sent = _sent(reference, clock, control_rate)
+    references = _reference_on(reference, clock, control_rate)
     samples = math.ceil(duration * schedule.log_rate) + 1
     log_time = np.arange(samples) / schedule.log_rate
     model = model_of(vehicle, controller)
-    fed = reference.inlet, reference.start
-    logged, crashes = _logged((columns, model, *fed), schedule, samples, precision)
+    inlet_and_start = reference.inlet, reference.start
+    logged, crashes = _run_flights((columns, model, *inlet_and_start), schedule, samples, precision)
     for segment, crash in enumerate(crashes):
         signals = {
             name: resample(name, Series(log_time, values[segment]), clock)
@@ -270,32 +270,32 @@ def _flights(  # noqa: PLR0917 (a piece travels as a tuple)
         coefficients = {name: float(column[segment]) for name, column in columns.items()}
         flight = Simulation(
             time=clock,
-            signals=signals | sent,
+            signals=signals | references,
             crash_time=float(crash) if np.isfinite(crash) else None,
             coefficients=coefficients,
         )
         yield _with_forces(flight, model) if forces else flight
 
 
-def _pieces(grid: Mapping[str, Array]) -> Iterator[dict[str, Array]]:
-    """Yield a grid in pieces of at most `CHUNK` vehicles."""
+def _grid_pieces(grid: Mapping[str, Array]) -> Iterator[dict[str, Array]]:
+    """Yield a grid in pieces of at most `MAX_LANES` vehicles."""
     count = len(next(iter(grid.values()))) if grid else 1
-    for start in range(0, count, CHUNK):
-        yield {name: np.asarray(column)[start : start + CHUNK] for name, column in grid.items()}
+    for start in range(0, count, MAX_LANES):
+        yield {name: np.asarray(column)[start : start + MAX_LANES] for name, column in grid.items()}
 
 
-def _logged(
+def _run_flights(
     flown: tuple[Mapping[str, Array], Model, Inlet, Vec3],
     schedule: Schedule,
     samples: int,
     precision: Precision,
 ) -> tuple[dict[str, Array], Array]:
     """Return signal -> (segments, samples, k), and the times (segments,) in s of crashes."""
-    given = jax.tree.map(np.asarray, flown)
-    columns, *shared = given
+    inputs = jax.tree.map(np.asarray, flown)
+    columns, *shared = inputs
     real = np.dtype(precision)
 
-    def kind(leaf: Array, *, lanes: bool, table: bool = False) -> Argument:
+    def argument_of(leaf: Array, *, lanes: bool, table: bool = False) -> Argument:
         dtype = real if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
         if lanes:
             return Argument((), dtype, lanes=True)
@@ -304,13 +304,13 @@ def _logged(
         )
 
     arguments = (
-        jax.tree.map(lambda leaf: kind(leaf, lanes=True), columns),
-        jax.tree.map(lambda leaf: kind(leaf, lanes=False), shared[0]),
-        jax.tree.map(lambda leaf: kind(leaf, lanes=False, table=True), shared[1]),
-        jax.tree.map(lambda leaf: kind(leaf, lanes=False), shared[2]),
+        jax.tree.map(lambda leaf: argument_of(leaf, lanes=True), columns),
+        jax.tree.map(lambda leaf: argument_of(leaf, lanes=False), shared[0]),
+        jax.tree.map(lambda leaf: argument_of(leaf, lanes=False, table=True), shared[1]),
+        jax.tree.map(lambda leaf: argument_of(leaf, lanes=False), shared[2]),
     )
     program = program_of(
-        _flight,
+        _fly_lane,
         arguments,
         schedule,
         precision,
@@ -319,7 +319,7 @@ def _logged(
         packages=CODE,
     )
     lanes = len(next(iter(columns.values()))) if columns else 1
-    rows_of, crash_time = program(given, lanes=lanes, turns=samples).values
+    rows_of, crash_time = program(inputs, lanes=lanes, turns=samples).values
     motion, setpoints = rows_of[MOTION], rows_of[SETPOINTS]
     logged = {
         "position": motion[..., 0:3],
@@ -334,10 +334,10 @@ def _logged(
     return {name: np.asarray(rows, np.float64) for name, rows in logged.items()}, crash_time
 
 
-def _flight(
-    schedule: Schedule, precision: Precision, given: Any, lengths: Mapping[str, int]
+def _fly_lane(
+    schedule: Schedule, precision: Precision, inputs: Any, lengths: Mapping[str, int]
 ) -> tuple[dict[str, Any], Any]:
-    columns, model, inlet, start = given
+    columns, model, inlet, start = inputs
     flown = with_coefficients(model, columns)
     plant, first = begun(
         flown.vehicle,
@@ -357,7 +357,7 @@ def _flight(
     return logged, last.crash_time
 
 
-def _sent(reference: Published, clock: Array, control_rate: float) -> dict[str, Array]:
+def _reference_on(reference: Published, clock: Array, control_rate: float) -> dict[str, Array]:
     """Return the reference in force at each instant of a clock."""
     tick = np.floor(clock * control_rate + 1e-9).astype(int)
     sent = {name: values[tick] for name, values in reference.signals.items()}
@@ -365,7 +365,7 @@ def _sent(reference: Published, clock: Array, control_rate: float) -> dict[str, 
 
 
 def _with_forces(flight: Simulation, model: Model) -> Simulation:
-    """Return a simulation with what acted until it ended or crashed."""
+    """Return a simulation with forces and moments until its end or crash."""
     values = {name: jnp.asarray(value) for name, value in flight.coefficients.items()}
     forces = forces_of(with_coefficients(model, values).vehicle, flight.time, flight.signals)
     crashed = flight.crash_time

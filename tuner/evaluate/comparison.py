@@ -1,11 +1,10 @@
-"""Recordings laid out once, and compared with any number of vehicles at the recorded stamps.
+"""Compare recordings with simulations of any number of vehicles at the recorded stamps.
 
-Simulation and reading at the stamps are those of the fit (`tuner.objective.residuals`), and so are
-the stretches: whole flights where the reference enters, windows from recorded starts where a signal
-further down does. A simulation that is fed motor commands, rotor speeds or rate set-points drifts
-away within seconds, whatever its coefficients; over a window its error says how good they are. A
-window starts from the recorded state, so that its end is predicted; how closely it is met from the
-likeliest start for the vehicle that flies, and with the likeliest trim, is another number.
+Simulation, interpolation at the stamps (`tuner.objective.residuals`) and segments are those of the
+fit: whole flights if the reference is the input, windows otherwise. A simulation fed with motor
+commands, rotor speeds or rate set-points drifts away within seconds whatever its coefficients; over
+a window its error measures them. A window starts from the recorded state, so that its end is a
+prediction. The error from the most likely start and trim of a vehicle is reported separately.
 """
 
 from __future__ import annotations
@@ -24,9 +23,16 @@ from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array
 from tuner.core.shipped import find_config
-from tuner.evaluate.forces import Forces, acting
+from tuner.evaluate.forces import Forces, forces_of_terms
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse, Row, Table, check_table_file, write_table
-from tuner.evaluate.rmse import FlightErrors, SignalErrors, joined, laps_of, rmse_of, short_way
+from tuner.evaluate.rmse import (
+    FlightErrors,
+    SignalErrors,
+    concatenate,
+    laps_of,
+    rmse_of,
+    wrap_degrees,
+)
 from tuner.evaluate.simulation_files import roll_pitch_yaw
 from tuner.findings.findings import one_line
 from tuner.objective.battery import with_reference_voltage
@@ -57,26 +63,27 @@ from tuner.vehicle import ControllerFile, VehicleFile, check_rotors, read_vehicl
 from tuner.vehicle.model import Model, model_of, schedule_of
 
 POSE = ("position", "attitude")
-LAG = 0.03
-"""s over which recent commands give the speed of a rotor without tachometer."""
-BEYOND = 0.02
-"""s simulated beyond a window, for stamps that are late."""
-LOOSE = 10.0
-"""Multiple of the noise by which a simulation may miss before its start is doubted."""
-FORCES_RATE = 50.0
-"""Hz at which forces along a flight are kept: they are drawn, nothing is computed from them."""
-ROUNDS = 3
-"""Steps towards the likeliest start."""
+ROTOR_LAG_S = 0.03
+"""The lag by which recent commands give the speed of a rotor without tachometer."""
+WINDOW_MARGIN_S = 0.02
+"""Windows are simulated so much longer, for late stamps."""
+MISFIT_SCALE = 10.0
+"""Residuals are divided by so many times the noise when starts are estimated, so that the model's
+errors hardly move them."""
+FORCES_RATE_HZ = 50.0
+"""Forces are only plotted, so that a lower rate than the log's will do."""
+GAUSS_NEWTON_STEPS = 3
+"""Gauss-Newton steps towards the most likely start."""
 
 
 class Comparison:
-    """Recordings laid out once, to be compared with any number of vehicles.
+    """Recordings as segments, for comparison with any number of vehicles.
 
     Parameters
     ----------
     recordings
         At least one. Their clock offsets are taken as known (`with_known` of
-        `tuner.search.job_flights`); one that a fit would estimate counts as zero.
+        `tuner.search.job_flights`); unknown ones are zero.
     window
         s, length of the windows of flights that are not simulated in a closed loop; None takes
         that of their inlet.
@@ -84,7 +91,7 @@ class Comparison:
     Raises
     ------
     RecordingError
-        A flight does not hold what its inlet needs.
+        A flight lacks a signal that its inlet needs.
     """
 
     def __init__(
@@ -115,10 +122,10 @@ class Comparison:
         Parameters
         ----------
         fitted_starts
-            Of flights in windows alone, from the likeliest starts and trims, which are fitted to
-            each window: how well the vehicle can meet it, not how well it predicts.
+            Whether to return flights in windows only, from the most likely starts and trims,
+            fitted to each window: the error of a fit, not of a prediction.
         flier
-            What flies segments: another simulator than this project's.
+            Function that flies segments, for another simulator.
 
         Raises
         ------
@@ -133,7 +140,7 @@ class Comparison:
 
 
 class _Group:
-    """The recordings that enter the loop at the same place, flown side by side."""
+    """The recordings with one inlet, flown side by side."""
 
     def __init__(
         self,
@@ -146,15 +153,15 @@ class _Group:
         self._schedule = schedule_of(controller)
         self._inlet, self._seconds = inlet, seconds
         self.windowed = not INLETS[inlet].closed_loop
-        self._stride = max(1, round(self._schedule.log_rate / FORCES_RATE))
+        self._stride = max(1, round(self._schedule.log_rate / FORCES_RATE_HZ))
         rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
         if self.windowed:
-            self._segments, pieces = self._laid(free_starts=False)
+            self._segments, pieces = self._window_segments(free_starts=False)
             self._windows = [
                 tuple(piece.window for piece in pieces if piece.number == number)
                 for number in range(len(flights))
             ]
-            self._samples, self._limits = math.ceil((seconds + BEYOND) * rate), AIRBORNE
+            self._samples, self._limits = math.ceil((seconds + WINDOW_MARGIN_S) * rate), AIRBORNE
         else:
             self._windows = [(Window(flight, 0.0),) for flight in flights]
             self._segments = segments_of(
@@ -165,15 +172,15 @@ class _Group:
             longest = max(flight.duration for flight in flights)
             self._samples, self._limits = math.ceil(longest * rate) + 2, limits_of(flights)
         late = np.array([recording.time_offset or 0.0 for recording in recordings])
-        self._late = late[np.asarray(self._segments.flight)]
+        self._stamp_delays = late[np.asarray(self._segments.flight)]
         names = sorted({name for recording in recordings for name in recording.conditions})
         self._conditions = {
             name: np.array([recording.conditions.get(name, 0.0) for recording in recordings])
             for name in names
         }
 
-    def _laid(self, *, free_starts: bool) -> tuple[Segments, list[Piece]]:
-        """Return the windows, which start as recorded or near there."""
+    def _window_segments(self, *, free_starts: bool) -> tuple[Segments, list[Piece]]:
+        """Return the windows, with starts as recorded or, if free, near them."""
         flights = [recording.flight for recording in self._recordings]
         inlets = [self._inlet] * len(flights)
         pieces = pieces_of(
@@ -188,7 +195,7 @@ class _Group:
             inlets=inlets,
             seconds=self._seconds,
             schedule=self._schedule,
-            lag=LAG,
+            lag=ROTOR_LAG_S,
             noise=noise_of(flights),
             free_starts=free_starts,
             pieces=pieces,
@@ -202,22 +209,22 @@ class _Group:
         fitted_starts: bool = False,
         flier: Callable[..., Flown] = fly,
     ) -> dict[str, FlightErrors]:
-        """Return flight name to its errors, those of windows behind each other."""
+        """Return flight name -> its errors, concatenated over windows."""
         check_rotors(vehicle)
         flights = [recording.flight for recording in self._recordings]
         model = model_of(with_reference_voltage(vehicle, flights), self._controller)
         segments, states = self._segments, None
         if fitted_starts:
-            segments, _ = self._laid(free_starts=True)
+            segments, _ = self._window_segments(free_starts=True)
             states = self._likeliest_starts(model, segments)
         elif self.windowed:
-            segments = self._spinning(vehicle)
-        simulated, acted, crash_times = self._flown(model, segments, states, flier)
+            segments = self._with_rotor_speeds(vehicle)
+        simulated, acted, crash_times = self._simulated(model, segments, states, flier)
         errors, first = {}, 0
         for recording, windows in zip(self._recordings, self._windows, strict=True):
             flight, crash = recording.flight, float(crash_times[first])
             position, attitude = (
-                joined(
+                concatenate(
                     [
                         self._errors(signal, simulated[signal], first + number, window)
                         for number, window in enumerate(windows)
@@ -237,15 +244,14 @@ class _Group:
             first += len(windows)
         return errors
 
-    def _flown(
+    def _simulated(
         self, model: Model, segments: Segments, states: Array | None, flier: Callable[..., Flown]
     ) -> tuple[dict[str, Array], dict[str, Array], Array]:
-        """Return signal -> (F, n, c) simulated at the recorded stamps, and crash times (F,) in s.
+        """Return simulated signals, forces, and crash times (F,) in s.
 
-        Between the two, term -> what acted at every ``stride``-th sample, (F, m, 6).
-
-        A stamp that is so late that it was taken before the simulation begins, or so early that it
-        was taken behind its end, is compared with the simulation's first or last sample.
+        Signal -> (F, n, c) at the recorded stamps, and term -> (F, m, 6) force and moment at every
+        ``stride``-th sample. A stamp before the simulation's start, or after its end, is compared
+        with its first or last sample.
         """
         owner = np.asarray(self._segments.flight)
         conditions = {name: values[owner] for name, values in self._conditions.items()}
@@ -260,7 +266,7 @@ class _Group:
             channels=(*POSE, SPEEDS, MOTION, TURNED),
         )
         rate, calm = float(self._schedule.log_rate), np.zeros(segments.count)
-        acted = acting(
+        acted = forces_of_terms(
             model.vehicle,
             flown.channels[MOTION],
             flown.channels[TURNED],
@@ -274,7 +280,7 @@ class _Group:
         simulated = {}
         for signal in POSE:
             time = np.asarray(segments.measured[signal].time)
-            taken = np.clip(time - self._late, 0.0, (self._samples - 1) / rate).T
+            taken = np.clip(time - self._stamp_delays, 0.0, (self._samples - 1) / rate).T
             simulated[signal] = at_stamps(flown.channels[signal], signal, taken, reading)
         return simulated, acted, flown.crash_time
 
@@ -289,16 +295,13 @@ class _Group:
         flown = simulated[segment, used]
         if signal == "attitude":
             recorded, flown = roll_pitch_yaw(recorded), roll_pitch_yaw(flown)
-            return SignalErrors(time[used] + window.begin, recorded, short_way(flown - recorded))
+            return SignalErrors(time[used] + window.begin, recorded, wrap_degrees(flown - recorded))
         return SignalErrors(time[used] + window.begin, recorded, flown - recorded)
 
     def _forces(
         self, acted: Mapping[str, Array], first: int, windows: Sequence[Window], end: float
     ) -> Forces:
-        """Return what acted along the segments of a flight, behind each other, up to a time in s.
-
-        A window's last instants, which the next one begins with, are left out.
-        """
+        """Return the forces along a flight's segments up to a time in s, without overlaps."""
         count = next(iter(acted.values())).shape[1]
         time = np.arange(count) * self._stride / self._schedule.log_rate
         shown = time < (self._seconds if self.windowed else end)
@@ -312,8 +315,8 @@ class _Group:
         )
         return whole.before(windows[0].flight.duration) if self.windowed else whole
 
-    def _spinning(self, vehicle: VehicleFile) -> Segments:
-        """Return the windows whose rotors without tachometer have followed their commands."""
+    def _with_rotor_speeds(self, vehicle: VehicleFile) -> Segments:
+        """Return the windows with starting speeds from commands for rotors without tachometer."""
         motor = vehicle.motor
         lag = 0.5 * (motor.time_constant_up + motor.time_constant_down)
         pieces = [window.flight for windows in self._windows for window in windows]
@@ -321,9 +324,9 @@ class _Group:
         return replace(self._segments, turning=turning)
 
     def _likeliest_starts(self, model: Model, segments: Segments) -> Array:
-        """Return the likeliest starts (L, F), in the segments' standard deviations.
+        """Return the most likely starts (L, F), in the segments' standard deviations.
 
-        By Gauss and Newton's steps from the recorded starts, halved where they overshoot.
+        They follow from Gauss-Newton steps from the recorded starts, halved where they overshoot.
         """
         assert segments.freedom is not None
         names, flights = tuple(self._conditions), len(self._recordings)
@@ -342,15 +345,15 @@ class _Group:
         ]
         none = np.zeros((len(OFFSETS), flights))
         point = Point(np.zeros(0), np.asarray(np.stack([*none, *rows])))
-        loose = {name: np.full(flights, LOOSE) for name in segments.measured}
+        loose = {name: np.full(flights, MISFIT_SCALE) for name in segments.measured}
         criterion = plain_criterion(objective, self._samples, loose)
         trial = best = np.zeros(segments.freedom.shape)
         least = np.full(trial.shape[1], np.inf)
-        for _ in range(ROUNDS + 1):  # the last one judges the step before it
+        for _ in range(GAUSS_NEWTON_STEPS + 1):  # the last one judges the step before it
             there = replace(criterion, states=np.asarray(trial))
             sums = objective.sums(point, there, derivatives=False)
             squares = np.sum([np.asarray(each) for each in sums.squares.values()], axis=0)
-            misfit = np.nan_to_num(squares / LOOSE**2 + (trial**2).sum(axis=0), nan=np.inf)
+            misfit = np.nan_to_num(squares / MISFIT_SCALE**2 + (trial**2).sum(axis=0), nan=np.inf)
             better = misfit <= least
             best, least = np.where(better, trial, best), np.where(better, misfit, least)
             asked = np.asarray(sums.states)
@@ -360,8 +363,8 @@ class _Group:
 
 
 OVERALL = "all"
-#: A lap in which fewer poses were recorded than this is left out.
-FEWEST_POSES = 10
+#: A lap with fewer poses is left out.
+MIN_POSES = 10
 
 
 def compare(
@@ -385,17 +388,17 @@ def compare(
     on_flown
         Called with vehicle -> flight -> errors.
     on_message
-        Called with a line on each flight that is left out, or simulated otherwise than asked.
+        Called with a line on each flight that is left out, or simulated with another inlet.
 
     Returns
     -------
     tuple
-        The table, and what was settled.
+        The table, and the settings.
 
     Raises
     ------
     InputError
-        Something named does not exist or cannot be used, or a file cannot be written.
+        A named input does not exist or cannot be used, or a file cannot be written.
     """
     for path in out:
         check_table_file(path)
@@ -408,7 +411,7 @@ def compare(
         raise InputError("--vehicle", "names no vehicle", "name the vehicles to compare")
     if not isinstance(vehicles, Mapping):
         vehicles = {name: name for name in vehicles}
-    sets = {label: _vehicle(named) for label, named in vehicles.items()}
+    sets = {label: _read_vehicle(named) for label, named in vehicles.items()}
     recordings, noticed = read_recordings(settings, fits=False)
     for finding in (*logged, *noticed):
         on_message(one_line(finding))
@@ -421,7 +424,7 @@ def compare(
     return table, settings
 
 
-def _vehicle(named: str | VehicleFile) -> VehicleFile:
+def _read_vehicle(named: str | VehicleFile) -> VehicleFile:
     if isinstance(named, VehicleFile):
         return named
     return read_vehicle(find_config("vehicles", named, Path()))
@@ -436,7 +439,7 @@ def table_of(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Table:
         )
         for row in stretch
     ]
-    return Table(vehicles=tuple(flown), best=_best(rows), rows=tuple(rows))
+    return Table(vehicles=tuple(flown), best=_best_vehicle(rows), rows=tuple(rows))
 
 
 def _rows(vehicle: str, flights: Mapping[str, FlightErrors]) -> list[Row]:
@@ -452,7 +455,7 @@ def _rows(vehicle: str, flights: Mapping[str, FlightErrors]) -> list[Row]:
             rows += [
                 row(name, number, lap.rmse, errors.crash_time)
                 for number, lap in enumerate(laps, start=1)
-                if len(lap.position.time) >= FEWEST_POSES
+                if len(lap.position.time) >= MIN_POSES
             ]
     crashes = [e.crash_time for e in flights.values() if e.crash_time is not None]
     overall = rmse_of(list(flights.values()))
@@ -460,7 +463,7 @@ def _rows(vehicle: str, flights: Mapping[str, FlightErrors]) -> list[Row]:
     return rows
 
 
-def _best(rows: Sequence[Row]) -> str | None:
+def _best_vehicle(rows: Sequence[Row]) -> str | None:
     """Return the vehicle whose overall RMSE has the smallest product over the axes."""
     scores = {}
     for row in rows:

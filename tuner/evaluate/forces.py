@@ -1,6 +1,6 @@
-"""What acted along a simulated flight: the force and moment of each term of the simulator.
+"""Force and moment of each term of the simulator along a flight.
 
-The thesis draws them so (Fig. 8.2), to see which effect matters in which flight.
+The thesis plots them (Fig. 8.2), to show which effect matters in which flight.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ WEIGHT = "gravity"
 class Forces:
     """Force and moment of each term along a flight.
 
-    Together the forces are mass times acceleration, the moments the rate of change of the angular
-    momentum.
+    The forces sum to mass times acceleration, the moments to the derivative of angular momentum.
 
     Attributes
     ----------
@@ -50,12 +49,12 @@ class Forces:
     of_term: Mapping[str, Array]
 
     def before(self, end: float) -> Forces:
-        """Return what acted until a time in s."""
+        """Return the forces before a time in s."""
         inside = self.time < end
         return Forces(self.time[inside], {n: v[inside] for n, v in self.of_term.items()})
 
 
-def acting(
+def forces_of_terms(
     vehicle: Vehicle,
     motion: Array,
     attitude: Array,
@@ -65,9 +64,9 @@ def acting(
     wind: tuple[Array, Array] | None = None,
     stride: int = 1,
 ) -> dict[str, Array]:
-    """Return term -> (F, m, 6) of what acted at every ``stride``-th sample, as in `Forces`.
+    """Return term -> (F, m, 6) force and moment at every ``stride``-th sample, as in `Forces`.
 
-    In the order of the simulator's terms, gravity last.
+    The order is that of the simulator's terms, gravity last.
 
     Parameters
     ----------
@@ -88,36 +87,38 @@ def acting(
     rows = [part[:, ::stride].reshape(flights * samples, -1).T for part in logged]
     calm = np.zeros(flights)
     air = [np.repeat(along, samples) for along in (*(wind or (calm, calm)), calm)]
-    given = (jax.tree.map(np.asarray, vehicle), *rows, np.stack(air))
-    of_vehicle, *of_lanes = given
+    inputs = (jax.tree.map(np.asarray, vehicle), *rows, np.stack(air))
+    of_vehicle, *of_lanes = inputs
     arguments = (
         jax.tree.map(partial(Argument.of, lanes=False), of_vehicle),
         *(Argument.of(rows, lanes=True) for rows in of_lanes),
     )
-    program = program_of(_acting, arguments, name="forces", made_of=total.TERMS, packages=CODE)
-    acted: dict[str, Array] = program(given, lanes=flights * samples).values
+    program = program_of(
+        _sample_forces, arguments, name="forces", made_of=total.TERMS, packages=CODE
+    )
+    acted: dict[str, Array] = program(inputs, lanes=flights * samples).values
     names = (*(term.__name__ for term in total.TERMS), WEIGHT)
     return {n: acted[n].reshape(flights, samples, 6) for n in names if n in acted}
 
 
-def _acting(given: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:
-    """Return term -> (6,) of what acts at one sample."""
-    vehicle, motion, attitude, speeds, accelerations, wind = given
+def _sample_forces(inputs: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:
+    """Return term -> (6,) force and moment at one sample."""
+    vehicle, motion, attitude, speeds, accelerations, wind = inputs
     rotors = len(vehicle.rotors)
-    moves = Motion(
+    body_motion = Motion(
         Vec3.of(motion[0:3]), Vec3.of(motion[3:6]), Quaternion.of(attitude), Vec3.of(motion[6:9])
     )
-    around = Environment(wind=Vec3.of(wind))
-    turning = tuple(speeds[i] for i in range(rotors))
-    air = Air.around(vehicle, moves, around, tuple(accelerations[i] for i in range(rotors)))
-    wrenches = wrench_of_each_term(vehicle, moves, turning, air)
+    ambient = Environment(wind=Vec3.of(wind))
+    rotor_speeds = tuple(speeds[i] for i in range(rotors))
+    air = Air.around(vehicle, body_motion, ambient, tuple(accelerations[i] for i in range(rotors)))
+    wrenches = wrench_of_each_term(vehicle, body_motion, rotor_speeds, air)
     parts = {
         name: (*_components(wrench.force), *_components(wrench.moment))
         for name, wrench in wrenches.items()
     }
-    pull = air.up * (-GRAVITY * vehicle.body.mass)
+    weight = air.up * (-GRAVITY * vehicle.body.mass)
     none = jnp.zeros(())
-    parts[WEIGHT] = (*_components(pull), none, none, none)
+    parts[WEIGHT] = (*_components(weight), none, none, none)
     return {
         name: jnp.stack([jnp.broadcast_to(value, ()) for value in values])
         for name, values in parts.items()
@@ -125,7 +126,7 @@ def _acting(given: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:
 
 
 def forces_of(vehicle: Vehicle, time: Array, signals: Mapping[str, Array]) -> Forces:
-    """Return what acted along a simulated flight.
+    """Return force and moment of each term along a simulated flight.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def forces_of(vehicle: Vehicle, time: Array, signals: Mapping[str, Array]) -> Fo
     names = ("position", "velocity", "body_rate")
     motion = np.concatenate([signals[name] for name in names], axis=1)
     logged = (motion, signals["attitude"], signals["rotor_speed"])
-    parts = acting(vehicle, *(np.asarray(part, float)[None] for part in logged), rate=rate)
+    parts = forces_of_terms(vehicle, *(np.asarray(part, float)[None] for part in logged), rate=rate)
     return Forces(time, {name: part[0] for name, part in parts.items()})
 
 

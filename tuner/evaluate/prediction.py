@@ -1,8 +1,8 @@
-"""What a vehicle does after each recorded state, fed with the recorded inputs, against what it did.
+"""Open-loop predictions of a flight from its recorded states and inputs, and their errors.
 
-A prediction begins at the recorded state (`tuner.recordings.states`) and is simulated open loop
-for a stated time. Nothing is fitted to the flight that is predicted: no start, no trim, no offset.
-From the state alone, or with the torque that an observer has told just before.
+A prediction begins at a recorded state (`tuner.recordings.states`) and is simulated open loop for a
+stated time, with or without an observed disturbance torque. Nothing is fitted to the predicted
+flight: no start, no trim, no offset.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from tuner.recordings.states import States, states_at
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle.model import Model, model_of, schedule_of
 
-AT_ONCE = 4096
+PREDICTIONS_AT_ONCE = 4096
 """Predictions that are simulated side by side."""
-SHARED = 2.0
-"""s over which predictions share their errors: the half second that they overlap in, and what then
-disturbs the flight."""
+CORRELATION_TIME_S = 2.0
+"""Errors of predictions are correlated over so long: they overlap by half a second, and share
+disturbances."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,7 @@ class Predictions:
         (S,) s after that at which they are compared.
     errors
         Quantity of `PREDICTED` -> (S, n): Euclidean distance from the recorded one, for an attitude
-        the angle of the rotation between both; what the inlet follows, and does not predict, is
-        left out.
+        the angle of the rotation between both. Quantities that are inputs are left out.
     """
 
     begins: Array
@@ -59,20 +58,19 @@ class Predictions:
     errors: Mapping[str, Array]
 
     def mean(self, seconds: float) -> dict[str, float]:
-        """Return each quantity's mean error so many s ahead, NaN of what is not predicted."""
+        """Return each quantity's mean error so many s ahead; NaN if it is not predicted."""
         step = self._step(seconds)
         means = {name: float(np.nanmean(errors[step])) for name, errors in self.errors.items()}
         return dict.fromkeys(PREDICTED, np.nan) | means
 
     def worse_than(self, other: Predictions, seconds: float) -> tuple[str, ...]:
-        """Return which quantities another predicts better so many s ahead, from the same states.
+        """Return the quantities that another predicts significantly better so many s ahead.
 
-        In the mean, and by more than chance: the test of Diebold and Mariano ("Comparing predictive
-        accuracy", 1995) on differences of errors, 95 %. Predictions share their errors for
-        `SHARED`, so that means over so much scatter, by Student's t; of one nothing can be said.
+        By the test of Diebold and Mariano ("Comparing predictive accuracy", 1995) on differences of
+        errors, 95 %: Student's t of means over `CORRELATION_TIME_S`, of which it needs two.
         """
         step = self._step(seconds)
-        count = round((self.begins[-1] - self.begins[0]) / SHARED)
+        count = round((self.begins[-1] - self.begins[0]) / CORRELATION_TIME_S)
         if count < 2:
             return ()
         allowed = stdtrit(count - 1, 0.975) / np.sqrt(count)
@@ -106,29 +104,31 @@ def predict(
     Parameters
     ----------
     vehicle, controller
-        What flies; the controller gives the rates of the simulation.
+        The model; the controller gives the rates of the simulation.
     flight, inlet
-        The recording and what of it is fed in.
+        The recording and its inlet.
     seconds
         s that each prediction lasts.
     stride
         s from one prediction to the next; by default one sample.
     input_late
-        s by which what is fed in is stamped later than the recorded state.
+        s by which the input is stamped later than the recorded state.
     observer
-        Tells the torque that no input shows when a prediction begins.
+        Gives the disturbance torque at the start of a prediction.
 
     Raises
     ------
     RecordingError
         The flight never holds so many s of pose and input.
     """
-    course = Course(flight, inlet, seconds=seconds, stride=stride, input_late=input_late)
-    return course.predicted(vehicle, controller, observer)
+    predictor = FlightPredictor(
+        flight, inlet, seconds=seconds, stride=stride, input_late=input_late
+    )
+    return predictor.predict(vehicle, controller, observer)
 
 
-class Course:
-    """A flight cut into what is predicted of it: the same for each of several vehicles.
+class FlightPredictor:
+    """Predicts one flight from the same states with any vehicle.
 
     Parameters, units and errors are those of `predict`.
     """
@@ -162,13 +162,13 @@ class Course:
         """The states that predictions are compared with, step by step."""
         return states_at(self.flight.series, (self.begins + self.ahead[:, None]).ravel())
 
-    def predicted(
+    def predict(
         self,
         vehicle: VehicleFile,
         controller: ControllerFile,
         observer: TorqueObserver | None = None,
     ) -> Predictions:
-        """Return what a vehicle is predicted to do."""
+        """Return the predictions with a vehicle."""
         motor, schedule = vehicle.motor, schedule_of(controller)
         segments = window_segments(
             [self.flight],
@@ -180,7 +180,7 @@ class Course:
             free_starts=False,
             pieces=self._pieces,
         )
-        segments = _taken(segments, self._whole)
+        segments = _select(segments, self._whole)
         if observer is not None:
             known = self.flight, self.inlet, self.input_late
             segments = replace(segments, disturbance=observer.disturbance(known, self.begins))
@@ -195,7 +195,7 @@ class Course:
 def errors_of(
     reached: Mapping[str, Array], recorded: States, shape: tuple[int, int]
 ) -> dict[str, Array]:
-    """Return quantity -> (S, n) distances of what was reached (S, n, k) from recorded states."""
+    """Return quantity -> (S, n) distances of reached states (S, n, k) from recorded ones."""
     errors = {}
     for name in PREDICTED:
         there = getattr(recorded, name).reshape(*shape, -1)
@@ -220,10 +220,10 @@ def _simulated(
         return np.asarray(before + share * (after - before))
 
     parts = []
-    for first in range(0, segments.count, AT_ONCE):
+    for first in range(0, segments.count, PREDICTIONS_AT_ONCE):
         flown = fly(
             model,
-            _taken(segments, np.arange(first, min(first + AT_ONCE, segments.count))),
+            _select(segments, np.arange(first, min(first + PREDICTIONS_AT_ONCE, segments.count))),
             schedule,
             samples=int(np.ceil(place[-1] - 1e-6)) + 2,
             limits=AIRBORNE,
@@ -241,18 +241,18 @@ def _simulated(
     return {name: np.concatenate([part[name] for part in parts], axis=1) for name in PREDICTED}
 
 
-def _taken(segments: Segments, chosen: NDArray[np.intp]) -> Segments:
+def _select(segments: Segments, chosen: NDArray[np.intp]) -> Segments:
     """Return some of the segments, which lie along the last axis."""
     taken: Segments = jax.tree.map(lambda leaf: leaf[..., chosen], segments)
     return taken
 
 
-def hold(
+def hold_state(
     flight: Flight, begins: Array, ahead: Array, recorded: States | None = None
 ) -> Predictions:
-    """Predict that the state stays as it was recorded: the naive predictor.
+    """Predict a constant state: the naive predictor.
 
-    ``recorded``: `Course.recorded`, where it is known.
+    ``recorded`` is `FlightPredictor.recorded`, if it is known.
     """
     start = states_at(flight.series, begins)
     shape = (len(ahead), len(begins))

@@ -1,7 +1,4 @@
-"""Errors of flights as ``result.json`` holds them, and their table as CSV, JSON or HTML.
-
-Pages and terminals read both without the simulator.
-"""
+"""Records of flights' errors in ``result.json``, and their table as CSV, JSON or HTML."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ AXES = {"position": ("x", "y", "z"), "attitude": ("roll", "pitch", "yaw")}
 
 
 class AxesRmse(Part):
-    """The thesis's six: position along world x, y, z in m; roll, pitch, yaw in degrees.
+    """RMSE of position along world x, y, z in m, and of roll, pitch, yaw in degrees.
 
     None stands for a flight that crashed or an axis that was not recorded.
     """
@@ -32,24 +29,23 @@ class AxesRmse(Part):
     pitch: FiniteOrNone
     yaw: FiniteOrNone
 
-    def together(self, signal: str) -> float | None:
-        """Return the RMSE over the axes of position or attitude; None if one has none."""
+    def norm_or_none(self, signal: str) -> float | None:
+        """Return the norm over the axes of position or attitude; None if an axis lacks its RMSE."""
         parts = [getattr(self, axis) for axis in AXES[signal]]
         return None if None in parts else math.hypot(*parts)
 
-    def length(self, signal: str) -> float:
-        """Return the same; infinite for a crash."""
-        together = self.together(signal)
+    def norm(self, signal: str) -> float:
+        """Return the same; infinite instead of None."""
+        together = self.norm_or_none(signal)
         return math.inf if together is None else together
 
 
 class PredictedErrors(Part):
-    """How far open-loop predictions lie from the recording, ``seconds`` after they begin.
+    """Mean errors of open-loop predictions of a flight, ``seconds`` after they begin.
 
-    Means over all predictions of a flight of the Euclidean distance in position (m), velocity (m/s)
-    and body rate (rad/s), and of the angle between the attitudes (rad). Each begins at the recorded
-    state, filtered within hundredths of a second (`tuner.recordings.states`); nothing is
-    fitted to it.
+    They are means of the Euclidean distance in position (m), velocity (m/s) and body rate (rad/s),
+    and of the angle between the attitudes (rad). Each prediction begins at the recorded, filtered
+    state (`tuner.recordings.states`); nothing is fitted to it.
     """
 
     seconds: float
@@ -72,11 +68,11 @@ class Row(Part):
     lap
         From 1; None for the whole flight. The last may be incomplete.
     vehicle
-        As the user calls it.
+        Its label.
     rmse
         m and degrees.
     crash_time
-        s at which the simulated vehicle crashed; None if it flew.
+        s at which the simulated vehicle crashed; None if it did not.
     """
 
     flight: str
@@ -87,9 +83,9 @@ class Row(Part):
 
 
 class Table(ResultFile):
-    """The rows of all stretches and vehicles, and which vehicle is closest to the recordings.
+    """The rows of all stretches and vehicles, and the vehicle closest to the recordings.
 
-    ``best`` is None where each vehicle crashed on some flight. A run writes one of its initial and
+    ``best`` is None if each vehicle crashed on some flight. A run writes a table of its initial and
     best coefficients.
     """
 
@@ -109,7 +105,7 @@ class Table(ResultFile):
         )
 
     def winners(self, flight: str, lap: int | None) -> dict[str, str]:
-        """Return axis to the vehicle with the lowest RMSE over a stretch."""
+        """Return axis -> vehicle with the lowest RMSE over a stretch."""
         winners = {}
         for axis in RMSE_UNITS:
             known = [

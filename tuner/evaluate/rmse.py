@@ -1,4 +1,4 @@
-"""What a comparison gives: simulated minus recorded at the recorded stamps, and its RMSE."""
+"""Errors of a simulation at the recorded stamps, simulated minus recorded, and their RMSE."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Pose = Literal["position", "attitude"]
 
 @dataclass(frozen=True)
 class SignalErrors:
-    """One recorded signal and how far a simulation is from it.
+    """One recorded signal and the error of its simulation.
 
     Attributes
     ----------
@@ -42,13 +42,13 @@ class SignalErrors:
 
     @property
     def simulated(self) -> Array:
-        """What was simulated (n, 3), angles beside the recorded ones rather than within ±180."""
+        """(n, 3) simulated values; angles are near the recorded ones rather than within ±180."""
         return self.recorded + self.error
 
 
 @dataclass(frozen=True)
 class FlightErrors:
-    """One flight, flown with one vehicle.
+    """The errors of one flight with one vehicle.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class FlightErrors:
     crash_time
         s; None for a flight that did not crash.
     forces
-        What acted along the simulation, term by term, until it crashed.
+        Force and moment of each term along the simulation, until a crash.
     """
 
     name: str
@@ -78,12 +78,12 @@ class FlightErrors:
 
     @property
     def rmse(self) -> AxesRmse:
-        """The thesis's six; None throughout for a crash."""
+        """The RMSE of all six axes; None for a crash."""
         return rmse_of([self])
 
 
 def rmse_of(flights: Sequence[FlightErrors]) -> AxesRmse:
-    """Return the RMSE over all samples of some flights, None throughout if one crashed."""
+    """Return the RMSE over all samples of some flights; None if one crashed."""
     if any(flight.crash_time is not None for flight in flights):
         return AxesRmse(**dict.fromkeys(RMSE_UNITS))
     values = [
@@ -98,8 +98,8 @@ def _root_mean_square(errors: Array) -> list[float | None]:
     return [float(np.sqrt(np.mean(c**2))) if len(c) else None for c in columns]
 
 
-def joined(parts: Sequence[SignalErrors]) -> SignalErrors:
-    """Return the errors of stretches of one signal, behind each other."""
+def concatenate(parts: Sequence[SignalErrors]) -> SignalErrors:
+    """Return the errors of successive stretches of one signal as one."""
     return SignalErrors(
         *(
             np.concatenate([getattr(part, field) for part in parts])
@@ -108,8 +108,8 @@ def joined(parts: Sequence[SignalErrors]) -> SignalErrors:
     )
 
 
-def short_way(degrees: Array) -> Array:
-    """Return angles in degrees within ±180."""
+def wrap_degrees(degrees: Array) -> Array:
+    """Return angles in degrees, wrapped to ±180."""
     return (degrees + 180.0) % 360.0 - 180.0
 
 

@@ -1,4 +1,4 @@
-"""Simulated flights on disk: tables and bags as a recording would be."""
+"""Simulated flights as CSV tables and ROS 1 bags."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from tuner.core.numerics import Array
 from tuner.evaluate.closed_loop import Simulation
 from tuner.evaluate.forces import COMPONENTS
 
-#: ns since 1970 of the first sample; a fixed one, so that the same flight gives the same file.
-EPOCH = 1_577_836_800_000_000_000
+#: Time of the first sample since 1970; fixed, so that the same flight gives the same file.
+EPOCH_NS = 1_577_836_800_000_000_000
 RPM_PER_RAD_S = 60.0 / (2.0 * np.pi)
 #: µs of PWM at command 0, and from there to command 1.
 PWM_LOW, PWM_SPAN = 1000, 1000
-#: s of hover at the first point before the set-points begin, as labs record them.
-HOVER_BEFORE = 2.0
+#: Hover at the first point before the set-points begin, as labs record it.
+HOVER_LEAD_S = 2.0
 BATTERY = "/mavros/battery"
 ONLY_IN_FLIGHT = ("/mavros/setpoint_raw/attitude", "/mavros/rc/out")
-#: Mask of a reference that holds position, velocity and acceleration.
-NO_JERK_NO_SNAP = 2
-#: Mask of a set-point that is a body rate.
-NO_ATTITUDE = 128
+#: Ignores jerk and snap of a reference.
+REFERENCE_MASK = 2
+#: Ignores the attitude of a set-point.
+BODY_RATE_MASK = 128
 
-#: Message types of MAVROS and of the controllers, which ROS itself does not bring along.
+#: Message types of MAVROS and of the controllers, which ROS lacks.
 DEFINITIONS = {
     "mavros_msgs/msg/RCOut": "std_msgs/Header header\nuint16[] channels\n",
     "mavros_msgs/msg/RPM": "std_msgs/Header header\nuint8 index\nfloat32 frequency\n",
@@ -64,12 +64,11 @@ TOPICS = {
 
 
 def write_bag(simulation: Simulation, path: Path) -> None:
-    """Write a flight as MAVROS, a motion capture system and the trajectory publisher record one.
+    """Write a flight as recorded from MAVROS, motion capture and the trajectory publisher.
 
-    What comes before time zero is hover, without set-points and commands; where nothing does, two
-    seconds at the first point come first. Every message carries the time at which it is true;
-    nothing is late, or noisier than the flight. Commands are PWM in whole µs, as autopilots send
-    them. The file appears whole.
+    Samples before time zero are hover, without set-points and commands; without such samples two
+    seconds of hover at the first point are added. Stamps are exact, and no noise is added. Commands
+    are PWM in whole µs, as from autopilots. The file is written atomically.
 
     Raises
     ------
@@ -92,43 +91,43 @@ def _write(simulation: Simulation, path: Path) -> None:
             for topic, kind in TOPICS.items()
             if topic != BATTERY or "battery_voltage" in simulation.signals
         }
-        for topic, nanoseconds, message in _in_time(simulation, messages):
+        for topic, nanoseconds, message in _timed_messages(simulation, messages):
             raw = store.serialize_ros1(message, TOPICS[topic])
             writer.write(connections[topic], nanoseconds, raw)
 
 
-def _in_time(simulation: Simulation, messages: _Messages) -> Iterator[tuple[str, int, Any]]:
+def _timed_messages(simulation: Simulation, messages: _Messages) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, time in ns and message of the hover before the flight, then of the flight."""
     flown, step = simulation.time >= 0.0, float(simulation.time[1] - simulation.time[0])
-    mission, hover = _rows(simulation, flown), _rows(simulation, ~flown)
+    mission, hover = _samples_at(simulation, flown), _samples_at(simulation, ~flown)
     if not len(hover.time):
-        hover = _rows(simulation, np.zeros(round(HOVER_BEFORE / step), int))
+        hover = _samples_at(simulation, np.zeros(round(HOVER_LEAD_S / step), int))
     for number in range(len(hover.time)):
-        nanoseconds = EPOCH + round(number * step * 1e9)
+        nanoseconds = EPOCH_NS + round(number * step * 1e9)
         for topic, message in messages.at(hover, number, nanoseconds):
             if topic not in ONLY_IN_FLIGHT:
                 yield topic, nanoseconds, message
     for index, seconds in enumerate(mission.time):
-        nanoseconds = EPOCH + round((len(hover.time) * step + float(seconds)) * 1e9)
+        nanoseconds = EPOCH_NS + round((len(hover.time) * step + float(seconds)) * 1e9)
         for topic, message in messages.at(mission, index, nanoseconds):
             yield topic, nanoseconds, message
 
 
-def _rows(simulation: Simulation, rows: NDArray[Any]) -> Simulation:
+def _samples_at(simulation: Simulation, rows: NDArray[Any]) -> Simulation:
     """Return some samples of a simulation."""
     signals = {name: values[rows] for name, values in simulation.signals.items()}
     return replace(simulation, time=simulation.time[rows], signals=signals)
 
 
 class _Messages:
-    """Makes the messages of one instant."""
+    """Makes the messages of one sample."""
 
     def __init__(self, types: Mapping[str, Any]) -> None:
         self._types = types
         self._still = self._make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
 
     def at(self, flight: Simulation, index: int, nanoseconds: int) -> Iterator[tuple[str, Any]]:
-        """Yield topic and message for every topic that has one then."""
+        """Yield topic and message of every topic with one at a sample."""
         now = {name: values[index].tolist() for name, values in flight.signals.items()}
         stamp = self._make("builtin_interfaces/msg/Time", *divmod(nanoseconds, 1_000_000_000))
         world = self._make("std_msgs/msg/Header", index, stamp, "map")
@@ -160,7 +159,7 @@ class _Messages:
             self._make(
                 "mavros_msgs/msg/AttitudeTarget",
                 body,
-                NO_ATTITUDE,
+                BODY_RATE_MASK,
                 self._make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
                 self._vector(now["rate_setpoint"]),
                 now["thrust_setpoint"][0],
@@ -173,7 +172,7 @@ class _Messages:
             self._make(
                 "controller_msgs/msg/FlatTarget",
                 world,
-                NO_JERK_NO_SNAP,
+                REFERENCE_MASK,
                 *parts,
                 self._still,
                 self._still,
@@ -219,7 +218,7 @@ class _Messages:
 Append = Callable[[Mapping[str, float], Sequence[str], Sequence[Array]], None]
 
 _XYZ = ("x", "y", "z")
-#: Signal -> the columns that hold it, in the order of the file.
+#: Signal -> its columns, in the order of the file.
 COLUMNS: dict[str, tuple[str, ...]] = {
     "position": _XYZ,
     "velocity": ("vx", "vy", "vz"),
@@ -236,7 +235,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
 
 
 def write_csv(simulations: Iterable[Simulation], path: Path) -> None:
-    """Write flights below each other.
+    """Write flights below each other in one table.
 
     Units: s, m, m/s (world), degrees for roll, pitch, yaw, rad/s (body), rad/s, commands and thrust
     set-point 0..1; the quaternion is body to world.
@@ -247,7 +246,7 @@ def write_csv(simulations: Iterable[Simulation], path: Path) -> None:
         The file cannot be written.
     """
     names = [name for columns in COLUMNS.values() for name in columns]
-    with flights_below_each_other(path) as append:
+    with flight_table(path) as append:
         for simulation in simulations:
             signals = {
                 **simulation.signals,
@@ -258,7 +257,7 @@ def write_csv(simulations: Iterable[Simulation], path: Path) -> None:
 
 
 def write_forces(simulation: Simulation, append: Append) -> None:
-    """Append what acted along a flight, one column per term and component, as ``thrust_fz``."""
+    """Append a flight's forces, one column per term and component, as ``thrust_fz``."""
     if simulation.forces is not None:
         time, of_term = simulation.forces.time, simulation.forces.of_term
         names = [f"{term}_{component}" for term in of_term for component in COMPONENTS]
@@ -266,11 +265,11 @@ def write_forces(simulation: Simulation, append: Append) -> None:
 
 
 @contextmanager
-def flights_below_each_other(path: Path) -> Iterator[Append]:
-    """Write a CSV of flights: what is yielded appends one.
+def flight_table(path: Path) -> Iterator[Append]:
+    """Yield a function that appends a flight to a CSV file, which is written atomically.
 
-    It takes the coefficients that were varied for the flight, which are the first columns, the
-    names of its columns behind ``time``, and time and columns. The file appears whole.
+    Its arguments are the flight's varied coefficients, which are the first columns, the names of
+    the columns after ``time``, and time and columns.
 
     Raises
     ------
@@ -298,7 +297,7 @@ def flights_below_each_other(path: Path) -> Iterator[Append]:
 
 
 def roll_pitch_yaw(attitude: Array) -> Array:
-    """Return (N, 3) degrees of (N, 4) quaternions w, x, y, z: turned by yaw, pitch, then roll."""
+    """Return (N, 3) degrees of (N, 4) quaternions w, x, y, z; rotation order yaw, pitch, roll."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import)
 
     turns = Rotation.from_quat(attitude, scalar_first=True)
@@ -308,7 +307,7 @@ def roll_pitch_yaw(attitude: Array) -> Array:
 
 @dataclass(frozen=True)
 class Summary:
-    """One simulated flight in a line.
+    """Summary of one simulated flight.
 
     Attributes
     ----------
@@ -329,24 +328,23 @@ class Summary:
 def write_flights(
     simulations: Iterable[Simulation], path: Path, *, forces: Path | None = None
 ) -> tuple[Summary, ...]:
-    """Write flights as they come, as ``.csv`` or one of them as a ROS 1 ``.bag``.
+    """Write flights as a ``.csv``, or a single one as a ROS 1 ``.bag``.
 
     Parameters
     ----------
     simulations
         The flights, with their forces where ``forces`` is given.
     forces
-        A ``.csv`` for what acted along them, term by term (`tuner.evaluate.forces`).
+        A ``.csv`` for force and moment of each term (`tuner.evaluate.forces`).
 
     Raises
     ------
     InputError
-        A file's suffix is another, several flights are to go into one bag, or it cannot be
-        written.
+        A file's suffix is another, a bag would hold several flights, or a file cannot be written.
     """
     writers: dict[str, Callable[[Iterator[Simulation], Path], None]] = {
         ".csv": write_csv,
-        ".bag": _write_only_one,
+        ".bag": _write_one_bag,
     }
     if path.suffix not in writers:
         raise InputError(path, f"no flight is written as '{path.suffix}'", "name a .csv or a .bag")
@@ -356,21 +354,21 @@ def write_flights(
             raise InputError(forces, "forces are written as a .csv of their own", "name one")
         check_file(forces)
     summaries: list[Summary] = []
-    with nullcontext() if forces is None else flights_below_each_other(forces) as append:
+    with nullcontext() if forces is None else flight_table(forces) as append:
 
-        def passing() -> Iterator[Simulation]:
+        def summarised() -> Iterator[Simulation]:
             for simulation in simulations:
                 summaries.append(summary_of(simulation))
                 if append is not None:
                     write_forces(simulation, append)
                 yield simulation
 
-        writers[path.suffix](passing(), path)
+        writers[path.suffix](summarised(), path)
     return tuple(summaries)
 
 
 def summary_of(simulation: Simulation) -> Summary:
-    """Return what is worth knowing of a flight."""
+    """Return the summary of a flight."""
     signals = simulation.signals
     error = signals["position"] - signals["reference_position"]
     x, y, z = np.sqrt(np.mean(error**2, axis=0)).tolist()
@@ -378,7 +376,7 @@ def summary_of(simulation: Simulation) -> Summary:
     return Summary(simulation.coefficients, simulation.crash_time, float(speed.max()), (x, y, z))
 
 
-def _write_only_one(simulations: Iterator[Simulation], path: Path) -> None:
+def _write_one_bag(simulations: Iterator[Simulation], path: Path) -> None:
     first = next(simulations)
     if next(simulations, None) is not None:
         raise InputError(path, "a bag holds one flight", "write a grid as .csv")

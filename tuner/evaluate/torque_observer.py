@@ -1,12 +1,12 @@
-"""The torque that no input shows, as the last samples before a prediction tell it.
+"""An observer of the disturbance torque just before a prediction begins.
 
-Where gusts turn a vehicle its loop answers with its rotors, and a simulation that is fed with these
-alone turns against what it does not know. What the angular acceleration was just before a
-prediction begins, minus what the model makes of state and inputs, is that torque; of it is carried
-on what is usually left so much later: its autocorrelation on fitted flights, the best linear
-prediction from one value (Brockwell and Davis, "Time series: theory and methods", 1991, 2.4 and
-5.1). Incremental control leans on the same acceleration (Smeur, Chu and de Croon, "Adaptive
-incremental nonlinear dynamic inversion for attitude control of micro air vehicles", 2016).
+The rotors of a vehicle answer gusts, so that a simulation that is fed with rotor speeds alone turns
+against a torque that it does not know. The residual of the model's angular acceleration at the last
+step before a prediction shows that torque. It decays in the prediction by its autocorrelation on
+fitted flights, which is the best linear prediction from one value (Brockwell and Davis, "Time
+series: theory and methods", 1991, 2.4 and 5.1). Incremental control uses the same acceleration
+(Smeur, Chu and de Croon, "Adaptive incremental nonlinear dynamic inversion for attitude control of
+micro air vehicles", 2016).
 """
 
 from __future__ import annotations
@@ -27,50 +27,50 @@ from tuner.recordings.flight import Flight
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle.model import model_of, schedule_of
 
-RATE = 100.0
-"""Hz of the ticks on which what is left is told."""
-LONGEST = 1.0
-"""s after which nothing is left."""
-TICKS = np.arange(round(LONGEST * RATE) + 1) / RATE
+RATE_HZ = 100.0
+"""The rate of the torque in a prediction."""
+MAX_LAG_S = 1.0
+"""The torque is zero after longer lags."""
+LAGS = np.arange(round(MAX_LAG_S * RATE_HZ) + 1) / RATE_HZ
 
-FED = ("rotor_speed", "actuator")
-"""Inlets in which recorded rotors or commands turn the vehicle."""
-Fed = tuple[Flight, InletName, float]
-"""A flight, what of it is fed in, and by how many s that is stamped late."""
+ROTOR_INLETS = ("rotor_speed", "actuator")
+"""Inlets with recorded rotor speeds or commands as input."""
+FedFlight = tuple[Flight, InletName, float]
+"""A flight, its inlet, and the delay in s of the input's stamps."""
 
 
 @dataclass(frozen=True)
 class TorqueObserver:
-    """Tells what turns a vehicle unseen.
+    """Observes the disturbance torque.
 
     Attributes
     ----------
     vehicle, controller
-        What is taken off an angular acceleration.
-    left
-        (T, 3) share of it, about each axis, that is left after `TICKS`.
+        The model whose angular acceleration is subtracted.
+    autocorrelation
+        (T, 3) of the residual about each axis at `LAGS`.
     """
 
     vehicle: VehicleFile
     controller: ControllerFile
-    left: Array
+    autocorrelation: Array
 
     @staticmethod
     def of(
-        vehicle: VehicleFile, controller: ControllerFile, fitted: Sequence[Fed]
+        vehicle: VehicleFile, controller: ControllerFile, fitted: Sequence[FedFlight]
     ) -> TorqueObserver | None:
-        """Return the observer of a vehicle fitted to some flights; None if these say nothing."""
-        products = np.zeros((len(TICKS), 3))
+        """Return the observer of a vehicle fitted to some flights; None if these have no residuals."""
+        products = np.zeros((len(LAGS), 3))
         for flight in fitted:
-            found = _unseen(vehicle, controller, flight)
+            found = _residual_acceleration(vehicle, controller, flight)
             if found is None:
                 continue
             part, unseen = found
-            lags = range(min(len(unseen), round(LONGEST / part.step) + 1))
+            lags = range(min(len(unseen), round(MAX_LAG_S / part.step) + 1))
             rows = [np.sum(unseen[lag:] * unseen[: len(unseen) - lag], axis=0) for lag in lags]
             times = np.array(lags) * part.step
             products += np.stack(
-                [np.interp(TICKS, times, row, right=0.0) for row in np.transpose(rows)], axis=1
+                [np.interp(LAGS, times, row, right=0.0) for row in np.transpose(rows)], axis=1
             )
         if not (products[0] > 0.0).all():
             return None
@@ -79,33 +79,33 @@ class TorqueObserver:
             vehicle, controller, np.where(np.minimum.accumulate(left) > 0.0, left, 0.0)
         )
 
-    def disturbance(self, fed: Fed, begins: Array) -> Disturbance | None:
-        """Return what acts on predictions that begin at (n,) s; None where the flight says nothing.
+    def disturbance(self, fed: FedFlight, begins: Array) -> Disturbance | None:
+        """Return the torque in predictions that begin at (n,) s; None without residuals.
 
-        Where the last step before is not known, nothing does.
+        It is zero if the step before is unknown.
         """
-        found = _unseen(self.vehicle, self.controller, fed)
+        found = _residual_acceleration(self.vehicle, self.controller, fed)
         if found is None:
             return None
         part, unseen = found
         last = np.searchsorted(part.time + 0.5 * part.step, begins + 1e-9) - 1
         torque = np.where(last[:, None] < 0, 0.0, unseen[last])
         inertia = self.vehicle.inertia
-        # from the middle of that step; white noise of the gyro is in that step alone
-        lag = np.maximum(TICKS + 0.5 * part.step, part.step)
+        # lags count from the middle of that step; its white noise of the gyro does not last
+        lag = np.maximum(LAGS + 0.5 * part.step, part.step)
         acting = [
-            np.interp(lag, TICKS, self.left[:, axis])[:, None] * moment * torque[:, axis]
+            np.interp(lag, LAGS, self.autocorrelation[:, axis])[:, None] * moment * torque[:, axis]
             for axis, moment in enumerate((inertia.xx, inertia.yy, inertia.zz))
         ]
-        return Disturbance(moment=Vec3(*acting), rate=RATE)
+        return Disturbance(moment=Vec3(*acting), rate=RATE_HZ)
 
 
-def _unseen(
-    vehicle: VehicleFile, controller: ControllerFile, fed: Fed
+def _residual_acceleration(
+    vehicle: VehicleFile, controller: ControllerFile, fed: FedFlight
 ) -> tuple[Steps, Array] | None:
-    """Return a flight's steps, and what of their angular acceleration (N, 3) the model lacks.
+    """Return a flight's steps, and the model's residual angular accelerations (N, 3), rad/s².
 
-    Zero where it is unknown. None where rotors do not turn the vehicle, or too little is known.
+    They are zero where unknown. None if the inlet lies above the rotors, or too little is known.
     """
     flight, inlet, late = fed
     model = model_of(with_reference_voltage(vehicle, [flight]), controller)

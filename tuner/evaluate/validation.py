@@ -1,7 +1,7 @@
-"""How well a flight is predicted by the initial and the fitted vehicle, and how well it is met.
+"""Validation: errors of flights with the initial and with the fitted vehicle.
 
-Predictions begin at recorded states and nothing is fitted to the flight that is predicted; what is
-fitted to it, the starts of windows and their trims, makes another number with another name.
+Predictions begin at recorded states, and nothing is fitted to the predicted flight. Errors with
+fitted starts and trims of windows have a name of their own.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.prediction import Course, Predictions, hold
+from tuner.evaluate.prediction import FlightPredictor, Predictions, hold_state
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, Pose
-from tuner.evaluate.torque_observer import FED, TorqueObserver
+from tuner.evaluate.torque_observer import ROTOR_INLETS, TorqueObserver
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS
@@ -45,7 +45,7 @@ def vehicle_fitted(job: Job, fitted: Fitted) -> VehicleFile:
 
 
 def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
-    """Return each free coefficient's reported value: fitted, or initial for one that is held."""
+    """Return each free coefficient's reported value: fitted, or initial if it is held."""
     initial, values = initial_of(job), job.space.numbers(fitted.point.coefficients)
     tied = (p.ratios for p in job.space.parameters if p.name in fitted.held.values())
     held = {*impossible_inertia(job, fitted), *(name for ratios in tied for name in ratios)}
@@ -69,7 +69,7 @@ def initial_of(job: Job) -> dict[str, float]:
 
 
 def impossible_inertia(job: Job, fitted: Fitted) -> tuple[str, ...]:
-    """Return the fitted moments of inertia, if together they are no rigid body's."""
+    """Return the fitted moments of inertia if no rigid body can have them."""
     fit, initial = job.space.numbers(fitted.point.coefficients), initial_of(job)
     inertia = [name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia"]
     moments = {name: fit.get(name, initial[name]) for name in inertia}
@@ -88,9 +88,9 @@ def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
 
 
 def conditions_of(job: Job, fitted: Fitted) -> dict[str, dict[str, float]]:
-    """Return flight -> name -> what surrounded it.
+    """Return flight -> name -> its condition (wind, battery).
 
-    It was estimated of the fitted flights; those held out are predicted with their mean.
+    Those of fitted flights were estimated; held-out ones get their mean.
     """
     names = fitted.objective.conditions
     rows = np.asarray(fitted.point.offsets)[len(OFFSETS) :] * units_of(names)[:, None]
@@ -102,7 +102,7 @@ def conditions_of(job: Job, fitted: Fitted) -> dict[str, dict[str, float]]:
 
 
 def comparison_of(job: Job, fitted: Fitted) -> Comparison:
-    """Return the job's recordings laid out as the search ended: controller, clocks, air."""
+    """Return the comparison of a job with the fitted controller, clocks and conditions."""
     recordings = with_known(
         job.recordings, time_offset=offsets_of(job, fitted), conditions=conditions_of(job, fitted)
     )
@@ -110,33 +110,33 @@ def comparison_of(job: Job, fitted: Fitted) -> Comparison:
     return Comparison(recordings, controller_flown(job, fitted), window=window)
 
 
-AHEAD = (0.1, 0.5)
-"""s after which predictions are compared."""
-STRIDE = 0.1
-"""s from one prediction to the next."""
+HORIZONS_S = (0.1, 0.5)
+"""Times ahead at which predictions are compared."""
+STRIDE_S = 0.1
+"""Time from one prediction to the next."""
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Flight -> how well it is simulated, with the initial and with the fitted vehicle.
+    """Flight -> errors of its simulation with the initial and with the fitted vehicle.
 
     Attributes
     ----------
     initial, best
-        Whole in the closed loop, else in windows from recorded states.
+        Of whole flights in the closed loop, else of windows from recorded states.
     fitted_starts
-        As ``best``, but windows start where the vehicle meets them best; flights in windows only.
+        As ``best``, with fitted starts of windows; flights in windows only.
     predicted_initial, predicted_best
-        Open-loop predictions; flights in windows only.
+        Of open-loop predictions; flights in windows only.
     predicted_with_observer
-        Likewise by the fitted vehicle, with the torque that fed rotors do not show before them.
+        The same with the fitted vehicle and an observed disturbance torque.
     predicted_holding
-        That the state stays as it was recorded, at the times of these predictions.
+        Of the prediction that the state stays constant.
     worse_than_holding
-        s ahead -> the quantities that the fitted vehicle predicts worse than that, chance apart.
+        s ahead -> quantities that the fitted vehicle predicts significantly worse than that.
     turning_explained
-        Share of the squared change of body rate that the fitted vehicle predicts; flights in
-        windows only.
+        Share of the mean squared change of body rate that the fitted vehicle predicts; flights
+        in windows only.
     """
 
     initial: Mapping[str, FlightErrors]
@@ -151,8 +151,8 @@ class Validation:
 
 
 @dataclass(frozen=True)
-class _Predicted:
-    """Predictions of one flight; ``observed`` where an observer can tell something of it."""
+class _FlightPredictions:
+    """Predictions of one flight; ``observed`` with an observed torque, None without rotor inputs."""
 
     initial: Predictions
     best: Predictions
@@ -163,31 +163,35 @@ class _Predicted:
 def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
     """Fly every flight with the initial and with the fitted vehicle."""
     comparison, initial = comparison_of(job, fitted), job.given.vehicle
-    predicted = _predicted(job, fitted, vehicle)
+    predicted = _predict_flights(job, fitted, vehicle)
     return Validation(
         initial=comparison.fly(initial),
         best=comparison.fly(vehicle),
         fitted_starts=comparison.fly(vehicle, fitted_starts=True),
-        predicted_initial={name: _errors(of.initial) for name, of in predicted.items()},
-        predicted_best={name: _errors(of.best) for name, of in predicted.items()},
+        predicted_initial={name: _mean_errors(of.initial) for name, of in predicted.items()},
+        predicted_best={name: _mean_errors(of.best) for name, of in predicted.items()},
         predicted_with_observer={
-            name: _errors(of.observed) for name, of in predicted.items() if of.observed is not None
+            name: _mean_errors(of.observed)
+            for name, of in predicted.items()
+            if of.observed is not None
         },
-        predicted_holding={name: _errors(of.held) for name, of in predicted.items()},
+        predicted_holding={name: _mean_errors(of.held) for name, of in predicted.items()},
         worse_than_holding={
-            name: {seconds: of.best.worse_than(of.held, seconds) for seconds in AHEAD}
+            name: {seconds: of.best.worse_than(of.held, seconds) for seconds in HORIZONS_S}
             for name, of in predicted.items()
         },
         turning_explained={
-            name: 1.0 - _turning_missed(of.best) / _turning_missed(of.held)
+            name: 1.0 - _body_rate_mse(of.best) / _body_rate_mse(of.held)
             for name, of in predicted.items()
             if "body_rate" in of.best.errors
         },
     )
 
 
-def _predicted(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, _Predicted]:
-    """Return flight -> its predictions, of those that are not flown in a closed loop."""
+def _predict_flights(
+    job: Job, fitted: Fitted, vehicle: VehicleFile
+) -> dict[str, _FlightPredictions]:
+    """Return flight -> its predictions, for flights that are not flown in a closed loop."""
     controller = controller_flown(job, fitted)
     known = [(r.flight, r.inlet, r.input_late) for r in job.recordings if not r.holdout]
     observer = TorqueObserver.of(vehicle, controller, known)
@@ -195,51 +199,50 @@ def _predicted(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, _Pre
     for recording in job.recordings:
         if INLETS[recording.inlet].closed_loop:
             continue
-        course = Course(
+        predictor = FlightPredictor(
             recording.flight,
             recording.inlet,
-            seconds=max(AHEAD),
-            stride=STRIDE,
+            seconds=max(HORIZONS_S),
+            stride=STRIDE_S,
             input_late=recording.input_late,
         )
-        best = course.predicted(vehicle, controller)
-        observes = observer is not None and recording.inlet in FED
-        found[recording.flight.name] = _Predicted(
-            initial=course.predicted(job.given.vehicle, controller),
+        best = predictor.predict(vehicle, controller)
+        observes = observer is not None and recording.inlet in ROTOR_INLETS
+        found[recording.flight.name] = _FlightPredictions(
+            initial=predictor.predict(job.given.vehicle, controller),
             best=best,
-            held=_unchanged(course, best),
-            observed=course.predicted(vehicle, controller, observer) if observes else None,
+            held=_hold_errors(predictor, best),
+            observed=predictor.predict(vehicle, controller, observer) if observes else None,
         )
     return found
 
 
-def _unchanged(course: Course, predictions: Predictions) -> Predictions:
-    """Return what is off if a flight's state stays, of what predictions of it predict."""
-    naive = hold(course.flight, course.begins, course.ahead, course.recorded)
+def _hold_errors(predictor: FlightPredictor, predictions: Predictions) -> Predictions:
+    """Return the errors of a constant state in the predicted quantities."""
+    naive = hold_state(predictor.flight, predictor.begins, predictor.ahead, predictor.recorded)
     return replace(naive, errors={name: naive.errors[name] for name in predictions.errors})
 
 
-def _errors(of: Predictions) -> tuple[PredictedErrors, ...]:
-    return tuple(PredictedErrors(seconds=seconds, **of.mean(seconds)) for seconds in AHEAD)
+def _mean_errors(of: Predictions) -> tuple[PredictedErrors, ...]:
+    return tuple(PredictedErrors(seconds=seconds, **of.mean(seconds)) for seconds in HORIZONS_S)
 
 
-def _turning_missed(predictions: Predictions) -> float:
-    """Return the mean square by which the body rate is missed at the end of predictions."""
+def _body_rate_mse(predictions: Predictions) -> float:
+    """Return the mean squared error of the body rate at the end of predictions."""
     return float(np.nanmean(predictions.errors["body_rate"][-1] ** 2))
 
 
-WORSE = 0.01
-"""Share by which a flight may be met worse than before the fit without a word."""
+MAX_RMSE_INCREASE = 0.01
+"""A flight's RMSE may grow by this share in the fit without a finding."""
 
-
-MET_BY: Mapping[Pose, str] = {"position": "m", "attitude": "degrees"}
-"""What a flight is judged by, with its unit."""
+UNITS: Mapping[Pose, str] = {"position": "m", "attitude": "degrees"}
+"""Signal of a flight's RMSE -> its unit."""
 
 
 def flights_worse(
     initial: Mapping[str, FlightErrors], best: Mapping[str, FlightErrors]
 ) -> tuple[Finding, ...]:
-    """Return which flights the fitted coefficients meet worse than the initial ones, or crash.
+    """Return findings on flights with larger RMSE after the fit, or that crash.
 
     Parameters
     ----------
@@ -254,9 +257,12 @@ def flights_worse(
                 numbers = {"seconds": crashed}
                 findings.append(Finding(Code.FLIGHT_CRASHES, "warning", flight, numbers))
             continue
-        for what, unit in MET_BY.items():
-            before, after = initial[flight].rmse.length(what), best[flight].rmse.length(what)
-            if after > (1.0 + WORSE) * before:
+        for what, unit in UNITS.items():
+            before, after = (
+                initial[flight].rmse.norm(what),
+                best[flight].rmse.norm(what),
+            )
+            if after > (1.0 + MAX_RMSE_INCREASE) * before:
                 numbers = {"before": before, "after": after}
                 findings.append(
                     Finding(Code.FLIGHT_WORSE, "warning", flight, numbers, (what, unit))
@@ -264,24 +270,23 @@ def flights_worse(
     return tuple(findings)
 
 
-ODD, FAR = 5.0, 0.05
-"""Times the middle of the others, and m, from which a flight's position RMSE stands out."""
-AT_LIMIT = 0.05
-"""Share of a flight by which the simulated one is longer at the limit of position control."""
+ODD_RATIO, ODD_RMSE_M = 5.0, 0.05
+"""A position RMSE above so many times the others' median, and above so much, is odd."""
+MIN_SHARE_AT_LIMIT = 0.05
+"""The simulation must be at the limit of position control for so much longer, as a share."""
 
 
-def flights_not_flown(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[Finding, ...]:
-    """Return which flights the closed loop does not follow although it follows others.
+def flights_not_followed(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[Finding, ...]:
+    """Return findings on flights that the closed loop does not follow although it follows others.
 
-    With the time from which, and how long position control asks for more than its limit, in the
-    simulation and in the recording. Beyond that limit it leans on a loop that knows no way back: a
-    start that is off is forgotten in seconds, and a rotor that lifts a few percent less keeps a
-    fast flight there for good.
+    They have the time of departure, and the shares of time with position feedback above its limit,
+    simulated and recorded. Above the limit the loop cannot return: a rotor with a few percent less
+    thrust keeps a fast flight there for good, while an error of the start decays in seconds.
 
     Parameters
     ----------
     job
-        Its flights, fitted ones and those held out, and its controller.
+        Its fitted and held-out flights, and its controller.
     errors
         Flight -> errors of a simulation with the fitted coefficients.
     """
@@ -292,15 +297,17 @@ def flights_not_flown(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[Fin
         and not r.flight.spins_freely
         and errors[r.flight.name].crash_time is None
     }
-    lengths = {name: errors[name].rmse.length("position") for name in flown}
+    lengths = {name: errors[name].rmse.norm("position") for name in flown}
     findings = []
     for name, flight in flown.items():
         others = [length for other, length in lengths.items() if other != name]
         typical = float(np.median(others)) if len(others) > 1 else np.inf
-        if lengths[name] < max(ODD * typical, FAR):
+        if lengths[name] < max(ODD_RATIO * typical, ODD_RMSE_M):
             continue
         position = errors[name].position
-        away = np.linalg.norm(np.nan_to_num(position.error), axis=1) > max(ODD * typical, FAR)
+        away = np.linalg.norm(np.nan_to_num(position.error), axis=1) > max(
+            ODD_RATIO * typical, ODD_RMSE_M
+        )
         numbers = {
             "rmse": lengths[name],
             "others": typical,
@@ -310,14 +317,14 @@ def flights_not_flown(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[Fin
             _beyond_limit(flight, job.settings.controller.position, position.time, there)
             for there in (position.simulated, position.recorded)
         ]
-        if shares[0] > shares[1] + AT_LIMIT:
+        if shares[0] > shares[1] + MIN_SHARE_AT_LIMIT:
             numbers |= {"beyond": shares[0], "beyond_recorded": shares[1]}
         findings.append(Finding(Code.FLIGHT_NOT_FLOWN, "warning", name, numbers))
     return tuple(findings)
 
 
 def _beyond_limit(flight: Flight, control: PositionControl, time: Array, position: Array) -> float:
-    """Return the share of a flight in which the feedback asked for is longer than its limit."""
+    """Return the share of a flight with position feedback above its limit."""
     asked = np.zeros_like(position)
     for kind, gains, there in (
         ("position", control.kp, position),
@@ -332,10 +339,10 @@ def _beyond_limit(flight: Flight, control: PositionControl, time: Array, positio
     return float(np.mean(np.linalg.norm(asked, axis=1) > limit))
 
 
-def holding_better(job: Job, validation: Validation) -> tuple[Finding, ...]:
-    """Return what of a flight is predicted worse than by leaving it as it is, chance apart.
+def predicted_worse_than_held(job: Job, validation: Validation) -> tuple[Finding, ...]:
+    """Return findings on flights that are predicted significantly worse than by a constant state.
 
-    So far ahead as anything is.
+    They are for the longest such time ahead.
     """
     findings = []
     for recording in job.recordings:

@@ -64,13 +64,13 @@ def check_in_simulator(
             ("position", OTHER_SLACK_M, "m"),
             ("attitude", OTHER_SLACK_DEG, "deg"),
         ):
-            expected, found = own.length(signal), other.length(signal)
+            expected, found = own.norm(signal), other.norm(signal)
             if math.isfinite(found) and found > expected * OTHER_FACTOR + slack:
                 objections.append(
                     f"{flight.name} is missed by {found:.3g} {unit}, expected {expected:.3g}"
                 )
     missed = "; ".join(
-        f"{name} {1000 * rmse.length('position'):.3g} mm, {rmse.length('attitude'):.2g}°"
+        f"{name} {1000 * rmse.norm('position'):.3g} mm, {rmse.norm('attitude'):.2g}°"
         for name, rmse in there.items()
     )
     return Gate(f"{title} itself flies it so", tuple(objections)), f"flown in {title}: {missed}"
@@ -132,7 +132,10 @@ def _worse(run: Run) -> list[str]:
     objections, flights = [], run.result.flights
     for flight in [one for one in flights if one.split == "holdout"] or flights:
         for what, unit in (("position", "m"), ("attitude", "degrees")):
-            before, after = flight.rmse_initial.length(what), flight.rmse_best.length(what)
+            before, after = (
+                flight.rmse_initial.norm(what),
+                flight.rmse_best.norm(what),
+            )
             if math.isinf(after):
                 objections.append(_crash(flight.name))
                 break

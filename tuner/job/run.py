@@ -24,9 +24,9 @@ from tuner.evaluate.comparison import table_of
 from tuner.evaluate.validation import (
     Validation,
     controller_flown,
-    flights_not_flown,
+    flights_not_followed,
     flights_worse,
-    holding_better,
+    predicted_worse_than_held,
     validate,
     vehicle_fitted,
 )
@@ -279,8 +279,8 @@ def _of_flights(job: Job, validation: Validation) -> tuple[Finding, ...]:
     """Return what the simulated flights say of a fit."""
     return (
         *flights_worse(validation.initial, validation.best),
-        *flights_not_flown(job, validation.best),
-        *holding_better(job, validation),
+        *flights_not_followed(job, validation.best),
+        *predicted_worse_than_held(job, validation),
         *turning_findings(job, validation.turning_explained),
     )
 

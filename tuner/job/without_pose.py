@@ -11,7 +11,7 @@ import numpy as np
 
 from tuner.config import Settings
 from tuner.core.errors import ConfigError, InputError, RecordingError
-from tuner.evaluate.validation import WORSE
+from tuner.evaluate.validation import MAX_RMSE_INCREASE
 from tuner.findings.findings import Code, Finding, Level
 from tuner.ground.bench_json import Combination, combine
 from tuner.ground.measurement import Measurement, value_of
@@ -147,7 +147,7 @@ def _predicted(
                 findings.append(_foretold(Code.RATE_NOT_PREDICTED, flight, errors))
                 break
             told = errors
-        if told is not None and told.fitted > (1.0 + WORSE) * told.initial:
+        if told is not None and told.fitted > (1.0 + MAX_RMSE_INCREASE) * told.initial:
             findings.append(_foretold(Code.RATE_WORSE, flight, told))
         elif told is not None and held_out:
             findings.append(_foretold(Code.RATE_PREDICTED, flight, told))

@@ -298,7 +298,7 @@ def _errors(flight: FlightResult, result: RunResult, signal: str) -> Errors:
     noise = result.settings.get("noise")
     of_axis = noise.get(signal) if isinstance(noise, dict) else None
     unit = math.sqrt(3.0) * (math.degrees(1.0) if signal == "attitude" else 1.0)
-    before, after = flight.rmse_initial.together(signal), flight.rmse_best.together(signal)
+    before, after = flight.rmse_initial.norm_or_none(signal), flight.rmse_best.norm_or_none(signal)
     return before, after, unit * of_axis if isinstance(of_axis, float) else None
 
 

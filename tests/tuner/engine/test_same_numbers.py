@@ -104,7 +104,7 @@ def test_populations_are_evaluated_alike(problem, two_workers):
 
 @pytest.mark.slow
 def test_a_sweep_is_flown_alike(updated, two_workers, monkeypatch):
-    monkeypatch.setattr(simulation, "CHUNK", 4)
+    monkeypatch.setattr(simulation, "MAX_LANES", 4)
 
     def flown():
         grid = {"motor_constant": np.linspace(1.3e-5, 1.6e-5, 10)}

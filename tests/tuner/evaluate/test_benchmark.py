@@ -9,7 +9,7 @@ from benchmarks.prediction import HELD_OUT, options_of
 from benchmarks.regression import Regression
 from benchmarks.without_pose import posed
 from tuner.core.errors import InputError
-from tuner.evaluate.prediction import hold
+from tuner.evaluate.prediction import hold_state
 from tuner.recordings.loader import InertialFlight
 
 
@@ -17,7 +17,7 @@ def test_linear_regression_predicts_better_than_one_that_holds(full_flight):
     begins, ahead = np.arange(0.2, 5.0, 0.1), np.arange(1, 51) * 0.01
     regression = Regression.of([full_flight], "rotor_speed")
     predicted = regression.predict(full_flight, begins, ahead)
-    naive = hold(full_flight, begins, ahead)
+    naive = hold_state(full_flight, begins, ahead)
     for name in ("position", "velocity", "attitude"):
         assert predicted.mean(0.5)[name] < 0.3 * naive.mean(0.5)[name], name
     assert predicted.errors["body_rate"].shape == (50, len(begins))

@@ -125,7 +125,7 @@ def test_a_grid_flies_each_vehicle_as_it_flies_alone(vehicle):
 
 
 def test_a_large_grid_takes_turns(vehicle, monkeypatch):
-    monkeypatch.setattr("tuner.evaluate.closed_loop.CHUNK", 2)
+    monkeypatch.setattr("tuner.evaluate.closed_loop.MAX_LANES", 2)
     constants = [1.3e-5, 1.4e-5, 1.5e-5]
     grid = {"motor_constant": np.array(constants), "inertia_xx": np.array([0.025] * 3)}
     in_turns = fly(vehicle, "hover", grid=grid)

@@ -10,7 +10,7 @@ import yaml
 from tests.tuner.evaluate.test_rmse import errors
 from tuner.config import Options, settle
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.validation import flights_not_flown
+from tuner.evaluate.validation import flights_not_followed
 from tuner.findings.findings import Code, remedy, sentence
 from tuner.search.job_flights import read_recordings
 from tuner.vehicle import COEFFICIENTS, with_values
@@ -38,7 +38,7 @@ def flown():
 
 def test_a_loop_beyond_its_limit_is_named_with_the_time(flown):
     job, fly = flown
-    (finding,) = flights_not_flown(job, fly(0.92))
+    (finding,) = flights_not_followed(job, fly(0.92))
     assert (finding.code, finding.subject) == (Code.FLIGHT_NOT_FLOWN, "lemniscate_4mps")
     assert 9.0 < finding.numbers["seconds"] < 15.0
     assert finding.numbers["beyond"] > 0.4
@@ -50,7 +50,7 @@ def test_a_loop_beyond_its_limit_is_named_with_the_time(flown):
 @pytest.mark.parametrize("share", [1.0, 1.08])
 def test_flights_that_are_all_flown_are_not(flown, share):
     job, fly = flown
-    assert flights_not_flown(job, fly(share)) == ()
+    assert flights_not_followed(job, fly(share)) == ()
 
 
 def test_a_flight_that_is_odd_for_another_reason_says_nothing_of_the_limit(flown):
@@ -59,9 +59,9 @@ def test_a_flight_that_is_odd_for_another_reason_says_nothing_of_the_limit(flown
         recording.flight.name: errors([[0.01, 0.0, 0.0]] * 90, [[0.0] * 3] * 90)
         for recording in job.recordings
     }
-    assert flights_not_flown(job, met) == ()
+    assert flights_not_followed(job, met) == ()
     met["circle_3mps"] = errors([[0.01, 0, 0]] * 45 + [[0.5, 0, 0]] * 45, [[0.0] * 3] * 90)
-    (finding,) = flights_not_flown(job, met)
+    (finding,) = flights_not_followed(job, met)
     assert finding.subject == "circle_3mps"
     assert finding.numbers["seconds"] == met["circle_3mps"].position.time[45]
     assert "beyond" not in finding.numbers
@@ -73,4 +73,4 @@ def test_one_flight_has_no_peers(flown):
     alone = SimpleNamespace(settings=job.settings, recordings=job.recordings[:1])
     name = job.recordings[0].flight.name
     far = {name: errors([[np.sqrt(0.5), 0, 0]] * 90, [[0.0] * 3] * 90)}
-    assert flights_not_flown(alone, far) == ()
+    assert flights_not_followed(alone, far) == ()

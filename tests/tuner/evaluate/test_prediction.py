@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.prediction import Predictions, hold, predict
+from tuner.evaluate.prediction import Predictions, hold_state, predict
 from tuner.findings.sentences import PREDICTED
 from tuner.recordings.flight import Series
 from tuner.recordings.states import MIN_HALF_WIDTH_S
@@ -20,7 +20,7 @@ def truth(full_flight, updated):
 
 
 def test_the_vehicle_that_flew_predicts_its_flight_better_than_one_that_holds(truth, full_flight):
-    naive = hold(full_flight, truth.begins, truth.ahead)
+    naive = hold_state(full_flight, truth.begins, truth.ahead)
     for name in PREDICTED:
         assert truth.mean(0.5)[name] < 0.05 * naive.mean(0.5)[name], name
     assert truth.errors["position"].shape == (50, len(truth.begins))
@@ -29,7 +29,7 @@ def test_the_vehicle_that_flew_predicts_its_flight_better_than_one_that_holds(tr
 
 
 def test_the_distances_are_euclidean_and_the_angle_is_geodesic(truth, full_flight):
-    naive = hold(full_flight, truth.begins[:1], truth.ahead)
+    naive = hold_state(full_flight, truth.begins[:1], truth.ahead)
     time, place = full_flight.time, full_flight.signals["position"]
     begin = int(np.searchsorted(time, truth.begins[0]))
     moved = np.linalg.norm(place[begin + 50] - place[begin])
@@ -131,7 +131,7 @@ def test_fitted_starts_meet_a_flight_no_worse_than_recorded_ones(full_flight, up
     comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
     predicted = comparison.fly(wrong)[full_flight.name]
     met = comparison.fly(wrong, fitted_starts=True)[full_flight.name]
-    assert met.rmse.length("attitude") < predicted.rmse.length("attitude")
+    assert met.rmse.norm("attitude") < predicted.rmse.norm("attitude")
 
 
 def of_attitude(error, seconds=0.5):

@@ -6,7 +6,7 @@ import pytest
 from sim_jax.state import AIRBORNE, Limits
 from tuner.config import TrajectorySettings
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.rmse import FlightErrors, SignalErrors, laps_of, rmse_of, short_way
+from tuner.evaluate.rmse import FlightErrors, SignalErrors, laps_of, rmse_of, wrap_degrees
 from tuner.objective.trajectory import with_named_reference
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import Recording
@@ -68,8 +68,8 @@ def test_the_vehicle_that_flew_meets_its_recording(flight, updated):
 
 def test_angles_are_compared_the_short_way_round():
     just_left, just_right = np.array([[0, 0, 179.0]]), np.array([[0, 0, -179.0]])
-    np.testing.assert_allclose(short_way(just_left - just_right), [[0, 0, -2]])
-    np.testing.assert_allclose(short_way(np.array([[-190.0, 180.0, 10.0]])), [[170, -180, 10]])
+    np.testing.assert_allclose(wrap_degrees(just_left - just_right), [[0, 0, -2]])
+    np.testing.assert_allclose(wrap_degrees(np.array([[-190.0, 180.0, 10.0]])), [[170, -180, 10]])
 
 
 def test_a_late_clock_is_taken_back(flight, updated):

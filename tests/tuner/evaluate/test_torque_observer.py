@@ -10,7 +10,7 @@ import pytest
 from benchmarks import fast_flights
 from tuner.config import Options, settle
 from tuner.evaluate.prediction import predict
-from tuner.evaluate.torque_observer import TICKS, TorqueObserver
+from tuner.evaluate.torque_observer import LAGS, TorqueObserver
 from tuner.recordings.flight import Series
 from tuner.recordings.states import MIN_HALF_WIDTH_S
 from tuner.search.job_flights import read_recordings
@@ -47,8 +47,8 @@ def flown(request, flights, tmp_path_factory):
 
 def test_a_hidden_torque_lasts_as_long_as_it_was_made_to(flown):
     *_, observer = flown
-    early = TICKS <= 0.05
-    made = np.exp(-TICKS[early] / LASTS)
+    early = LAGS <= 0.05
+    made = np.exp(-LAGS[early] / LASTS)
     for axis in (0, 1):  # about z it is as small as the gyro's noise
         np.testing.assert_allclose(observer.left[early, axis], made, atol=0.13)
     assert not observer.left[-1].any()
