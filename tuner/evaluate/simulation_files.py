@@ -136,77 +136,35 @@ class _Messages:
         attitude = self._make("geometry_msgs/msg/Quaternion", x, y, z, w)
         place = self._make("geometry_msgs/msg/Point", *now["position"])
         pose = self._make("geometry_msgs/msg/Pose", place, attitude)
-        stamped = self._make("geometry_msgs/msg/PoseStamped", world, pose)
-        yield "/optitrack/pose", stamped
-        yield "/mavros/local_position/pose", stamped
-        twist = self._make(
-            "geometry_msgs/msg/Twist", self._vector(now["velocity"]), self._vector(now["body_rate"])
-        )
-        yield (
-            "/mavros/local_position/velocity_local",
-            self._make("geometry_msgs/msg/TwistStamped", world, twist),
-        )
-        yield "/mavros/imu/data", self._imu(body, attitude, now)
+        yield self._on("/optitrack/pose", world, pose)
+        yield self._on("/mavros/local_position/pose", world, pose)
+        velocity, body_rate = self._vector(now["velocity"]), self._vector(now["body_rate"])
+        twist = self._make("geometry_msgs/msg/Twist", velocity, body_rate)
+        yield self._on("/mavros/local_position/velocity_local", world, twist)
+        force, unknown = self._vector(now["acceleration"]), np.zeros(9)
+        imu = (attitude, unknown, body_rate, unknown, force, unknown)
+        yield self._on("/mavros/imu/data", body, *imu)
         for rotor, speed in enumerate(now["rotor_speed"]):
-            yield (
-                "/mavros/rpm",
-                self._make("mavros_msgs/msg/RPM", body, rotor, speed * RPM_PER_RAD_S),
-            )
+            yield self._on("/mavros/rpm", body, rotor, speed * RPM_PER_RAD_S)
         pwm = np.array([PWM_LOW + round(PWM_SPAN * u) for u in now["command"]], dtype=np.uint16)
-        yield "/mavros/rc/out", self._make("mavros_msgs/msg/RCOut", body, pwm)
-        yield (
-            "/mavros/setpoint_raw/attitude",
-            self._make(
-                "mavros_msgs/msg/AttitudeTarget",
-                body,
-                BODY_RATE_MASK,
-                self._make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
-                self._vector(now["rate_setpoint"]),
-                now["thrust_setpoint"][0],
-            ),
-        )
+        yield self._on("/mavros/rc/out", body, pwm)
+        level = self._make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+        setpoint = (level, self._vector(now["rate_setpoint"]), now["thrust_setpoint"][0])
+        yield self._on("/mavros/setpoint_raw/attitude", body, BODY_RATE_MASK, *setpoint)
         names = ("reference_position", "reference_velocity", "reference_acceleration")
-        parts = [self._vector(now[name]) for name in names]
-        yield (
-            "/reference/flatsetpoint",
-            self._make(
-                "controller_msgs/msg/FlatTarget",
-                world,
-                REFERENCE_MASK,
-                *parts,
-                self._still,
-                self._still,
-            ),
-        )
-        if "battery_voltage" in now and np.isfinite(now["battery_voltage"][0]):
-            yield BATTERY, self._battery(world, now["battery_voltage"][0])
+        parts = (*(self._vector(now[name]) for name in names), self._still, self._still)
+        yield self._on("/reference/flatsetpoint", world, REFERENCE_MASK, *parts)
+        if "battery_voltage" in now and np.isfinite(volts := now["battery_voltage"][0]):
+            unknown_amounts = (float("nan"),) * 6  # temperature, current, charge, capacities, share
+            state = (0, 0, 0, True)  # power supply unknown, battery present
+            none = np.zeros(0, np.float32)
+            yield self._on(BATTERY, world, volts, *unknown_amounts, *state, none, none, "", "")
         laps = flight.signals["lap"][:, 0]
         if index and laps[index] != laps[index - 1]:
-            yield (
-                "/trajectory_publisher/lap_completed",
-                self._make("std_msgs/msg/Int32", int(laps[index])),
-            )
+            yield self._on("/trajectory_publisher/lap_completed", int(laps[index]))
 
-    def _battery(self, header: Any, volts: float) -> Any:
-        unknown, none = float("nan"), np.zeros(0, np.float32)
-        amounts = (unknown,) * 6  # temperature, current, charge, capacity, design and share of it
-        state = (0, 0, 0, True)  # power supply unknown, battery present
-        return self._make(
-            "sensor_msgs/msg/BatteryState", header, volts, *amounts, *state, none, none, "", ""
-        )
-
-    def _imu(self, header: Any, attitude: Any, now: Mapping[str, list[float]]) -> Any:
-        unknown = np.zeros(9)
-        return self._make(
-            "sensor_msgs/msg/Imu",
-            header,
-            attitude,
-            unknown,
-            self._vector(now["body_rate"]),
-            unknown,
-            self._vector(now["acceleration"]),
-            unknown,
-        )
+    def _on(self, topic: str, *fields: object) -> tuple[str, Any]:
+        return topic, self._make(TOPICS[topic], *fields)
 
     def _vector(self, values: Sequence[float]) -> Any:
         return self._make("geometry_msgs/msg/Vector3", *values)

@@ -59,7 +59,7 @@ class TorqueObserver:
     def of(
         vehicle: VehicleFile, controller: ControllerFile, fitted: Sequence[FedFlight]
     ) -> TorqueObserver | None:
-        """Return the observer of a vehicle fitted to some flights; None if these have no residuals."""
+        """Return the observer of a vehicle fitted to some flights; None without residuals."""
         products = np.zeros((len(LAGS), 3))
         for flight in fitted:
             found = _residual_acceleration(vehicle, controller, flight)

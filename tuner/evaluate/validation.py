@@ -152,7 +152,7 @@ class Validation:
 
 @dataclass(frozen=True)
 class _FlightPredictions:
-    """Predictions of one flight; ``observed`` with an observed torque, None without rotor inputs."""
+    """Predictions of one flight; ``observed`` with an observed torque, for rotor inputs only."""
 
     initial: Predictions
     best: Predictions
