@@ -165,9 +165,7 @@ class _Group:
         else:
             self._windows = [(Window(flight, 0.0),) for flight in flights]
             self._segments = segments_of(
-                flights,
-                noise=dict.fromkeys(POSE, 1.0),
-                schedule=self._schedule,
+                flights, noise=dict.fromkeys(POSE, 1.0), schedule=self._schedule
             )
             longest = max(flight.duration for flight in flights)
             self._samples, self._limits = math.ceil(longest * rate) + 2, limits_of(flights)

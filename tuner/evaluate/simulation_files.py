@@ -234,10 +234,7 @@ def flight_table(path: Path) -> Iterator[Append]:
     OutputError
         The file cannot be written.
     """
-    with (
-        whole_file(path) as unfinished,
-        unfinished.open("w", newline="", encoding="utf-8") as file,
-    ):
+    with whole_file(path) as unfinished, unfinished.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         begun = False
 

@@ -258,10 +258,7 @@ def flights_worse(
                 findings.append(Finding(Code.FLIGHT_CRASHES, "warning", flight, numbers))
             continue
         for what, unit in UNITS.items():
-            before, after = (
-                initial[flight].rmse.norm(what),
-                best[flight].rmse.norm(what),
-            )
+            before, after = (initial[flight].rmse.norm(what), best[flight].rmse.norm(what))
             if after > (1.0 + MAX_RMSE_INCREASE) * before:
                 numbers = {"before": before, "after": after}
                 findings.append(

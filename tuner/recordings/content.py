@@ -275,9 +275,7 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     return Content(**read, missions=missions)
 
 
-def _with_times_in_us(
-    raw: dict[str, RawSignal],
-) -> tuple[dict[str, RawSignal], list[Note]]:
+def _with_times_in_us(raw: dict[str, RawSignal]) -> tuple[dict[str, RawSignal], list[Note]]:
     """Return signals with times divided by 1000, if gravity shows that their unit is us, not ms."""
     if not is_too_slow({name: data.in_seconds(0) for name, data in raw.items()}):
         return raw, []

@@ -255,10 +255,7 @@ def _mission(content: Content, index: int) -> MissionReport:
         top_turn_rate=turning,
         yaw_rate_setpoint=None if spin is None else spin.yaw_rate,
         level_held=spin is not None and spin.level_held,
-        height=(
-            _reduced(np.nanmin, position[:, 2]),
-            _reduced(np.nanmax, position[:, 2]),
-        ),
+        height=(_reduced(np.nanmin, position[:, 2]), _reduced(np.nanmax, position[:, 2])),
         known=float(known.mean()),
         fitted=mission.fitted,
     )
@@ -476,11 +473,7 @@ def _unit_comment(source: Source, inferred: str | None, name: str) -> str:
 
 
 def _map_text(
-    path: Path,
-    lines: list[str],
-    found: dict[str, Source],
-    why: dict[str, str],
-    unused: list[str],
+    path: Path, lines: list[str], found: dict[str, Source], why: dict[str, str], unused: list[str]
 ) -> str:
     name = "".join(letter if letter.isalnum() else "_" for letter in path.stem)[:40]
     text = [

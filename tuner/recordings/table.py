@@ -335,10 +335,7 @@ def _with_days_counted(times: Nanoseconds) -> Nanoseconds:
 
 
 def _require_fine_stamps(
-    path: Path,
-    column: pyarrow.ChunkedArray,
-    times: Nanoseconds,
-    sampled: list[NDArray[np.bool_]],
+    path: Path, column: pyarrow.ChunkedArray, times: Nanoseconds, sampled: list[NDArray[np.bool_]]
 ) -> None:
     """Refuse stamps with so few digits that many rows share them."""
     there = times[max(sampled, key=np.count_nonzero)]

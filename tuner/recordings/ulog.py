@@ -290,9 +290,7 @@ FIELD_LAYOUTS: Mapping[str, Mapping[str, FieldLayout]] = {
     },
     "actuator_motors": {"command": _array("control", count=4)},
     "actuator_outputs": {"command": _array("output", count=4, unit="pwm_us")},
-    "esc_status": {
-        "rotor_speed": _fields(*(f"esc[{i}].esc_rpm" for i in range(4)), unit="rpm"),
-    },
+    "esc_status": {"rotor_speed": _fields(*(f"esc[{i}].esc_rpm" for i in range(4)), unit="rpm")},
     "vehicle_rates_setpoint": {
         "rate_setpoint": _fields("roll", "pitch", "yaw"),
         "thrust_setpoint": _fields("thrust_body[2]"),

@@ -196,13 +196,13 @@ FIELD_LAYOUTS: Mapping[str, Mapping[str, FieldLayout]] = {
     "gazebo_msgs/msg/LinkState": {**_pose("pose."), **_twist("twist.")},
     "gazebo_msgs/msg/ModelState": {**_pose("pose."), **_twist("twist.")},
     "mavros_msgs/msg/RCOut": {
-        "command": FieldLayout(tuple(f"channels[{rotor}]" for rotor in range(4)), unit="pwm_us"),
+        "command": FieldLayout(tuple(f"channels[{rotor}]" for rotor in range(4)), unit="pwm_us")
     },
     "mavros_msgs/msg/ESCStatus": {
-        "rotor_speed": FieldLayout(tuple(f"esc_status[{r}].rpm" for r in range(4)), unit="rpm"),
+        "rotor_speed": FieldLayout(tuple(f"esc_status[{r}].rpm" for r in range(4)), unit="rpm")
     },
     "mavros_msgs/msg/ESCTelemetry": {
-        "rotor_speed": FieldLayout(tuple(f"esc_telemetry[{r}].rpm" for r in range(4)), unit="rpm"),
+        "rotor_speed": FieldLayout(tuple(f"esc_telemetry[{r}].rpm" for r in range(4)), unit="rpm")
     },
     "mavros_msgs/msg/AttitudeTarget": {
         "attitude_setpoint": _layout("orientation", _WXYZ),

@@ -289,9 +289,7 @@ def _samples(
         seconds = kept.pop(_SECONDS).astype(np.int64)
         stamp = seconds * 1_000_000_000 + kept.pop(_NANOSECONDS).astype(np.int64)
     return Samples(
-        receive[whole],
-        stamp,
-        {name: values.astype(np.float64) for name, values in kept.items()},
+        receive[whole], stamp, {name: values.astype(np.float64) for name, values in kept.items()}
     )
 
 
