@@ -13,9 +13,9 @@ from jaxtyping import Float
 from sim_jax.numeric import Array, Scalar
 from sim_jax.schedule import Schedule
 from tuner.core.errors import RecordingError
+from tuner.core.numerics import Array as Numbers
 from tuner.core.numerics import robust_sd
 from tuner.objective.windows import Window
-from tuner.recordings.flight import Array as Numbers
 from tuner.recordings.flight import Flight, Series
 from tuner.vehicle import VehicleFile
 

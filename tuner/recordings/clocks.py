@@ -25,9 +25,8 @@ from tuner.recordings.interpolation import (
     smooth,
 )
 from tuner.recordings.notes import Kind, Note, NoteCode
-from tuner.recordings.recording import Nanoseconds, Samples
+from tuner.recordings.recording import NS_PER_SECOND, Nanoseconds, Samples
 
-NS_PER_SECOND = 1_000_000_000
 #: A stamp that leaves its neighbours by more, while its arrival does not, has jumped.
 MIN_CLOCK_JUMP_NS = NS_PER_SECOND // 10
 #: Topics whose stamps differ by more from the others' have a clock of their own.

@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.recordings.notes import Damage, Note
-
-Array = NDArray[np.float64]
 
 #: The signals a flight can hold: name -> (number of columns, unit, interpolation).
 #: World is ENU, body is FLU, quaternions are (w, x, y, z) body to world.

@@ -28,20 +28,8 @@ MAX_LOG_BYTES = 128 << 20
 CHECKSUM_BYTES = 4
 #: No firmware logs more.
 MAX_EVENTS, MAX_VARIABLES, MAX_NAME_BYTES = 256, 512, 256
-#: Code of a type -> NumPy's code.
-TYPES = {
-    "b": "<i1",
-    "B": "<u1",
-    "h": "<i2",
-    "H": "<u2",
-    "i": "<i4",
-    "I": "<u4",
-    "q": "<i8",
-    "Q": "<u8",
-    "e": "<f2",
-    "f": "<f4",
-    "d": "<f8",
-}
+#: Codes of types, which are NumPy's.
+TYPES = frozenset("bBhHiIqQefd")
 _STAMPS = {1: ("<u4", NS_PER_UNIT["ms"]), 2: ("<u8", NS_PER_UNIT["us"])}
 #: Fields of every record beside its variables, whose names have no space.
 _NUMBER, _STAMP = " number", " stamp"
@@ -148,7 +136,7 @@ class _Header:
                 if code not in TYPES or not variable or variable in names:
                     raise self._header_error(f"the variable '{variable[:40]}'")
                 names.append(variable)
-                formats.append(TYPES[code])
+                formats.append(f"<{code}")
             if number in events:
                 raise self._header_error(f"two event types {number}")
             events[number] = _Event(name, np.dtype({"names": names, "formats": formats}))

@@ -42,10 +42,7 @@ class NoteCode(Worded):
     )
     WITHOUT_POSE = (
         "without_pose",
-        (
-            "no pose was recorded: the {seconds:.1f} s with turning motors are fitted without "
-            "motion capture, by body rate and specific force"
-        ),
+        "no pose: {seconds:.1f} s of flight are fitted by body rate and specific force",
     )
     OTHER_CLOCK = "other_clock", "stamped by another clock, {seconds:.3f} s off: moved"
     STAMPS_UNSET = "stamps_unset", "its stamps are not set: its times are those of recording"
@@ -88,10 +85,7 @@ class NoteCode(Worded):
     STAMPED_TWICE = "stamped_twice", "{samples} with a stamp seen before dropped"
     STAMPS_COARSE = (
         "stamps_coarse",
-        (
-            "{samples} differ from another with the same stamp and are dropped: the stamps, "
-            "{milliseconds:.3g} ms apart, have too few digits"
-        ),
+        "{samples} share a stamp and are dropped: steps of {milliseconds:.3g} ms are too coarse",
     )
     SAMPLES_MISSING = "samples_missing", "{samples} seem to be missing between those recorded"
     NO_UNIT_QUATERNION = (
@@ -101,10 +95,7 @@ class NoteCode(Worded):
     REPEATED = "repeated", "{samples} repeat the one before while the vehicle moves: dropped"
     STALE = (
         "stale",
-        (
-            "{samples} repeat the one before to the bit through the last {seconds:.1f} s, while "
-            "the vehicle moves on: nothing measured them"
-        ),
+        "{samples} repeat one value in the last {seconds:.1f} s, while the vehicle moves",
     )
     AWAY_AND_BACK = "away_and_back", "{samples} jump away and back within a second: dropped"
     AWAY_FOR_GOOD = "away_for_good", "{samples} leap and do not come back: check the recording"
@@ -128,10 +119,7 @@ class NoteCode(Worded):
     )
     SPEED_UNIT_OPEN = (
         "speed_unit_open",  # names: the unit of `UNITS` that is assumed
-        (
-            "the topic map gives rotor_speed no unit: {first} is taken, and held against the "
-            "weight that the rotors carry"
-        ),
+        "the topic map gives rotor_speed no unit: {first} is assumed, and checked by the weight",
     )
     MOTOR_ORDER_GIVEN = (
         "motor_order_given",  # names: the order of `MOTOR_ORDERS`, or the motors
@@ -139,14 +127,11 @@ class NoteCode(Worded):
     )
     PX4_REFERENCE = (
         "px4_reference",
-        ("is what PX4's own position control was asked for, another loop than the geometric one"),
+        "is the reference of PX4's position control, not of the geometric controller",
     )
     POSE_ALONE = (
         "pose_alone",
-        (
-            "a pose alone was recorded, and nothing that drives the vehicle: no motor commands, "
-            "rotor speeds, set-points or reference"
-        ),
+        "no motor command, rotor speed, set-point or reference was recorded beside the pose",
     )
     TIME_READ = (
         "time_read",
@@ -154,10 +139,7 @@ class NoteCode(Worded):
     )
     UNIT_DOUBTED = (
         "unit_doubted",  # names: the signal
-        (
-            "{first} accelerates {times:.3g} times as fast as the attitude's tilt says under "
-            "gravity: check its unit"
-        ),
+        "{first} accelerates {times:.3g} times as fast as tilt and gravity say: check its unit",
     )
     ATTITUDE_DOUBTED = (
         "attitude_doubted",
@@ -180,10 +162,7 @@ class NoteCode(Worded):
     )
     AXES_TURNED = (
         "axes_turned",
-        (
-            "the attitude's body axes are turned by {degrees:.0f} degrees against the gyro's: "
-            "check how its markers were defined"
-        ),
+        "the attitude's body axes are turned by {degrees:.0f}° against the gyro's: check markers",
     )
     CONTRADICTED = (
         "contradicted",  # names: the signal, the signal that denies it
@@ -203,10 +182,7 @@ class NoteCode(Worded):
     )
     NOT_CHOSEN = (
         "not_chosen",
-        (
-            "it is not fitted: other manoeuvres of this long recording show more, or its side-car "
-            "names others"
-        ),
+        "not fitted: other manoeuvres of the recording move more, or its side-car names others",
     )
     ONE_OF_SEVERAL = "one_of_several", "mission {number:.0f} of {count} in this recording"
 

@@ -18,8 +18,9 @@ from tuner.core.yaml_section import Section
 from tuner.recordings.notes import Damage, Note
 
 Nanoseconds = NDArray[np.int64]
+NS_PER_SECOND = 1_000_000_000
 #: Unit of time -> nanoseconds.
-NS_PER_UNIT = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+NS_PER_UNIT = {"s": NS_PER_SECOND, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 
 def short_reason(err: Exception) -> str:
@@ -163,9 +164,9 @@ class Recording(ABC):
         known = self.fields(topic)
         return tuple(name for name in fields if name not in known)
 
-    def undefined_type(self, topic: str) -> str | None:  # noqa: ARG002
-        """Return the message type of a topic if its definition is nowhere; None if it is known."""
-        return None
+    def is_defined(self, topic: str) -> bool:  # noqa: ARG002
+        """Return whether the definition of a topic's message type is known."""
+        return True
 
     @abstractmethod
     def read(self, wanted: Mapping[str, Request]) -> ReadResult:

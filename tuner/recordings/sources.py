@@ -457,7 +457,7 @@ def _type_error(recording: Recording, signals: Iterable[str]) -> RecordingError 
         holds = topic.count and any(
             recording.field_layout(topic.name, signal) for signal in signals
         )
-        if holds and recording.undefined_type(topic.name) is not None:
+        if holds and not recording.is_defined(topic.name):
             return RecordingError(
                 recording.path,
                 f"holds {topic.name}, but not the definition of its type {topic.type}, which "

@@ -31,6 +31,7 @@ from tuner.core.numerics import Array
 from tuner.recordings.formats import MAX_LINE_BYTES, layout_of
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode
 from tuner.recordings.recording import (
+    NS_PER_SECOND,
     NS_PER_UNIT,
     TABLE_TOPIC,
     Clock,
@@ -177,16 +178,11 @@ MIN_SAMPLE_RATE_HZ, MAX_SAMPLE_RATE_HZ = 3.0, 3000.0
 MAX_ROWS_PER_STAMP = 10
 #: The step is the median over the samples of at most so many fields.
 MAX_FIELDS = 24
-UNIT_NAMES = {
-    "s": "in seconds",
-    "ms": "in milliseconds",
-    "us": "in microseconds",
-    "ns": "in nanoseconds",
-}
+UNIT_NAMES = {"ms": "in milliseconds", "us": "in microseconds", "ns": "in nanoseconds"}
 
 _DATE = r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}:\d{2}(\.\d{1,9})?(Z|[+-]\d{2}(:?\d{2})?)?$"
 _TIME_OF_DAY = r"^\d{2}:\d{2}:\d{2}(\.\d{1,9})?$"
-_DAY = 24 * 3600 * NS_PER_UNIT["s"]
+_DAY = 24 * 3600 * NS_PER_SECOND
 
 
 def read_times(
@@ -273,7 +269,7 @@ def _unit_by_step(
         return None
     step = float(np.nanmedian(steps))
     for unit, factor in NS_PER_UNIT.items():
-        if MIN_SAMPLE_RATE_HZ <= NS_PER_UNIT["s"] / (step * factor) < MAX_SAMPLE_RATE_HZ:
+        if MIN_SAMPLE_RATE_HZ <= NS_PER_SECOND / (step * factor) < MAX_SAMPLE_RATE_HZ:
             return unit
     raise RecordingError(
         path,

@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.tuner.recordings import making
-from tuner.recordings.flight import Array, Flight
+from tuner.core.numerics import Array
+from tuner.recordings.flight import Flight
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.unit_detection import (

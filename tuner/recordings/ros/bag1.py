@@ -24,6 +24,7 @@ from rosbags.typesys.msg import normalize_msgtype
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause
+from tuner.recordings.recording import NS_PER_SECOND
 from tuner.recordings.ros.container import (
     Chunk,
     ChunkedFile,
@@ -184,7 +185,7 @@ def _time(value: bytes) -> int:
     if len(value) != 8:
         raise DamagedError("a message lacks its time")
     seconds, nanoseconds = struct.unpack("<II", value)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+    return int(seconds) * NS_PER_SECOND + int(nanoseconds)
 
 
 def _connection(header: Header, data: bytes) -> Connection:
@@ -219,7 +220,7 @@ def _entries(content: bytes) -> tuple[Index, Index]:
     if len(content) % 12:
         raise DamagedError("an index makes no sense")
     entries = np.frombuffer(content, dtype="<u4").reshape(-1, 3).astype(np.int64)
-    return entries[:, 0] * 1_000_000_000 + entries[:, 1], entries[:, 2]
+    return entries[:, 0] * NS_PER_SECOND + entries[:, 1], entries[:, 2]
 
 
 def _is_of(content: Bytes, connection: int, header: Index, size: Index) -> NDArray[np.bool_]:

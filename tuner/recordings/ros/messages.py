@@ -241,21 +241,10 @@ Cursor = int | Index
 MAX_DEPTH = 12
 MAX_ELEMENTS = 256
 
-_NUMPY_KINDS = {
-    "bool": "u1",
-    "byte": "u1",
-    "char": "u1",
-    "octet": "u1",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "int64": "i8",
-    "uint64": "u8",
-    "float32": "f4",
-    "float64": "f8",
+_NUMPY_KINDS = dict.fromkeys(("bool", "byte", "char", "octet"), "u1") | {
+    f"{name}{8 * size}": f"{name[0]}{size}"
+    for name, sizes in (("int", (1, 2, 4, 8)), ("uint", (1, 2, 4, 8)), ("float", (4, 8)))
+    for size in sizes
 }
 
 

@@ -22,6 +22,7 @@ from tuner.core.yaml_document import read_yaml
 from tuner.recordings import ulog
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import (
+    NS_PER_SECOND,
     Clock,
     FieldLayout,
     Nanoseconds,
@@ -223,9 +224,9 @@ class RosRecording(Recording):
         except RecordingError:
             return fields
 
-    def undefined_type(self, topic: str) -> str | None:
-        """Return the message type of a topic if its definition is nowhere; None if it is known."""
-        return self._kind(topic) if self._type(topic) is None else None
+    def is_defined(self, topic: str) -> bool:
+        """Return whether the definition of a topic's message type is known."""
+        return self._type(topic) is not None
 
     def _type(self, topic: str) -> Fields | None:
         with contextlib.suppress(RecordingError):
@@ -287,7 +288,7 @@ def _samples(
         stamp = kept.pop(clock.field).astype(np.int64) * clock.nanoseconds
     elif _SECONDS in kept:
         seconds = kept.pop(_SECONDS).astype(np.int64)
-        stamp = seconds * 1_000_000_000 + kept.pop(_NANOSECONDS).astype(np.int64)
+        stamp = seconds * NS_PER_SECOND + kept.pop(_NANOSECONDS).astype(np.int64)
     return Samples(
         receive[whole], stamp, {name: values.astype(np.float64) for name, values in kept.items()}
     )
