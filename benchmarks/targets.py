@@ -15,7 +15,7 @@ from pathlib import Path
 from tuner.core.runtime import configure
 from tuner.core.shipped import EXPORT_TARGETS
 from tuner.evaluate.records import AxesRmse
-from tuner.exporters.effective import kept_effective, pose_rmse, refly
+from tuner.exporters.effective import cached_effective, pose_rmse, refly
 from tuner.exporters.target import target_of, write
 from tuner.report.result_texts import rmse_in_words
 from tuner.result import PoseRmse, read_run
@@ -35,7 +35,7 @@ def main(folder: str) -> None:
     print("|---|---|---|---|---|")
     for kind in EXPORT_TARGETS:
         target = target_of(kind)
-        found = kept_effective(run, target.simulator) if target.simulator.name else None
+        found = cached_effective(run, target.simulator) if target.simulator.name else None
         vehicle = run.vehicle if found is None else found.vehicle
         draft = target.draft(vehicle, "by a benchmark", target.simulator, None)
         with tempfile.TemporaryDirectory() as place:

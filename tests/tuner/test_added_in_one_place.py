@@ -36,7 +36,7 @@ from tuner.core.errors import ConfigError, ExportError
 from tuner.core.phrases import Worded
 from tuner.core.yaml_section import build, section_of
 from tuner.evaluate.simulation_files import write_flights
-from tuner.exporters.simulators import THIS_PROJECT, registered
+from tuner.exporters.simulators import THIS_PROJECT, registry_entries
 from tuner.exporters.target import Draft, Target, differences
 from tuner.findings.findings import Finding, brief, one_line
 from tuner.options import FILES, Options
@@ -153,7 +153,7 @@ def ini_target(monkeypatch):
         return Draft(text, vehicle, (), faults)
 
     def entry(row):
-        return registered("ini")(row) or NotCarried("an ini file holds sails alone")
+        return registry_entries("ini")(row) or NotCarried("an ini file holds sails alone")
 
     module = ModuleType("tuner.exporters.targets.ini")
     module.TARGET = Target("ini", ".ini", draft, replace(THIS_PROJECT, entry=entry))

@@ -19,7 +19,7 @@ from tuner.config.job import ExportSettings
 from tuner.core import disk
 from tuner.core.disk import file_name, inside
 from tuner.core.errors import OutputError
-from tuner.exporters.export import exports_of_job
+from tuner.exporters.export import export_formats_of_job
 from tuner.report import render
 from tuner.report.chart import Chart, Panel
 from tuner.report.paper import write_plots
@@ -83,7 +83,7 @@ def test_exports_of_a_job_stay_in_its_folder(make_run, name):
     wanted = ExportSettings(formats=("yaml", "sdf", "px4"))
     with nothing_outside(run.folder):
         done = dict(
-            exports_of_job(run.folder, wanted, refly=as_the_run_says, today=date(2024, 5, 6))
+            export_formats_of_job(run.folder, wanted, refly=as_the_run_says, today=date(2024, 5, 6))
         )
     assert all(isinstance(path, Path) and path.exists() for path in done.values()), done
 

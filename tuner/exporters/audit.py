@@ -1,7 +1,7 @@
-"""Whether a simulator's model agrees with itself, with PX4's parameters, and with physics.
+"""Audit a simulator's model against itself, PX4's parameters, and physics.
 
-Each fault is a line: where it is, what is wrong, what would be right. What is judged are ranges far
-wider than vehicles differ, and numbers that must agree with each other.
+Each fault is a line: the place, the fault, the right value. The ranges are far wider than those of
+vehicles.
 """
 
 from __future__ import annotations
@@ -13,44 +13,35 @@ from pathlib import Path
 
 import numpy as np
 
-from sim_jax.constants import GRAVITY
+from sim_jax.constants import GRAVITY, RAD_S_PER_RPM
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
-from tuner.exporters.sdf.model import (
-    MOST_ROTORS,
-    Inertial,
-    Model,
-    composite,
-    inertials,
-    read_model,
-)
-from tuner.exporters.sdf.spans import Element, read_tree, rendered
+from tuner.exporters.sdf.model import MAX_ROTORS, Inertial, Model, composite, inertials, read_model
+from tuner.exporters.sdf.spans import Element, read_tree, render
 from tuner.exporters.target import read_file
 from tuner.exporters.targets.px4 import outside_range, read_parameters
 from tuner.result import Run
 from tuner.vehicle import values_of
 
-RPM = 2 * math.pi / 60
-"""rad/s of one rpm."""
-THRUST_TO_WEIGHT = (1.2, 12.0)
-"""Of vehicles that fly; SITL models sit between 1.5 and 5."""
-HOVER = (0.1, 0.8)
-"""Throttle that PX4 accepts as ``MPC_THR_HOVER``."""
-TIME_CONSTANT = (0.002, 0.5)
-"""s, of brushed and brushless motors with propellers from 2 to 30 inch."""
-MOMENT_CONSTANT = (0.003, 0.12)
-"""m: drag torque over thrust of propellers from 2 to 30 inch, PX4's 0.06 of its iris among them."""
-RADIUS_OF_GYRATION = (0.1, 1.0)
-"""Of the longest arm: a body that is all hub, and one that is all motors."""
-SLOWDOWN = (1.0, 100.0)
-TIP_SPEED = 343.0
-"""m/s: no propeller's tips are faster than sound."""
-FASTEST = 6000.0
-"""rad/s, of a propeller of one inch."""
-SAME_PLACE = 0.02
-"""m within which allocation and model agree."""
-SAME_SHARE = 0.1
-"""Part by which numbers that should agree may differ."""
+THRUST_TO_WEIGHT_RANGE = (1.2, 12.0)
+"""SITL models have 1.5 to 5."""
+HOVER_RANGE = (0.1, 0.8)
+"""The throttle that PX4 accepts as ``MPC_THR_HOVER``."""
+TIME_CONSTANT_RANGE_S = (0.002, 0.5)
+"""Of brushed and brushless motors with propellers from 2 to 30 inch."""
+MOMENT_CONSTANT_RANGE_M = (0.003, 0.12)
+"""Drag torque over thrust of propellers from 2 to 30 inch; that of PX4's iris is 0.06."""
+GYRATION_RANGE = (0.1, 1.0)
+"""Relative to the longest arm: from a body that is all hub to one that is all motors."""
+SLOWDOWN_RANGE = (1.0, 100.0)
+MAX_TIP_SPEED = 343.0
+"""m/s. No propeller's tips are faster than sound."""
+MAX_ROTOR_SPEED = 6000.0
+"""rad/s. Propellers of one inch reach it."""
+LAYOUT_TOLERANCE_M = 0.02
+"""Positions of rotors in allocation and model may differ by this."""
+RELATIVE_TOLERANCE = 0.1
+"""Other numbers that should agree may differ by this share."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +57,7 @@ class Rotor:
 
 @dataclass(frozen=True)
 class Audit:
-    """A model as it was read, and what is wrong with it, a line each."""
+    """The audit of a model: its faults, and its differences from a run, a line each."""
 
     path: Path
     mass: float
@@ -82,32 +73,32 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     params
         PX4's parameters that fly it.
     run
-        A fit to hold its numbers against.
+        A fit to compare its numbers with.
 
     Raises
     ------
     ExportError
-        A file cannot be read, or is no multirotor's.
+        A file cannot be read, or is no model of a multirotor.
     """
-    model = read_model(read_tree(path, read_file, rendered), MOST_ROTORS)
+    model = read_model(read_tree(path, read_file, render), MAX_ROTORS)
     rotors = _rotors(model)
     if not rotors:
         raise ExportError(path, "has no motor with a link and a number", "give each motor its own")
-    given = {} if params is None else read_parameters(params)
-    bodies = [*_of_bodies(model)]
-    faults = [*bodies, *_of_rotors(rotors, model)]
+    parameters = {} if params is None else read_parameters(params)
+    bodies = [*_body_faults(model)]
+    faults = [*bodies, *_rotor_faults(rotors, model)]
     mass = sum(body.mass for _, body in inertials(model))
-    if not mass > 0:  # of which nothing else can be judged
+    if not mass > 0:  # nothing else can be judged
         return Audit(path, mass, tuple(dict.fromkeys(faults)), ())
-    whole, speeds = composite(model), _speeds(model, rotors, given)
-    hover = [*_of_hover(whole, rotors, speeds)]
-    faults += [*_of_layout(whole, rotors), *hover]
+    whole, speeds = composite(model), _speeds(model, rotors, parameters)
+    hover = [*_hover_faults(whole, rotors, speeds)]
+    faults += [*_layout_faults(whole, rotors), *hover]
     if not bodies and not any("times the weight" in fault for fault in hover):
-        faults += _of_whole(whole, rotors)  # which else follows from those
+        faults += _inertia_faults(whole, rotors)  # otherwise a consequence of those
     if params is not None:
-        faults += outside_range(given)
-        faults += _of_parameters(given, whole, rotors, speeds)
-    differences = () if run is None else tuple(_against(run, whole, rotors))
+        faults += outside_range(parameters)
+        faults += _parameter_faults(parameters, whole, rotors, speeds)
+    differences = () if run is None else tuple(_differences_from(run, whole, rotors))
     return Audit(path, whole.mass, tuple(dict.fromkeys(faults)), differences)
 
 
@@ -133,8 +124,8 @@ def _radius(link: Element) -> float | None:
     return None
 
 
-def _of_bodies(model: Model) -> Iterator[str]:
-    """Yield links whose mass or inertia no body has."""
+def _body_faults(model: Model) -> Iterator[str]:
+    """Yield faults of links: an impossible mass or inertia."""
     for link, body in inertials(model):
         name = link.attributes.get("name", "")
         moments = np.linalg.eigvalsh(body.inertia)
@@ -149,13 +140,13 @@ def _of_bodies(model: Model) -> Iterator[str]:
             )
 
 
-def _of_whole(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
-    """Yield what is wrong with the inertia of the whole for its size."""
+def _inertia_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
+    """Yield faults of the whole inertia for the vehicle's size."""
     arm = max(float(np.hypot(*(r.place - whole.pose.position)[:2])) for r in rotors)
     if arm <= 0:
         return
     shares = np.sqrt(np.maximum(np.diag(whole.inertia), 0.0) / whole.mass) / arm
-    low, high = RADIUS_OF_GYRATION
+    low, high = GYRATION_RANGE
     if shares.min() < low or shares.max() > high:
         yield (
             f"inertia {_listed(np.diag(whole.inertia))} kg m²: radii of gyration of "
@@ -164,8 +155,8 @@ def _of_whole(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
         )
 
 
-def _of_rotors(rotors: list[Rotor], model: Model) -> Iterator[str]:
-    """Yield what is wrong with single motors, or differs between them."""
+def _rotor_faults(rotors: list[Rotor], model: Model) -> Iterator[str]:
+    """Yield faults of motors, and differences between them."""
     for rotor in rotors:
         where, given = f"rotor {rotor.number}", rotor.numbers
         for tag in ("motorConstant", "momentConstant", "timeConstantUp", "timeConstantDown"):
@@ -173,32 +164,44 @@ def _of_rotors(rotors: list[Rotor], model: Model) -> Iterator[str]:
                 yield f"{where}: it has no {tag}, and the plugin's default flies"
         for tag in ("timeConstantUp", "timeConstantDown"):
             value = given.get(tag)
-            if value is not None and not TIME_CONSTANT[0] <= value <= TIME_CONSTANT[1]:
-                hint = ": is it in ms?" if value > TIME_CONSTANT[1] else ""
-                yield f"{where}: {tag} {value:g} s is no motor's ({_range(TIME_CONSTANT)} s){hint}"
+            if (
+                value is not None
+                and not TIME_CONSTANT_RANGE_S[0] <= value <= TIME_CONSTANT_RANGE_S[1]
+            ):
+                hint = ": is it in ms?" if value > TIME_CONSTANT_RANGE_S[1] else ""
+                limits = _range(TIME_CONSTANT_RANGE_S)
+                yield f"{where}: {tag} {value:g} s is no motor's ({limits} s){hint}"
         moment = given.get("momentConstant")
-        if moment is not None and not MOMENT_CONSTANT[0] <= moment <= MOMENT_CONSTANT[1]:
+        if (
+            moment is not None
+            and not MOMENT_CONSTANT_RANGE_M[0] <= moment <= MOMENT_CONSTANT_RANGE_M[1]
+        ):
             yield (
                 f"{where}: momentConstant {moment:g} m is no propeller's "
-                f"({_range(MOMENT_CONSTANT)} m): it is drag torque over thrust, not 60/(2π kV)"
+                f"({_range(MOMENT_CONSTANT_RANGE_M)} m): it is drag torque over thrust, not "
+                "60/(2π kV)"
             )
         limit = given.get("maxRotVelocity")
         tip = None if limit is None or rotor.radius is None else limit * rotor.radius
-        if limit is not None and (limit > FASTEST or (tip is not None and tip > TIP_SPEED)):
+        if limit is not None and (
+            limit > MAX_ROTOR_SPEED or (tip is not None and tip > MAX_TIP_SPEED)
+        ):
             yield (
                 f"{where}: maxRotVelocity {limit:g} rad/s is too fast for its propeller; is it in "
-                f"rpm? that would be {limit * RPM:.4g} rad/s"
+                f"rpm? that would be {limit * RAD_S_PER_RPM:.4g} rad/s"
             )
         slow = given.get("rotorVelocitySlowdownSim")
-        if slow is None or not SLOWDOWN[0] <= slow <= SLOWDOWN[1]:
-            shown = "is missing" if slow is None else f"{slow:g} is not {_range(SLOWDOWN)}"
+        if slow is None or not SLOWDOWN_RANGE[0] <= slow <= SLOWDOWN_RANGE[1]:
+            shown = "is missing" if slow is None else f"{slow:g} is not {_range(SLOWDOWN_RANGE)}"
             yield f"{where}: rotorVelocitySlowdownSim {shown} (PX4's models have 10)"
         if rotor.turns not in ("ccw", "cw"):
             yield f"{where}: turningDirection is '{rotor.turns}', not ccw or cw"
     for tag in sorted({tag for rotor in rotors for tag in rotor.numbers} - {"motorNumber"}):
         values = {rotor.numbers.get(tag) for rotor in rotors}
         known = [value for value in values if value is not None]
-        if known and (None in values or max(known) - min(known) > SAME_SHARE * abs(max(known))):
+        if known and (
+            None in values or max(known) - min(known) > RELATIVE_TOLERANCE * abs(max(known))
+        ):
             found = ", ".join(f"rotor {r.number} {r.numbers.get(tag)}" for r in rotors)
             yield f"{tag} differs between rotors: {found}"
     fewer = len(model.motors()) - len(rotors)
@@ -206,8 +209,8 @@ def _of_rotors(rotors: list[Rotor], model: Model) -> Iterator[str]:
         yield f"{fewer} motor plugins share a motorNumber with another, or name no link"
 
 
-def _of_layout(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
-    """Yield what is wrong with where rotors sit and how they turn."""
+def _layout_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
+    """Yield faults of the rotors' positions and turning directions."""
     senses = [rotor.turns for rotor in rotors]
     if senses.count("ccw") != senses.count("cw"):
         yield (
@@ -223,7 +226,7 @@ def _of_layout(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
             yield "turningDirection: neighbouring rotors turn the same way: no yaw is commanded"
     off = arms[:, :2].mean(axis=0)
     reach = float(np.abs(arms[:, :2]).max())
-    if np.hypot(*off) > max(SAME_PLACE, 0.1 * reach):
+    if np.hypot(*off) > max(LAYOUT_TOLERANCE_M, 0.1 * reach):
         yield (
             f"the centre of mass is {_listed(off)} m off the middle of the rotors along x and y, "
             f"with arms of {reach:.3g} m"
@@ -231,9 +234,9 @@ def _of_layout(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
 
 
 def _speeds(
-    model: Model, rotors: list[Rotor], given: Mapping[str, float]
+    model: Model, rotors: list[Rotor], parameters: Mapping[str, float]
 ) -> tuple[float, float] | None:
-    """Return the rotor speeds in rad/s at no and at full command; None where nothing says them."""
+    """Return the rotor speeds in rad/s at zero and at full command; None if unknown."""
     limit = min((r.numbers.get("maxRotVelocity", math.inf) for r in rotors), default=math.inf)
     for channel in model.channels():
         numbers = {child.tag: child.number for child in channel.children}
@@ -241,23 +244,23 @@ def _speeds(
         if scaling is not None and zero is not None:
             low = (numbers.get("input_offset") or 0.0) * scaling + zero
             return low, min(low + scaling, limit)
-    least, most = given.get("SIM_GZ_EC_MIN1"), given.get("SIM_GZ_EC_MAX1")
+    least, most = parameters.get("SIM_GZ_EC_MIN1"), parameters.get("SIM_GZ_EC_MAX1")
     if most is not None:
         return float(least or 0.0), min(float(most), limit)
     return None if math.isinf(limit) else (0.0, limit)
 
 
 def _motor_constant(rotors: list[Rotor]) -> float:
-    """Return N s²/rad² of all rotors together."""
+    """Return the sum of the rotors' motor constants in N s²/rad²."""
     return sum(rotor.numbers.get("motorConstant", 0.0) for rotor in rotors)
 
 
 def _hover_throttle(
     whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float] | None
 ) -> float | None:
-    """Return the share of the way from no to full command at which rotors carry the weight.
+    """Return the hover throttle between the speeds at zero and at full command.
 
-    None where speeds or thrust are not known, or there is no way between them.
+    None if speeds or thrust are unknown, or the speeds are equal.
     """
     constant, (low, high) = _motor_constant(rotors), speeds or (0.0, 0.0)
     if not (constant > 0 and high > low):
@@ -265,10 +268,10 @@ def _hover_throttle(
     return (math.sqrt(whole.mass * GRAVITY / constant) - low) / (high - low)
 
 
-def _of_hover(
+def _hover_faults(
     whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float] | None
 ) -> Iterator[str]:
-    """Yield what is wrong with thrust to weight and with the hover."""
+    """Yield faults of the thrust-to-weight ratio and of the hover."""
     if speeds is None or any("motorConstant" not in rotor.numbers for rotor in rotors):
         return
     constant, (low, high) = _motor_constant(rotors), speeds
@@ -278,52 +281,52 @@ def _of_hover(
         return
     weight = whole.mass * GRAVITY
     ratio = constant * high**2 / weight
-    if not THRUST_TO_WEIGHT[0] <= ratio <= THRUST_TO_WEIGHT[1]:
+    if not THRUST_TO_WEIGHT_RANGE[0] <= ratio <= THRUST_TO_WEIGHT_RANGE[1]:
         yield (
             f"full thrust is {ratio:.3g} times the weight of {whole.mass:.4g} kg, vehicles have "
-            f"{_range(THRUST_TO_WEIGHT)}: mass, motorConstant (N s²/rad², not per rpm²) or speeds "
-            "are off"
+            f"{_range(THRUST_TO_WEIGHT_RANGE)}: mass, motorConstant (N s²/rad², not per rpm²) or "
+            "speeds are off"
         )
         return
-    if not HOVER[0] <= hover <= HOVER[1]:
+    if not HOVER_RANGE[0] <= hover <= HOVER_RANGE[1]:
         yield (
             f"it hovers at a throttle of {hover:.2f}, with rotors of {low:g} to {high:g} rad/s; "
-            f"PX4 accepts {_range(HOVER)}"
+            f"PX4 accepts {_range(HOVER_RANGE)}"
         )
 
 
-def _of_parameters(
-    given: Mapping[str, float],
+def _parameter_faults(
+    parameters: Mapping[str, float],
     whole: Inertial,
     rotors: list[Rotor],
     speeds: tuple[float, float] | None,
 ) -> Iterator[str]:
-    """Yield where PX4's parameters and the model disagree."""
-    count = given.get("CA_ROTOR_COUNT")
+    """Yield disagreements of PX4's parameters with the model."""
+    count = parameters.get("CA_ROTOR_COUNT")
     if count is not None and count != len(rotors):
         yield f"CA_ROTOR_COUNT is {count:g}, the model has {len(rotors)} rotors"
     for rotor in rotors:
         name = f"CA_ROTOR{rotor.number}"
         arm = rotor.place - whole.pose.position
         for key, expected in (("PX", arm[0]), ("PY", -arm[1])):
-            value = given.get(f"{name}_{key}")
-            if value is not None and abs(value - expected) > SAME_PLACE:
+            value = parameters.get(f"{name}_{key}")
+            if value is not None and abs(value - expected) > LAYOUT_TOLERANCE_M:
                 yield f"{name}_{key} is {value:g} m, rotor {rotor.number} sits at {expected:.3g} m"
-        turn = given.get(f"{name}_KM")
+        turn = parameters.get(f"{name}_KM")
         if turn and rotor.turns in ("ccw", "cw") and (turn > 0) != (rotor.turns == "ccw"):
             yield f"{name}_KM {turn:g} says the other turning direction than {rotor.turns}"
-    mass = given.get("SIH_MASS")
-    if mass is not None and not math.isclose(mass, whole.mass, rel_tol=SAME_SHARE):
+    mass = parameters.get("SIH_MASS")
+    if mass is not None and not math.isclose(mass, whole.mass, rel_tol=RELATIVE_TOLERANCE):
         yield f"SIH_MASS is {mass:g} kg, the model weighs {whole.mass:.4g} kg"
-    hover, there = given.get("MPC_THR_HOVER"), _hover_throttle(whole, rotors, speeds)
-    if hover is None or there is None or "SIH_T_MAX" in given:
+    hover, there = parameters.get("MPC_THR_HOVER"), _hover_throttle(whole, rotors, speeds)
+    if hover is None or there is None or "SIH_T_MAX" in parameters:
         return
-    if abs(hover - there) > SAME_SHARE:
+    if abs(hover - there) > RELATIVE_TOLERANCE:
         yield f"MPC_THR_HOVER is {hover:g}, the model hovers at a throttle of {there:.2f}"
 
 
-def _against(run: Run, whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
-    """Yield how far each number is from the fitted one."""
+def _differences_from(run: Run, whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
+    """Yield the difference of each number from the fitted one."""
     fitted = values_of(run.vehicle)
     first = rotors[0].numbers
     there = {

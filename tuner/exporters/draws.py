@@ -1,8 +1,8 @@
-"""Draws of a run's joint posterior: vehicles that its flights do not tell apart.
+"""Draws of vehicles from a run's joint posterior.
 
-Coefficients are normally distributed in the coordinate that the search moves, the logarithm or the
-number, with the covariance of ``sensitivity.json``: flights and priors together, errors of model
-and gusts included. What leaves the search's bounds, or is no rigid body, is drawn again.
+Coefficients, or their logarithms if the search moved these, are normally distributed with the
+covariance of ``sensitivity.json``: of flights and priors, with errors of model and gusts. Draws
+beyond the search's bounds, or with an impossible inertia, are drawn again.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from tuner.result import Run
 from tuner.uncertainty.records import Knowledge
 from tuner.vehicle import COEFFICIENTS, VehicleFile, values_of, with_values
 
-MOST = 10_000
-"""Draws at a time."""
-TABLE = "draws.csv"
-RANGES = "ranges_isaaclab.py"
-CENTRAL = (2.5, 97.5)
-"""Percentiles between which Isaac Lab samples."""
-TRIES = 200
-"""Times as many vectors are drawn until enough are within the bounds."""
+MAX_DRAWS = 10_000
+"""The largest number of draws."""
+TABLE_FILE = "draws.csv"
+RANGES_FILE = "ranges_isaaclab.py"
+CENTRAL_PERCENTILES = (2.5, 97.5)
+"""The percentiles of Isaac Lab's ranges."""
+MAX_TRIES = 200
+"""So many batches are drawn until enough vectors are within the bounds."""
 
 
 @dataclass(frozen=True)
 class Draws:
-    """Coefficients that were drawn together.
+    """Joint draws of coefficients.
 
     Attributes
     ----------
     names
-        K coefficients.
+        The K coefficients.
     values
         (N, K) in their units.
     best
         (K,) the run's.
     is_log
-        (K,) whether they are drawn by their logarithm.
+        (K,) whether their logarithms are drawn.
     """
 
     names: tuple[str, ...]
@@ -58,12 +58,12 @@ class Draws:
     is_log: NDArray[np.bool_]
 
     def vehicle(self, number: int, base: VehicleFile) -> VehicleFile:
-        """Return one draw of a vehicle that has the run's coefficients, or effective ones.
+        """Return one draw of a vehicle with the run's, or effective, coefficients.
 
         Raises
         ------
         ConfigError
-            Its inertia is no rigid body's.
+            Its inertia is impossible.
         """
         held = values_of(base)
         drawn = {}
@@ -78,24 +78,24 @@ class Draws:
 
 
 def draws_of(run: Run, count: int) -> Draws:
-    """Return draws of a run's coefficients; the same for the same run.
+    """Return draws of a run's coefficients, always the same for one run.
 
     Raises
     ------
     InputError
-        The result folder does not hold their covariance.
+        The result folder lacks their covariance.
     ExportError
-        Too many are asked for, or the bounds leave nothing to draw.
+        The count is too large, or the bounds hardly contain the posterior.
     """
-    if not 1 <= count <= MOST:
-        raise ExportError("--draws", f"{count} are asked for", f"ask for 1 to {MOST}")
+    if not 1 <= count <= MAX_DRAWS:
+        raise ExportError("--draws", f"{count} are asked for", f"ask for 1 to {MAX_DRAWS}")
     known = Knowledge.read(run.folder)
     rows = run.result.coefficients
     names = tuple(known.names)
     if not names or any(name not in rows for name in names):
         raise InputError(run.folder / Knowledge.FILE, "is of another run", "fit again")
     best = np.array([rows[name].best for name in names])
-    is_log = np.array([_by_logarithm(run, name) for name in names])
+    is_log = np.array([_is_log_scaled(run, name) for name in names])
     unit = np.where(is_log, best, 1.0)
     covariance = np.array(known.covariance) / np.outer(unit, unit)
     values, vectors = symmetric_eigen(covariance)
@@ -104,11 +104,11 @@ def draws_of(run: Run, count: int) -> Draws:
     high = np.array([np.inf if (b := rows[n].upper) is None else b for n in names])
     generator = np.random.default_rng(run.result.seed)
     kept: list[Array] = []
-    for _ in range(TRIES):
+    for _ in range(MAX_TRIES):
         steps = generator.standard_normal((count, len(names))) @ root.T
         drawn = np.where(is_log, best * np.exp(np.where(is_log, steps, 0.0)), best + steps)
         inner = ((drawn >= low) & (drawn <= high)).all(axis=1)
-        kept += [row for row in drawn[inner] if _flies(run.vehicle, names, row)]
+        kept += [row for row in drawn[inner] if _is_valid(run.vehicle, names, row)]
         if len(kept) >= count:
             break
     else:
@@ -133,7 +133,7 @@ def draws_of(run: Run, count: int) -> Draws:
     )
 
 
-def _by_logarithm(run: Run, name: str) -> bool:
+def _is_log_scaled(run: Run, name: str) -> bool:
     """Return whether the search moved a coefficient's logarithm."""
     job: Any = run.result.settings.get("job")
     given = (job.get("coefficients") or {}).get(name) if isinstance(job, dict) else None
@@ -141,7 +141,7 @@ def _by_logarithm(run: Run, name: str) -> bool:
     return bool(scale == "log" and run.result.coefficients[name].best > 0)
 
 
-def _flies(vehicle: VehicleFile, names: Sequence[str], row: Array) -> bool:
+def _is_valid(vehicle: VehicleFile, names: Sequence[str], row: Array) -> bool:
     try:
         with_values(vehicle, dict(zip(names, row.tolist(), strict=True)))
     except ConfigError:
@@ -152,63 +152,67 @@ def _flies(vehicle: VehicleFile, names: Sequence[str], row: Array) -> bool:
 def write_draws(
     draws: Draws, base: VehicleFile, folder: Path, target: Target, provenance: str
 ) -> tuple[str, ...]:
-    """Write a table, a file for each draw, and what Isaac Lab samples between.
+    """Write a table, a file for each draw, and Isaac Lab's ranges.
 
     Parameters
     ----------
     draws, base
-        The draws, and the vehicle that they are draws of.
+        The draws, and their vehicle.
     folder, target
-        Where the files lie, and their format.
+        The folder and the format of the files.
 
     Returns
     -------
     tuple
-        What was written, a note each.
+        A note on each file.
     """
     make_folder(folder)
     vehicles = []
     for number in range(len(draws.values)):
         try:
             vehicles.append(draws.vehicle(number, base))
-        except ConfigError:  # of effective coefficients, whose moments are another body's
+        except ConfigError:  # drawn moments of effective coefficients may be impossible
             continue
     rows = [(number + 1, *values_of(v).values()) for number, v in enumerate(vehicles)]
-    write_text(folder / TABLE, csv_text(("draw", *values_of(base)), rows))
+    write_text(folder / TABLE_FILE, csv_text(("draw", *values_of(base)), rows))
     for number, vehicle in enumerate(vehicles):
         name = f"draw_{number + 1:05d}"
         named = vehicle.replace(name=f"{base.name}_{name}")
         draft = target.draft(named, f"{provenance}; {name}", target.simulator, None)
         write(draft, inside(folder, f"{name}{target.suffix}"))
-    notes = [f"{len(vehicles)} draws of the joint posterior are in {folder / TABLE}"]
+    notes = [f"{len(vehicles)} draws of the joint posterior are in {folder / TABLE_FILE}"]
     if len(vehicles) < len(draws.values):
         notes.append(f"{len(draws.values) - len(vehicles)} more are no rigid body and left out")
     if target.simulator is ISAAC_LAB:
         text = isaaclab_text(_ranges(list(map(ISAAC_LAB.flown, vehicles))), provenance)
-        write_text(folder / RANGES, text)
-        notes.append(f"the central 95 % of each number are the ranges in {folder / RANGES}")
+        write_text(folder / RANGES_FILE, text)
+        notes.append(f"the central 95 % of each number are the ranges in {folder / RANGES_FILE}")
     return tuple(notes)
 
 
 def _ranges(vehicles: Sequence[VehicleFile]) -> dict[str, dict[str, Any]]:
-    """Return Isaac Lab's configuration with ranges between percentiles of vehicles."""
+    """Return Isaac Lab's configuration, with ranges from percentiles over vehicles."""
     configurations = [configuration(vehicle) for vehicle in vehicles]
-    middle: dict[str, dict[str, Any]] = {}
+    ranges: dict[str, dict[str, Any]] = {}
     for section, values in configurations[0].items():
-        middle[section] = {}
+        ranges[section] = {}
         for name, value in values.items():
             if isinstance(value, bool | str):
-                middle[section][name] = value
+                ranges[section][name] = value
                 continue
             each = np.array([c[section][name] for c in configurations], float)
-            low, half, high = np.percentile(each, (CENTRAL[0], 50.0, CENTRAL[1]), axis=0)
+            low, half, high = np.percentile(
+                each, (CENTRAL_PERCENTILES[0], 50.0, CENTRAL_PERCENTILES[1]), axis=0
+            )
             if name.endswith("_range") and name != "thrust_range":
-                middle[section][name] = [float(low[0]), float(high[1])]
+                ranges[section][name] = [float(low[0]), float(high[1])]
             else:
-                middle[section][name] = half.tolist()
+                ranges[section][name] = half.tolist()
                 if section == "BODY":
-                    middle[section][f"{name}_range"] = [low.tolist(), high.tolist()]
+                    ranges[section][f"{name}_range"] = [low.tolist(), high.tolist()]
     ratio = [c["THRUSTER"]["torque_to_thrust_ratio"] for c in configurations]
-    middle["BODY"]["torque_to_thrust_ratio_range"] = np.percentile(ratio, CENTRAL).tolist()
-    middle["MULTIROTOR"]["rotor_directions"] = configurations[0]["MULTIROTOR"]["rotor_directions"]
-    return middle
+    ranges["BODY"]["torque_to_thrust_ratio_range"] = np.percentile(
+        ratio, CENTRAL_PERCENTILES
+    ).tolist()
+    ranges["MULTIROTOR"]["rotor_directions"] = configurations[0]["MULTIROTOR"]["rotor_directions"]
+    return ranges

@@ -1,10 +1,9 @@
-"""With which coefficients a simulator flies most like the vehicle, and a run's flights flown again.
+"""Effective coefficients of a simulator that lacks terms, and flights of a run simulated again.
 
-Without the terms that a simulator lacks, the coefficients of its own model are fitted once more
-from their physical values, so that they stand in for what is missing as well as they can. Terms
-that it has a place for stay as they are, and so do the set-up, the clocks and the air as the run
-ended with them. Those for Gazebo are found while a run is under way. Those for other simulators are
-found when an export asks for them, and kept in the result folder.
+The coefficients of the simulator's own model are refitted without those terms, from their physical
+values, to compensate for them. Other terms, the set-up, and the run's clocks and conditions stay.
+Effective coefficients for Gazebo are part of a run. Those for other simulators are found by an
+export, and cached in the result folder.
 """
 
 from __future__ import annotations
@@ -52,51 +51,48 @@ from tuner.vehicle import (
     write_vehicle,
 )
 
-STAGES = slice(-3, None)
-"""Of the search: whole flights, then the polish in the weights that what is missing leaves."""
-POLISH = -2
-"""Of the search: the stage from which it goes on where moments of inertia have to stay."""
+LAST_STAGES = slice(-3, None)
+"""The stages of the search: whole flights, then the polish with weights for the missing terms."""
+POLISH_STAGE = -2
+"""The stage from which a search with fixed moments of inertia goes on."""
 MOMENTS = frozenset(name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia")
-LEFT = 1e-4
-"""Share of the loss that may be left to gain: half as much of how far off the flights are. With a
-hundredth a moment constant ends a quarter off: steps in the long valley that a lacking model leaves
-gain half of that each."""
-LAWS = "other laws"
-"""What a simulator lacks that no coefficient says."""
+MIN_TOLERANCE = 1e-4
+"""Relative reduction of the loss at which a stage ends. With a hundredth a moment constant ends a
+quarter off: a model without a term has a long valley, in which each step gains half of that."""
+OTHER_LAWS = "other laws"
+"""The group of differences that have no coefficient."""
 FOLDER = "effective"
-"""Of a result folder, for the vehicles that simulators fly."""
+"""The result folder's folder of effective vehicles."""
 
-Recorded = tuple[Settings, Sequence[Recording]]
-"""A run's settings, with the controller as it ended, and its recordings. What the run found of each
-flight, clocks and air, is in its result."""
+RunInputs = tuple[Settings, Sequence[Recording]]
+"""A run's settings, with the fitted controller, and its recordings. Clocks and conditions of each
+flight are in its result."""
 
 
 @dataclass(frozen=True)
 class Effective:
-    """The vehicle that a simulator flies most like a run's, and how it flies."""
+    """A simulator's vehicle with effective coefficients, and its errors."""
 
     vehicle: VehicleFile
     result: EffectiveResult
 
 
-def effective_in(
+def find_effective(
     run: Run,
     simulator: Simulator,
-    read: Callable[[Run], Recorded],
+    read: Callable[[Run], RunInputs],
     *,
     on_message: Callable[[str], None] = lambda _: None,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Effective | None:
-    """Return the vehicle with which a simulator flies most like a run's.
-
-    None where the simulator lacks nothing of what acts.
+    """Return a simulator's vehicle with effective coefficients; None if it lacks no acting term.
 
     Parameters
     ----------
     run, simulator
-        The physical answer, and who is to fly it.
+        The physical result, and the simulator.
     read
-        Returns the run's recordings; not called where nothing is lacking.
+        Returns the run's recordings; only called if a term is missing.
     on_message, on_progress
         Called before the fit, and after every iteration.
 
@@ -114,7 +110,7 @@ def effective_in(
     )
     recorded = read(run)
     names = frozenset(name for members in lost.values() for name in members)
-    vehicle, converged = fitted_in(run, simulator, recorded, names, on_progress)
+    vehicle, converged = fit_effective(run, simulator, recorded, names, on_progress)
     spinning = {r.flight.name for r in recorded[1] if r.flight.spins_freely}
 
     def flown(flying: VehicleFile, missing: Collection[str]) -> dict[str, AxesRmse]:
@@ -125,7 +121,7 @@ def effective_in(
         return pose_rmse(axes for name, axes in rmse.items() if name not in spinning)
 
     def without(members: tuple[str, ...]) -> PoseRmse:
-        lacking = simulator.lacking(run.vehicle, members)
+        lacking = simulator.with_built_in(run.vehicle, members)
         return over_flights(flown(lacking if members else lawful, members))
 
     lawful, flights = simulator.laws(run.vehicle), flown(vehicle, names)
@@ -149,9 +145,9 @@ def effective_in(
 
 
 def lost_terms(run: Run, simulator: Simulator) -> dict[str, tuple[str, ...]]:
-    """Return group -> its coefficients that act and that a simulator flies at another value.
+    """Return group -> its acting coefficients that have another value in a simulator.
 
-    What acted on a flight counts as well. Where nothing was flown there are none.
+    Conditions of flights count as well. A run without flights has none.
     """
     if not run.result.flights:
         return {}
@@ -162,12 +158,12 @@ def lost_terms(run: Run, simulator: Simulator) -> dict[str, tuple[str, ...]]:
     lost = simulator.lost(acting)
     there = simulator.laws(run.vehicle)
     if there.aerodynamics != run.vehicle.aerodynamics or values_of(there) != values_of(run.vehicle):
-        lost[LAWS] = ()
+        lost[OTHER_LAWS] = ()
     return lost
 
 
 def carried_terms(simulator: Simulator, vehicle: VehicleFile) -> tuple[str, ...]:
-    """Return the terms beyond the motor model that act and that a simulator has a place for."""
+    """Return the acting terms beyond the motor model that a simulator has."""
     return tuple(
         name
         for name, value in vehicle.effects.items()
@@ -176,23 +172,23 @@ def carried_terms(simulator: Simulator, vehicle: VehicleFile) -> tuple[str, ...]
     )
 
 
-def fitted_in(
+def fit_effective(
     run: Run,
     simulator: Simulator,
-    recorded: Recorded,
+    recorded: RunInputs,
     lost: Collection[str],
     on_progress: Callable[[Progress], None],
 ) -> tuple[VehicleFile, bool]:
     """Return a simulator's vehicle fitted to a run's flights, and whether the fit converged.
 
-    What was known of its coefficients beforehand is about the vehicle, not about a simulator that
-    lacks terms: each is held weakly at its start. Where the moments of inertia end as no rigid
-    body's, they stay as they began, and the others go on from where they ended.
+    Prior knowledge is about the vehicle, not about a simulator without some terms: each coefficient
+    has a weak prior at its start. If the moments of inertia end as impossible, they are fixed at
+    their start, and the fit of the others goes on.
     """
     settings, recordings = recorded
     begins = run.vehicle if simulator.start is None else simulator.start(run.vehicle)
     start = simulator.flown(begins)
-    free = free_in(run, simulator, start)
+    free = free_coefficients(run, simulator, start)
     if not free:
         return start, True
     conditions = {n for flight in run.result.flights for n in flight.conditions if n not in lost}
@@ -216,12 +212,12 @@ def fitted_in(
         replace(
             stage,
             name=f"for {simulator.title}, {stage.name}",
-            tolerance=max(stage.tolerance, LEFT),
+            tolerance=max(stage.tolerance, MIN_TOLERANCE),
             rough=True,
         )
-        for stage in (stages[STAGES] if simulator.start is None else stages)
+        for stage in (stages[LAST_STAGES] if simulator.start is None else stages)
     )
-    space, begun = problem.space, _as_it_ended(run, problem, lost)
+    space, begun = problem.space, _start_of_fit(run, problem, lost)
 
     def ended(progress: Progress, moves: NDArray[np.bool_]) -> Progress:
         none = np.zeros(begun.points.offsets.shape[1:], bool)
@@ -245,7 +241,7 @@ def fitted_in(
     at_start = np.where(moves, progress.points.coefficients, space.initial)
     again = replace(
         begun,
-        stage=len(stages) + POLISH,
+        stage=len(stages) + POLISH_STAGE,
         points=replace(progress.points, coefficients=at_start),
         scales=progress.scales,
         iterations=progress.iterations,
@@ -256,7 +252,7 @@ def fitted_in(
 
 
 def _bounds(run: Run, start: VehicleFile, free: Sequence[str]) -> dict[str, CoefficientSettings]:
-    """Return the bounds that a run searched between, where a simulator's vehicle begins inside."""
+    """Return the run's bounds of those coefficients whose start is inside."""
     values, rows = values_of(start), run.result.coefficients
     return {
         name: CoefficientSettings(lower=lower, upper=upper)
@@ -267,7 +263,7 @@ def _bounds(run: Run, start: VehicleFile, free: Sequence[str]) -> dict[str, Coef
     }
 
 
-def _as_it_ended(run: Run, problem: Job, lost: Collection[str]) -> Progress:
+def _start_of_fit(run: Run, problem: Job, lost: Collection[str]) -> Progress:
     """Return where a fit begins, with clocks, air and weights as the run ended with them."""
     objective, begun = (
         problem.objective,
@@ -290,11 +286,8 @@ def _as_it_ended(run: Run, problem: Job, lost: Collection[str]) -> Progress:
     return replace(begun, points=Point(begun.points.coefficients, at[None]), scales=scales)
 
 
-def free_in(run: Run, simulator: Simulator, bare: VehicleFile) -> list[str]:
-    """Return the coefficients that stand in for what a simulator lacks.
-
-    Those that the run fitted and that the simulator has, and the simulator's own.
-    """
+def free_coefficients(run: Run, simulator: Simulator, bare: VehicleFile) -> list[str]:
+    """Return the coefficients to fit: those of the run that the simulator has, and its own."""
     values = values_of(bare)
     names = []
     for name, row in COEFFICIENTS.items():
@@ -308,9 +301,9 @@ def free_in(run: Run, simulator: Simulator, bare: VehicleFile) -> list[str]:
 
 
 def pose_rmse(flights: Iterable[AxesRmse]) -> PoseRmse:
-    """Return the root mean square over flights of what each misses; a crash leaves none of it.
+    """Return the root mean square of RMSEs over flights; None with a crash.
 
-    That of attitude is over the flights that predict it, and follow it not.
+    That of attitude is over the flights that have no attitude as input.
     """
     rows = list(flights)
     crashed = any(row.x is None for row in rows)
@@ -328,19 +321,19 @@ def pose_rmse(flights: Iterable[AxesRmse]) -> PoseRmse:
 def refly(
     run: Run, vehicle: VehicleFile, flier: Callable[..., Any] | None = None
 ) -> Mapping[str, AxesRmse]:
-    """Return flight name to RMSE of a run's recordings, simulated whole with a vehicle.
+    """Return flight name -> RMSE of a run's recordings, simulated with a vehicle.
 
     Parameters
     ----------
     run
-        Gives the recordings, the controller that flew, and each flight's clock offset.
+        The run, with recordings, controller and each flight's clock offset.
     flier
-        Flies it in another simulator, as of `tuner.exporters.flier.flier`.
+        Flies it in another simulator, as of `tuner.exporters.external_simulator.flier_of`.
 
     Raises
     ------
     InputError
-        A recording is gone or has changed, or the result folder does not hold what flew.
+        A recording is missing or has changed, or the result folder lacks its settings.
     """
     if not run.result.flights:  # of ground measurements
         return {}
@@ -349,8 +342,8 @@ def refly(
     return {name: errors.rmse for name, errors in flown.items()}
 
 
-def _comparison(run: Run, recorded: Recorded, missing: Collection[str] = ()) -> Comparison:
-    """Return a run's recordings laid out as it ended, without some of what acted on a flight."""
+def _comparison(run: Run, recorded: RunInputs, missing: Collection[str] = ()) -> Comparison:
+    """Return the comparison of a run's recordings, without some conditions."""
     settings, recordings = recorded
     ended = {flight.name: flight for flight in run.result.flights}
     acted = {
@@ -362,7 +355,7 @@ def _comparison(run: Run, recorded: Recorded, missing: Collection[str] = ()) -> 
     return Comparison(recordings, settings.controller, window=settings.job.search.window)
 
 
-def recordings_of(run: Run) -> Recorded:
+def recordings_of(run: Run) -> RunInputs:
     """Return the settings of a run, and its recordings.
 
     Raises
@@ -384,9 +377,9 @@ def recordings_of(run: Run) -> Recorded:
 
 
 def _settings(run: Run) -> Settings:
-    """Return how the run read its recordings.
+    """Return the run's settings of reading its recordings.
 
-    Inlets, and commands that follow from a commanded wrench, go by the vehicle that it began with.
+    Inlets, and commands from a commanded wrench, follow from the initial vehicle.
     """
     settings = run.result.settings
     try:
@@ -407,29 +400,29 @@ def _settings(run: Run) -> Settings:
 
 
 class EffectiveFile(ResultFile):
-    """A simulator's effective coefficients, kept beside the run that they are of.
+    """A simulator's effective coefficients, cached in the result folder.
 
     Attributes
     ----------
     of
-        Hash of what they follow from: the run's vehicle, and this program's version.
+        Hash of the run's vehicle and this program's version.
     effective
-        How they fly; None where the simulator lacks nothing.
+        Their result; None if the simulator lacks no term.
     """
 
     of: str
     effective: EffectiveResult | None
 
 
-def kept_effective(run: Run, simulator: Simulator) -> Effective | None:
-    """Return what `effective_in` does, from the result folder where it was found before.
+def cached_effective(run: Run, simulator: Simulator) -> Effective | None:
+    """Return the result of `find_effective`, cached in the result folder.
 
     Raises
     ------
     InputError
         As of `refly`.
     OutputError
-        It cannot be kept.
+        It cannot be cached.
     """
     vehicle_file = run.folder / FOLDER / f"{simulator.name}.yaml"
 
@@ -446,7 +439,7 @@ def kept_effective(run: Run, simulator: Simulator) -> Effective | None:
                 if kept.effective is None
                 else Effective(read_vehicle(vehicle_file), kept.effective)
             )
-    found = effective_in(run, simulator, recordings_of)
+    found = find_effective(run, simulator, recordings_of)
     if found is not None:
         write_vehicle(found.vehicle, vehicle_file, header=f"Effective in {simulator.title}.")
     Kept(of=key, effective=None if found is None else found.result).write(run.folder)

@@ -1,4 +1,4 @@
-"""Exports from a run to files: which numbers, their origin, gates, writing, reading back."""
+"""Exports from a run to files: numbers, provenance, gates, writing, reading back."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from tuner.config.job import ExportSettings
 from tuner.core.disk import check_file, file_name, inside
 from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draws import draws_of, write_draws
-from tuner.exporters.effective import Effective, kept_effective, refly
-from tuner.exporters.gates import Refly, check, check_hover, check_in_simulator, not_flown
+from tuner.exporters.effective import Effective, cached_effective, refly
+from tuner.exporters.gates import Refly, check, check_hover, check_in_simulator, gates_not_run
 from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.exporters.target import (
     Draft,
@@ -46,14 +46,14 @@ FOLDER = EXPORTS
 
 @dataclass(frozen=True)
 class Exported:
-    """A file that was written and read back.
+    """An exported file.
 
     Attributes
     ----------
     gates
-        The conditions that were checked; those not met were accepted.
+        The checked conditions; unmet ones were accepted.
     notes
-        What was done, and what the format has no place for.
+        Remarks, and coefficients that the format lacks.
     """
 
     path: Path
@@ -63,24 +63,24 @@ class Exported:
 
 def export(
     run: Run,
-    asked: ExportOptions,
+    options: ExportOptions,
     *,
     today: date,
     refly: Refly = refly,
     copies: Path | None = None,
 ) -> Exported:
-    """Write a run's coefficients in a format, if they hold there.
+    """Write a run's coefficients in a format, if they pass the gates.
 
     Parameters
     ----------
     run
         A result folder. A target that lacks some of its terms gets its effective coefficients,
         unless its job wants the physical ones.
-    asked
-        The format, and where to write. A reason to export in spite of gates that are not met goes
-        into the provenance.
+    options
+        The format, and the path. A reason to export in spite of unmet gates goes into the
+        provenance.
     copies
-        Folder for a copy of the model, which then stays as it is.
+        Folder for a patched copy of the model.
 
     Raises
     ------
@@ -89,17 +89,17 @@ def export(
     OutputError
         The file cannot be written.
     """
-    target, into, out = target_of(asked.format), asked.into, asked.out
+    target, into, out = target_of(options.format), options.into, options.out
     own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
     if out is not None and out.name in OF_A_RUN:
-        _keep(out, run.folder / out.name)
+        _refuse_overwrite(out, run.folder / out.name)
     if out is None or out.suffix:  # before anything is computed
         check_file(out or into or inside(run.folder, own))
-    target = target.for_simulator(asked.simulator, into)
-    physical, (run, effective) = run, in_simulator(run, target)
+    target = target.for_simulator(options.simulator, into)
+    physical, (run, effective) = run, run_in_simulator(run, target)
     vehicle, decided = exported_vehicle(run, today)
     check_every_coefficient(physical.vehicle, target)
-    line = provenance(run, today, asked.accept)
+    line = provenance(run, today, options.accept)
     if effective is not None:
         line = f"{what_is_exported(effective, target.simulator.title)}; {line}"
         decided = (
@@ -110,7 +110,7 @@ def export(
     draft = target.draft(vehicle, line, target.simulator, into)
     if into is not None and copies is not None and out is None:
         out = copies if draft.others else inside(copies, into.name)
-    places = _places(draft, out or into or inside(run.folder, own), into)
+    places = _output_paths(draft, out or into or inside(run.folder, own), into)
     gates = (
         *draft.gates,
         check_hover(target.simulator.flown(vehicle), draft.vehicle),
@@ -120,58 +120,58 @@ def export(
     if draft.flier is not None and run.result.flights:
         gate, sentence = check_in_simulator(run, draft, refly, target.simulator.title)
         gates, flown = (*gates, gate), (sentence,)
-    refuse(run.folder, gates, asked.accept, "fit again")
+    require_gates(run.folder, gates, options.accept, "fit again")
     write(draft, *places)
     notes = (*decided, *flown, *draft.notes, *not_carried(vehicle, target))
     if places[0].is_relative_to(run.folder):
         file = places[0].relative_to(run.folder).as_posix()
-        _record(run.folder, ExportRecord(format=asked.format, file=file, gates=gates))
+        _record(run.folder, ExportRecord(format=options.format, file=file, gates=gates))
     return Exported(places[0], gates, notes)
 
 
-def _keep(out: Path, read: Path) -> None:
-    """Refuse to write over what the numbers come from."""
+def _refuse_overwrite(out: Path, read: Path) -> None:
+    """Refuse to overwrite the source of the numbers."""
     if out.resolve() == read.resolve():
         raise ExportError("--out", f"{out} is what is exported", "name another file")
 
 
 def _record(folder: Path, made: ExportRecord) -> None:
-    """Note in a result folder what was exported into it, or was not."""
+    """Record an export, or a refusal, in a result folder."""
     known = ExportRecords.read_if_any(folder) or ExportRecords()
     ExportRecords(exports={**known.exports, made.format: made}).write(folder)
 
 
-def export_vehicle(file: Path, asked: ExportOptions, *, today: date) -> Exported:
-    """Write the coefficients of a vehicle file in a format: no flight says that they are right.
+def export_vehicle(file: Path, options: ExportOptions, *, today: date) -> Exported:
+    """Write the coefficients of a vehicle file in a format, without a check by flights.
 
     Parameters
     ----------
     file
-        Of the vehicle; what its ``source`` says of each number is handed on.
-    asked, today
+        The vehicle file; the ``source`` of each number becomes a note.
+    options, today
         As of `export`; by default it is written beside the vehicle file.
 
     Raises
     ------
     ConfigError
-        The file is no vehicle's.
+        The file is no vehicle file.
     ExportError, OutputError
         As of `export`.
     """
     vehicle = read_vehicle(file)
-    if asked.out is not None:
-        _keep(asked.out, file)
-    target = target_of(asked.format).for_simulator(asked.simulator, asked.into)
+    if options.out is not None:
+        _refuse_overwrite(options.out, file)
+    target = target_of(options.format).for_simulator(options.simulator, options.into)
     simulator = target.simulator
     check_every_coefficient(vehicle, target)
-    line, sources = provenance_of_file(vehicle, file, today, asked.accept)
-    draft = target.draft(vehicle, line, simulator, asked.into)
+    line, sources = provenance_of_file(vehicle, file, today, options.accept)
+    draft = target.draft(vehicle, line, simulator, options.into)
     beside = file.with_name(f"{file.stem}{target.suffix}")
     if beside.name == file.name:
         beside = file.with_name(f"{file.stem}_exported{target.suffix}")
-    places = _places(draft, asked.out or asked.into or beside, asked.into)
-    gates = (*draft.gates, check_hover(simulator.flown(vehicle), draft.vehicle), *not_flown())
-    refuse(file, gates, asked.accept, "correct the vehicle file or the model")
+    places = _output_paths(draft, options.out or options.into or beside, options.into)
+    gates = (*draft.gates, check_hover(simulator.flown(vehicle), draft.vehicle), *gates_not_run())
+    require_gates(file, gates, options.accept, "correct the vehicle file or the model")
     write(draft, *places)
     lacks = (f"{simulator.name} computes otherwise: {what}" for what in simulator.deviations)
     notes = (*sources, *draft.notes, *not_carried(vehicle, target), *lacks)
@@ -179,17 +179,13 @@ def export_vehicle(file: Path, asked: ExportOptions, *, today: date) -> Exported
 
 
 def export_draws(
-    run: Run,
-    asked: ExportOptions,
-    *,
-    today: date,
-    refly: Refly = refly,
+    run: Run, options: ExportOptions, *, today: date, refly: Refly = refly
 ) -> Exported:
     """Write draws of a run's joint posterior in a format, once the run itself may be exported.
 
     Parameters
     ----------
-    run, asked, today, refly
+    run, options, today, refly
         As of `export`; written into a folder, by default ``export/draws`` in the result folder.
 
     Raises
@@ -197,21 +193,21 @@ def export_draws(
     InputError
         As `export` raises, or the run has no covariance to draw from.
     """
-    assert asked.draws is not None
-    folder = asked.out or run.folder / FOLDER / "draws"
-    draws = draws_of(run, asked.draws)
-    target = target_of(asked.format).for_simulator(asked.simulator)
+    assert options.draws is not None
+    folder = options.out or run.folder / FOLDER / "draws"
+    draws = draws_of(run, options.draws)
+    target = target_of(options.format).for_simulator(options.simulator)
     name = file_name(run.vehicle.name, target.suffix)
-    first = replace(asked, out=inside(folder, name))
+    first = replace(options, out=inside(folder, name))
     done = export(run, first, today=today, refly=refly)
-    flying, _ = in_simulator(run, target)
-    line = f"draw of the posterior; {provenance(run, today, asked.accept)}"
+    flying, _ = run_in_simulator(run, target)
+    line = f"draw of the posterior; {provenance(run, today, options.accept)}"
     notes = write_draws(draws, flying.vehicle, folder, target, line)
     return replace(done, path=folder, notes=(*done.notes, *notes))
 
 
-def refuse(subject: Path, gates: Sequence[Gate], accept: str, remedy: str) -> None:
-    """Refuse numbers against which something stands, unless a reason accepts them.
+def require_gates(subject: Path, gates: Sequence[Gate], accept: str, remedy: str) -> None:
+    """Refuse numbers that fail a gate, unless a reason accepts them.
 
     Raises
     ------
@@ -227,11 +223,10 @@ def refuse(subject: Path, gates: Sequence[Gate], accept: str, remedy: str) -> No
         )
 
 
-def _places(draft: Draft, path: Path, into: Path | None) -> tuple[Path, dict[Path, Path]]:
-    """Return where a draft is written, and where its further files are.
+def _output_paths(draft: Draft, path: Path, into: Path | None) -> tuple[Path, dict[Path, Path]]:
+    """Return the path of a draft, and further file -> its path.
 
-    A model that is split over several files stays where it is, or is written into a folder, each
-    file in a folder of the name of its own.
+    A model of several files is overwritten, or written into a folder with its folders.
     """
     if into is None or path == into or not draft.others:
         check_file(path)
@@ -249,33 +244,27 @@ def _places(draft: Draft, path: Path, into: Path | None) -> tuple[Path, dict[Pat
     return places.pop(into), places
 
 
-def exports_of_job(
-    folder: Path,
-    wanted: ExportSettings,
-    *,
-    today: date,
-    refly: Refly = refly,
+def export_formats_of_job(
+    folder: Path, wanted: ExportSettings, *, today: date, refly: Refly = refly
 ) -> Iterator[tuple[str, Path | InputError]]:
-    """Write every format that a job asks for into its result folder.
-
-    A format that is refused is no failure of the run.
+    """Write all formats of a job into its result folder; a refused one is no failure of the run.
 
     Parameters
     ----------
     wanted
-        Formats, and the model for ``sdf``, which stays as it is.
+        Formats, and the model for ``sdf``, of which a copy is patched.
 
     Yields
     ------
     tuple
-        Each format with the file that was written, or with the reason why it was not.
+        Each format with its file, or with the error.
     """
     run = read_run(folder)
     for kind in wanted.formats:
         into = wanted.into if target_of(kind).simulator_of else None
         try:
-            asked, copies = ExportOptions(kind, into=into), folder / FOLDER
-            done = export(run, asked, today=today, refly=refly, copies=copies)
+            options, copies = ExportOptions(kind, into=into), folder / FOLDER
+            done = export(run, options, today=today, refly=refly, copies=copies)
             yield kind, done.path
         except InputError as error:
             _record(folder, ExportRecord(format=kind, refused=str(error)))
@@ -285,8 +274,7 @@ def exports_of_job(
 def exported_vehicle(run: Run, today: date) -> tuple[VehicleFile, tuple[str, ...]]:
     """Return the run's best vehicle with source and confidence, and a note on each doubtful number.
 
-    What the run held at its initial value has that value there; what was fitted beside it keeps
-    the value that goes with it.
+    Coefficients that the run held have their initial values, the others those fitted with them.
     """
     notes = tuple(
         f"{name} = {row.best:g} is {judgement_in_words(row.verdict, row.reason)}"
@@ -307,7 +295,7 @@ def exported_vehicle(run: Run, today: date) -> tuple[VehicleFile, tuple[str, ...
 
 
 def provenance(run: Run, today: date, accepted: str = "") -> str:
-    """Return one line that says where the numbers come from."""
+    """Return a line on the origin of a run's numbers."""
     fitted = [flight.name for flight in run.result.flights if flight.split == "fit"]
     how = f"fitted to {', '.join(fitted)}" if fitted else "measured, no flight was simulated"
     line = f"{how}; run {run.folder.resolve().name}; {today.isoformat()}"
@@ -315,7 +303,7 @@ def provenance(run: Run, today: date, accepted: str = "") -> str:
 
 
 def _one_line(provenance: str, accepted: str) -> str:
-    """Return where numbers come from, and why in spite of a refusal, for a comment of any file."""
+    """Return origin and reason of acceptance as one printable line."""
     line = f"{provenance}; exported against a refusal: {accepted}" if accepted else provenance
     return " ".join("".join(c if c.isprintable() else " " for c in line).split())
 
@@ -323,7 +311,7 @@ def _one_line(provenance: str, accepted: str) -> str:
 def provenance_of_file(
     vehicle: VehicleFile, file: Path, today: date, accepted: str = ""
 ) -> tuple[str, tuple[str, ...]]:
-    """Return a line on where a vehicle file's numbers come from, and one on each that it says."""
+    """Return a line on the origin of a vehicle file's numbers, and one per ``source`` entry."""
     how = vehicle.source.get("method", "as the vehicle file has it")
     line = f"{file.name}: {how}; no flight was compared; {today.isoformat()}"
     values = values_of(vehicle)
@@ -350,11 +338,10 @@ def _confidence(run: Run, name: str) -> dict[str, JsonValue]:
     return known
 
 
-def in_simulator(run: Run, target: Target) -> tuple[Run, EffectiveResult | None]:
-    """Return a run as a target's simulator flies it, and how that was found.
+def run_in_simulator(run: Run, target: Target) -> tuple[Run, EffectiveResult | None]:
+    """Return a run with effective coefficients for a target's simulator, and their result.
 
-    The run itself where the simulator lacks nothing, where there is none, and where the job wants
-    physical coefficients.
+    The run stays as it is if no term is missing, or if the job wants physical coefficients.
     """
     simulator, found = target.simulator, None
     job = run.result.settings.get("job")
@@ -364,8 +351,8 @@ def in_simulator(run: Run, target: Target) -> tuple[Run, EffectiveResult | None]
     if simulator is GAZEBO_CLASSIC and run.effective is not None and run.result.effective:
         found = Effective(run.effective, run.result.effective)
     else:
-        with suppress(InputError):  # recordings that are gone: the gate that flies them says so
-            found = kept_effective(run, simulator)
+        with suppress(InputError):  # missing recordings fail the gate that flies them
+            found = cached_effective(run, simulator)
     if found is None:
         return run, None
     effective = found.result

@@ -1,8 +1,8 @@
-"""What rotors give, and what each simulator computes of a vehicle, with source and version.
+"""Rotor speed and thrust, and the physics of each simulator, with source and version.
 
-A simulator is told apart from the physics that is fitted by the coefficients that it flies at a
-value of its own (`Simulator.entry`) and by its laws (`Simulator.laws`). Both together give the
-vehicle that it flies, which the project's own simulation flies for it.
+A simulator differs from the fitted physics by coefficients with a built-in value
+(`Simulator.entry`) and by its laws (`Simulator.laws`). Both give a vehicle with which the project's
+own simulation flies like that simulator.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ def thrust_to_weight(vehicle: VehicleFile) -> float:
 
 
 def hover_speed(vehicle: VehicleFile) -> float:
-    """Return the rotor speed in rad/s at which the rotors carry the vehicle."""
+    """Return the rotor speed in rad/s of the hover."""
     aerodynamics = vehicle.aerodynamics
     squared = vehicle.mass * GRAVITY / len(vehicle.rotors) / aerodynamics.motor_constant
     return squared if aerodynamics.thrust_law == "linear" else math.sqrt(squared)
 
 
 def hover_command(vehicle: VehicleFile) -> float | None:
-    """Return the command 0..1 at which the vehicle hovers; None if full command does not do."""
+    """Return the command 0..1 of the hover; None if full command is too weak."""
     wanted = hover_speed(vehicle)
     low, high = 0.0, 1.0
     if not rotor_speed(vehicle, low) < wanted < rotor_speed(vehicle, high):
@@ -76,39 +76,38 @@ def hover_command(vehicle: VehicleFile) -> float | None:
 Entry = Written | NotCarried
 Laws = Callable[[VehicleFile], VehicleFile]
 
-_OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
+_SETUP_ENTRY = NotCarried("it belongs to the set-up, not to the vehicle")
 
 
-def _torque_on_body(vehicle: VehicleFile) -> VehicleFile:
+def _with_body_torque(vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle whose rotors' reaction torque acts about the body's z axis."""
     return vehicle.replace(aerodynamics=vehicle.aerodynamics.replace(reaction_torque="body"))
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """A simulator that a vehicle is exported for.
+    """A simulator that vehicles are exported for.
 
     Attributes
     ----------
     name, title
-        As users type it, and as it is called; this project's has no name.
+        Its name on the command line, and in sentences; this project's has no name.
     version, source
-        What was read to know what it computes.
+        Of the code or documentation that says what it computes.
     deviations
-        What it computes otherwise than the physics that is fitted, a clause each.
+        Its differences from the fitted physics, a clause each.
     entry
-        Where its file holds a coefficient, or why it has no place for it and what it flies instead.
+        A coefficient's place in its file, or why it has none and which value is built in.
     laws
-        A vehicle -> the one that its laws make of it, where a coefficient does not say it. Applied
-        twice it changes nothing.
+        A vehicle -> the one by its laws, for differences without a coefficient. Idempotent.
     free
-        Coefficients that stand in for what it lacks, beside those of Gazebo's motor model.
+        Effective coefficients beside those of Gazebo's motor model.
     ties
-        Groups of coefficients of which it has only one.
+        Groups of coefficients that are one in it.
     fixed
-        Coefficients that are one with others there, or that would go to no sensible value.
+        Coefficients that are not fitted for it, as redundant or indeterminate there.
     start
-        A vehicle -> where a fit of effective coefficients begins; None begins with what is flown.
+        A vehicle -> the start of a fit of effective coefficients; None starts as `flown`.
     """
 
     name: str
@@ -117,26 +116,26 @@ class Simulator:
     source: str
     deviations: tuple[str, ...]
     entry: Callable[[Coefficient], Entry | None]
-    laws: Laws = _torque_on_body
+    laws: Laws = _with_body_torque
     free: tuple[str, ...] = ()
     ties: tuple[tuple[str, ...], ...] = ()
     fixed: tuple[str, ...] = ()
     start: Laws | None = None
 
     def flown(self, vehicle: VehicleFile) -> VehicleFile:
-        """Return the vehicle as the simulator flies it, in a file that this project flies."""
+        """Return the vehicle with which this project flies like the simulator."""
         vehicle = self.laws(vehicle)
-        return self.lacking(
+        return self.with_built_in(
             vehicle, [n for n in values_of(vehicle) if self.built_in(n) is not None]
         )
 
     def built_in(self, name: str) -> float | None:
-        """Return the value that it flies in the place of a coefficient's; None where it has it."""
+        """Return its built-in value of a coefficient; None if it has the coefficient."""
         entry = self.entry(REGISTRY[name])
         return entry.built_in if isinstance(entry, NotCarried) else None
 
     def lost(self, acting: Mapping[str, float]) -> dict[str, tuple[str, ...]]:
-        """Return group -> its coefficients, of name -> value, that it flies at another value."""
+        """Return group -> its coefficients whose built-in value differs from the given one."""
         groups: dict[str, tuple[str, ...]] = {}
         for name, value in acting.items():
             if self.built_in(name) not in (None, value):
@@ -144,8 +143,8 @@ class Simulator:
                 groups[group] = (*groups.get(group, ()), name)
         return groups
 
-    def lacking(self, vehicle: VehicleFile, names: Collection[str]) -> VehicleFile:
-        """Return a vehicle with some coefficients as the simulator has them built in."""
+    def with_built_in(self, vehicle: VehicleFile, names: Collection[str]) -> VehicleFile:
+        """Return a vehicle with built-in values of some coefficients."""
         effects = {name: value for name, value in vehicle.effects.items() if name not in names}
         built_in = {
             name: value
@@ -159,17 +158,17 @@ class Simulator:
 # laws
 
 
-def _mean_lag(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle whose rotors speed up and slow down with one lag, the mean."""
+def _with_mean_lag(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle with the mean lag for rotors that speed up or slow down."""
     motor = vehicle.motor
     lag = fmean((motor.time_constant_up, motor.time_constant_down))
     return vehicle.replace(motor=motor.replace(time_constant_up=lag, time_constant_down=lag))
 
 
 def drag_at_hover(vehicle: VehicleFile) -> tuple[float, float, float]:
-    """Return the vehicle's drag along x, y and z in N s/m at the hover's rotor speed.
+    """Return the linear drag along x, y and z in N s/m at the hover's rotor speed.
 
-    That of the rotors and of the body's linear drag; along z, what thrust changes with the inflow.
+    It is that of rotors and body; along z it has the change of thrust with the inflow.
     """
     count, speed, effects = len(vehicle.rotors), hover_speed(vehicle), vehicle.effects
     rotors = count * speed * vehicle.aerodynamics.rotor_drag_coefficient
@@ -179,8 +178,8 @@ def drag_at_hover(vehicle: VehicleFile) -> tuple[float, float, float]:
     return rotors + body[0], rotors * ratio + body[1], inflow + body[2]
 
 
-def _dragging(vehicle: VehicleFile, drag: tuple[float, float, float]) -> VehicleFile:
-    """Return a vehicle with a linear drag of the body in the place of its rotors'."""
+def _with_linear_drag(vehicle: VehicleFile, drag: tuple[float, float, float]) -> VehicleFile:
+    """Return a vehicle with a linear drag of the body instead of rotor drag."""
     effects = {
         name: value
         for name, value in vehicle.effects.items()
@@ -191,14 +190,14 @@ def _dragging(vehicle: VehicleFile, drag: tuple[float, float, float]) -> Vehicle
     return vehicle.replace(effects=effects, aerodynamics=aerodynamics)
 
 
-def _same_drag(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle with one linear drag in all directions, that along x and y on average."""
+def _with_one_drag(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle with the mean linear drag along x and y in all directions."""
     x, y, _ = drag_at_hover(vehicle)
-    return _dragging(vehicle, (fmean((x, y)),) * 3)
+    return _with_linear_drag(vehicle, (fmean((x, y)),) * 3)
 
 
-def _one_damping(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle whose rotation is damped by one coefficient about all axes, if at all."""
+def _with_one_damping(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle with the mean damping of rotation about all axes."""
     names = [f"angular_drag_{axis}" for axis in "xyz"]
     damping = fmean(max(vehicle.effects.get(name, 0.0), 0.0) for name in names)
     effects = {name: value for name, value in vehicle.effects.items() if name not in names}
@@ -207,17 +206,16 @@ def _one_damping(vehicle: VehicleFile) -> VehicleFile:
     return vehicle.replace(effects=effects)
 
 
-def linear_in(vehicle: VehicleFile, *, idle: bool) -> VehicleFile:
-    """Return a vehicle whose lag is one of the thrust, and the thrust linear in what lags.
+def with_linear_thrust(vehicle: VehicleFile, *, idle: bool) -> VehicleFile:
+    """Return a vehicle whose thrust, instead of rotor speed, has the lag.
 
-    Its "rotor speed" is the thrust in units of which the hover's is the hover's rotor speed.
+    Its "rotor speed" is the thrust, scaled to the rotor speed in the hover.
 
     Parameters
     ----------
     idle
-        Whether what is asked for is the thrust that the command's rotor speed gives (a second
-        degree polynomial through no command, the hover and full command); otherwise it is the
-        command's share of the full thrust, and nothing at no command.
+        Whether the commanded thrust follows from the rotor speed (by a parabola through zero
+        command, hover and full command); otherwise it is proportional to the command.
     """
     aerodynamics, motor = vehicle.aerodynamics, vehicle.motor
     if aerodynamics.thrust_law == "linear":
@@ -225,13 +223,13 @@ def linear_in(vehicle: VehicleFile, *, idle: bool) -> VehicleFile:
     speed, thrust = hover_speed(vehicle), vehicle.mass * GRAVITY / len(vehicle.rotors)
     unit = speed / thrust
 
-    def asked(command: float) -> float:
+    def asked_thrust(command: float) -> float:
         return unit * aerodynamics.motor_constant * rotor_speed(vehicle, command) ** 2
 
     low, full, bend = 0.0, unit * full_thrust(vehicle), 0.0
     hover = hover_command(vehicle)
     if idle and hover is not None:
-        low = asked(0.0)
+        low = asked_thrust(0.0)
         bend = ((full - low) - (speed - low) / hover) / (1.0 - hover)
     return vehicle.replace(
         motor=motor.replace(
@@ -245,19 +243,19 @@ def linear_in(vehicle: VehicleFile, *, idle: bool) -> VehicleFile:
     )
 
 
-def linear_at_hover(vehicle: VehicleFile) -> VehicleFile:
+def with_linear_hover(vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle whose thrust is linear in the command, with the same hover throttle.
 
-    Its thrust changes less with the command than the vehicle's does at the hover, by as much as its
-    moments of inertia are smaller: it turns as the vehicle does.
+    Its moments of inertia are scaled like the slope of thrust over command in the hover, so that it
+    turns like the vehicle.
     """
     hover, step = hover_command(vehicle), 1e-4
     if hover is None or vehicle.aerodynamics.thrust_law == "linear":
-        return linear_in(vehicle, idle=False)
+        return with_linear_thrust(vehicle, idle=False)
     slope = [thrust_at(vehicle, rotor_speed(vehicle, hover + sign * step)) for sign in (-1, 1)]
     thrust = vehicle.mass * GRAVITY / len(vehicle.rotors)
     ratio = (slope[1] - slope[0]) / (2 * step) / (thrust / hover)
-    linear, inertia = linear_in(vehicle, idle=False), vehicle.inertia
+    linear, inertia = with_linear_thrust(vehicle, idle=False), vehicle.inertia
     full = hover_speed(vehicle) / hover
     return linear.replace(
         inertia=inertia.replace(**{axes: value / ratio for axes, value in inertia}),
@@ -265,21 +263,20 @@ def linear_at_hover(vehicle: VehicleFile) -> VehicleFile:
     )
 
 
-FASTEST_GZ = 1000.0
-"""rad/s up to which PX4's bridge to gz-sim takes rotor speeds."""
+MAX_GZ_SPEED = 1000.0
+"""rad/s. PX4's bridge to gz-sim takes no higher rotor speeds."""
 
 
-def gz_unit(vehicle: VehicleFile) -> float:
-    """Return how many rad/s of gz-sim one of the vehicle's is.
+def gz_speed_unit(vehicle: VehicleFile) -> float:
+    """Return the rad/s in gz-sim per rad/s of the vehicle: 1, or less for fast rotors.
 
-    One, unless its rotors turn faster than PX4 lets the bridge say. A model with all speeds scaled,
-    and the constants to match, moves in the same way.
+    A model with scaled speeds and constants moves in the same way.
     """
-    return min(1.0, FASTEST_GZ / rotor_speed(vehicle, 1.0))
+    return min(1.0, MAX_GZ_SPEED / rotor_speed(vehicle, 1.0))
 
 
-def with_speeds_in(vehicle: VehicleFile, unit: float) -> VehicleFile:
-    """Return the vehicle with every rotor speed in ``unit`` times as many of other units."""
+def with_speed_unit(vehicle: VehicleFile, unit: float) -> VehicleFile:
+    """Return the vehicle with all rotor speeds multiplied by ``unit``, and scaled constants."""
     motor, aerodynamics = vehicle.motor, vehicle.aerodynamics
     return vehicle.replace(
         motor=motor.replace(
@@ -296,17 +293,17 @@ def with_speeds_in(vehicle: VehicleFile, unit: float) -> VehicleFile:
     )
 
 
-def _between_whole_speeds(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle whose commands go by a line between whole rad/s, in gz-sim's unit.
+def _with_whole_speeds(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose rotor speeds are linear in the command, between whole rad/s.
 
-    Commands below which rotors stand still are on the line, too.
+    They are whole in gz-sim's unit, and never negative.
 
     Raises
     ------
     ExportError
         The rotors turn too slowly for whole rad/s.
     """
-    unit = gz_unit(vehicle)
+    unit = gz_speed_unit(vehicle)
     speeds = (max(rotor_speed(vehicle, command), 0.0) for command in (0.0, 1.0))
     low, high = (round(unit * speed) / unit for speed in speeds)
     if low == high:
@@ -316,16 +313,16 @@ def _between_whole_speeds(vehicle: VehicleFile) -> VehicleFile:
         input_scaling=high - low, zero_position_armed=low, input_offset=0.0, quadratic=0.0
     )
     fastest = max(motor.max_rotor_velocity, high)
-    return _torque_on_body(vehicle.replace(motor=motor.replace(max_rotor_velocity=fastest)))
+    return _with_body_torque(vehicle.replace(motor=motor.replace(max_rotor_velocity=fastest)))
 
 
 # simulators
 
 
-def registered(
+def registry_entries(
     target: str, other: Mapping[str, NotCarried] = MappingProxyType({})
 ) -> Callable[..., Entry | None]:
-    """Return the `Target.entry` of a target whose entries stand in the registry, but for some."""
+    """Return the `Simulator.entry` of a target in the registry, with exceptions."""
     return lambda row: other.get(row.name) or row.exported_as.get(target)
 
 
@@ -335,7 +332,7 @@ GAZEBO_CLASSIC = Simulator(
     version="PX4-SITL_gazebo-classic 807b67bb",
     source="src/gazebo_motor_model.cpp, include/gazebo_mavlink_interface.h",
     deviations=("thrust falls by the length of the axial airspeed over 25 m/s",),
-    entry=registered("sdf"),
+    entry=registry_entries("sdf"),
 )
 GZ_SIM = Simulator(
     name="gz-sim",
@@ -348,7 +345,7 @@ GZ_SIM = Simulator(
         "rolling moments add up whichever way rotors turn: none is written",
         "commands are mapped by a line from SIM_GZ_EC_MIN to SIM_GZ_EC_MAX, whole rad/s up to 1000",
     ),
-    entry=registered(
+    entry=registry_entries(
         "sdf",
         {
             "max_relative_airspeed": NotCarried(
@@ -360,7 +357,7 @@ GZ_SIM = Simulator(
             ),
         },
     ),
-    laws=_between_whole_speeds,
+    laws=_with_whole_speeds,
 )
 SIH = Simulator(
     name="sih",
@@ -373,63 +370,63 @@ SIH = Simulator(
         "one drag in all directions, linear in the velocity and at the centre of mass",
         "one damping of rotation about all axes",
     ),
-    entry=registered("px4"),
-    laws=lambda vehicle: _one_damping(
-        _same_drag(_mean_lag(linear_in(_torque_on_body(vehicle), idle=False)))
+    entry=registry_entries("px4"),
+    laws=lambda vehicle: _with_one_damping(
+        _with_one_drag(_with_mean_lag(with_linear_thrust(_with_body_torque(vehicle), idle=False)))
     ),
     free=("linear_drag_x", "linear_drag_y", "linear_drag_z"),
     ties=(("linear_drag_x", "linear_drag_y", "linear_drag_z"),),
     fixed=("input_scaling", "zero_position_armed", "time_constant_up", "time_constant_down"),
-    start=linear_at_hover,
+    start=with_linear_hover,
 )
 
 _CENTRE = {f"center_of_mass_{axis}": "rotor positions" for axis in "xyz"}
 _MOTORS = ("input_scaling", "zero_position_armed", "input_offset", "quadratic")
-_LACKED = {
+_NOT_MODELLED = {
     "rolling_moment_coefficient": NotCarried("it has no such term", 0.0),
     "max_relative_airspeed": NotCarried("its thrust does not depend on the airspeed", NO_LOSS),
 }
-"""What of Gazebo's motor model the others lack, and why."""
+"""Coefficients of Gazebo's motor model that the others lack, and why."""
 _BODY = ("mass", "inertia_xx", "inertia_yy", "inertia_zz")
 _LINEAR = ("linear_drag_x", "linear_drag_y", "linear_drag_z")
 _ANGULAR = ("angular_drag_x", "angular_drag_y", "angular_drag_z")
 
 
 def _entries(title: str, *groups: tuple[str, ...], **keys: str) -> Callable[..., Entry]:
-    """Return `Simulator.entry` of what a simulator holds.
+    """Return `Simulator.entry` of a simulator from its coefficients.
 
     Parameters
     ----------
     groups, keys
-        Coefficients under their own names, beside body and motors, and coefficient -> key.
+        Coefficients with their own names, beside body and motors, and coefficient -> key.
     """
     held = {name: name for group in (_BODY, _MOTORS, *groups) for name in group} | keys
 
     def entry(row: Coefficient) -> Entry:
         if row.name in held:
             return Written(held[row.name])
-        if row.name in _LACKED:
-            return _LACKED[row.name]
+        if row.name in _NOT_MODELLED:
+            return _NOT_MODELLED[row.name]
         if row.scope != "vehicle":
-            return _OF_SETUP
+            return _SETUP_ENTRY
         return NotCarried(f"{title} has no such term", row.neutral)
 
     return entry
 
 
-def _about_centre(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle whose rotor positions count from its centre of mass, and torques' axis."""
+def _about_centre_of_mass(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose rotor positions count from its centre of mass."""
     offset = [vehicle.effects.get(name, 0.0) for name in _CENTRE]
     effects = {name: value for name, value in vehicle.effects.items() if name not in _CENTRE}
     rotors = tuple(
         rotor.replace(position=tuple(at - o for at, o in zip(rotor.position, offset, strict=True)))
         for rotor in vehicle.rotors
     )
-    return _torque_on_body(vehicle.replace(effects=effects, rotors=rotors))
+    return _with_body_torque(vehicle.replace(effects=effects, rotors=rotors))
 
 
-def _square_x(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle whose rotors sit in a square about the centre of mass, at its height."""
+def _with_square_rotors(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle with rotors in a square around the centre of mass, at its height."""
     arm = fmean(abs(rotor.position[axis]) for rotor in vehicle.rotors for axis in (0, 1))
 
     def side(x: float) -> float:
@@ -439,7 +436,7 @@ def _square_x(vehicle: VehicleFile) -> VehicleFile:
         rotor.replace(position=(side(rotor.position[0]), side(rotor.position[1]), 0.0))
         for rotor in vehicle.rotors
     )
-    return _torque_on_body(vehicle.replace(rotors=rotors))
+    return _with_body_torque(vehicle.replace(rotors=rotors))
 
 
 THIS_PROJECT = Simulator(
@@ -473,7 +470,9 @@ MUJOCO = Simulator(
         rotor_drag_ratio_y="biasprm",
         **_CENTRE,
     ),
-    laws=lambda vehicle: linear_in(_mean_lag(_about_centre(vehicle)), idle=True),
+    laws=lambda vehicle: with_linear_thrust(
+        _with_mean_lag(_about_centre_of_mass(vehicle)), idle=True
+    ),
     fixed=(*_MOTORS, "time_constant_up", "time_constant_down"),
 )
 ROTORPY = Simulator(
@@ -494,7 +493,7 @@ ROTORPY = Simulator(
         flapping_moment_coefficient="k_flap",
         **_CENTRE,
     ),
-    laws=lambda vehicle: _mean_lag(_about_centre(vehicle)),
+    laws=lambda vehicle: _with_mean_lag(_about_centre_of_mass(vehicle)),
     ties=(("time_constant_up", "time_constant_down"),),
 )
 DRONE_MODELS = Simulator(
@@ -517,7 +516,7 @@ DRONE_MODELS = Simulator(
         rotor_drag_coefficient="drag_matrix",
         rotor_inertia="prop_inertia",
     ),
-    laws=lambda vehicle: _square_x(_dragging(vehicle, drag_at_hover(vehicle))),
+    laws=lambda vehicle: _with_square_rotors(_with_linear_drag(vehicle, drag_at_hover(vehicle))),
     free=("linear_drag_x", "linear_drag_y"),
 )
 ISAAC_LAB = Simulator(
@@ -540,7 +539,7 @@ ISAAC_LAB = Simulator(
         rotor_drag_coefficient="linear_damping",
         **_CENTRE,
     ),
-    laws=lambda vehicle: _one_damping(_same_drag(_about_centre(vehicle))),
+    laws=lambda vehicle: _with_one_damping(_with_one_drag(_about_centre_of_mass(vehicle))),
     free=_LINEAR,
     ties=(_LINEAR,),
 )

@@ -1,4 +1,4 @@
-"""What an export target is, its file on the way out, and what of a vehicle it does not hold."""
+"""Export targets: their files, written and read back, and the coefficients that they lack."""
 
 from __future__ import annotations
 
@@ -22,8 +22,10 @@ from tuner.result import Gate
 from tuner.vehicle import COEFFICIENTS, Coefficient, NotCarried, VehicleFile, values_of
 
 MAX_BYTES = 10_000_000
-#: Numbers are written with twelve digits; mass and inertia may go through sums of links.
+#: Relative. Numbers are written with twelve digits; mass and inertia are sums over links.
 TOLERANCE = 1e-9
+PLACE_TOLERANCE_M = 0.005
+"""Rotors that are nearer to their place in a vehicle file, or to a square, are there."""
 
 
 @dataclass(frozen=True)
@@ -33,19 +35,18 @@ class Draft:
     Attributes
     ----------
     vehicle
-        The vehicle as whoever reads the file will fly it.
+        The vehicle as the file's reader flies it.
     notes
-        What was done, and what the format has no place for.
+        Remarks, and coefficients that the format lacks.
     faults
-        Given the file as it stands on the disk, and which others stand in for theirs, what is wrong
-        with the numbers in it.
+        The file on the disk, and further file -> its stand-in -> wrong numbers, a sentence each.
     gates
         Conditions of the format's own.
     others
-        Further files -> their text, where a model is split over several.
+        Further file of a split model -> its text.
     flier
-        Flies it in its own simulator, as of `tuner.exporters.flier.flier`; None where that is
-        not installed.
+        Flies segments in its own simulator (`tuner.exporters.external_simulator.flier_of`); None
+        if that is not installed.
     """
 
     text: str
@@ -58,7 +59,7 @@ class Draft:
 
 
 def differences(wanted: Mapping[str, float], read: Mapping[str, float]) -> list[str]:
-    """Return which of the wanted numbers, by name, a file does not hold, a sentence each."""
+    """Return a sentence for each wanted number, by name, that a file does not hold."""
     return [
         f"{name} is {read[name]!r}, not {value!r}" if name in read else f"{name} is missing"
         for name, value in wanted.items()
@@ -66,21 +67,21 @@ def differences(wanted: Mapping[str, float], read: Mapping[str, float]) -> list[
     ]
 
 
-def flattened(content: Mapping[str, Any]) -> dict[str, float]:
-    """Return key and place -> number of tables and lists in each other; words are left out."""
+def flatten(content: Mapping[str, Any]) -> dict[str, float]:
+    """Return path -> number of nested tables and lists, without strings."""
     numbers: dict[str, float] = {}
     for name, value in content.items():
         if isinstance(value, Mapping):
-            numbers |= flattened({f"{name}.{key}": item for key, item in value.items()})
+            numbers |= flatten({f"{name}.{key}": item for key, item in value.items()})
         elif isinstance(value, list):
-            numbers |= flattened({f"{name}[{i}]": item for i, item in enumerate(value)})
+            numbers |= flatten({f"{name}[{i}]": item for i, item in enumerate(value)})
         elif not isinstance(value, str):
             numbers[name] = float(value)
     return numbers
 
 
-def assigned(path: Path) -> dict[str, Any]:
-    """Return what a Python module that was written here assigns: name -> value; nothing is run."""
+def module_assignments(path: Path) -> dict[str, Any]:
+    """Return the assignments, name -> value, of an exported Python module, without running it."""
     return {
         statement.targets[0].id: literal_eval(statement.value)
         for statement in parse(read_file(path)).body
@@ -90,24 +91,24 @@ def assigned(path: Path) -> dict[str, Any]:
 
 
 def xml_comment(text: str) -> str:
-    """Return a line as an XML comment may hold it, in a Jinja template too."""
+    """Return a line that an XML comment, and a Jinja template, may hold."""
     return re.sub(r"-(?=-)|\{(?=[{%#])", r"\g<0> ", text)
 
 
 def write(draft: Draft, path: Path, others: Mapping[Path, Path] | None = None) -> None:
-    """Write a draft if it reads back as what it should hold; otherwise all stays as it was.
+    """Write a draft if it reads back right; otherwise change nothing.
 
     Parameters
     ----------
     path
-        Where to; it appears whole.
+        The file, written atomically.
     others
-        Further file of the draft -> where it is written instead; None writes it where it is.
+        Further file of the draft -> the path to write it to; None overwrites them.
 
     Raises
     ------
     ExportError
-        It does not hold what it should.
+        It does not read back right.
     OutputError
         It cannot be written.
     """
@@ -147,22 +148,20 @@ def read_file(path: Path) -> str:
 
 @dataclass(frozen=True)
 class Target:
-    """A format that a vehicle can be exported in.
+    """A format of exports.
 
     Attributes
     ----------
     name
-        As `Coefficient.exported_as` has it.
+        Its key in `Coefficient.exported_as`.
     draft
-        Vehicle, provenance in one line, simulator, and the model to patch, or None for a file of
-        its own -> the file before it is written, which knows how it is read back.
+        Vehicle, provenance in one line, simulator, and the model to patch or None -> the draft.
     simulator
-        Who flies what it holds.
+        The simulator that flies it.
     others
         Further simulators that read the format.
     simulator_of
-        A model to patch -> the name of the simulator that it is for; None for a format that goes
-        into no model that exists.
+        A model to patch -> the name of its simulator; None for a format that patches no model.
     """
 
     name: str
@@ -173,12 +172,12 @@ class Target:
     simulator_of: Callable[[Path], str] | None = None
 
     def for_simulator(self, simulator: str = "", into: Path | None = None) -> Target:
-        """Return the target for the simulator that is asked for, or that a model is for.
+        """Return the target for a named simulator, or for that of a model.
 
         Raises
         ------
         ExportError
-            It patches no model, has nothing for that simulator, or the model is for another one.
+            It patches no model, does not support the simulator, or the model is for another.
         """
         known = {s.name: s for s in (self.simulator, *self.others) if s.name}
         is_for = ""
@@ -218,13 +217,12 @@ def target_of(name: str) -> Target:
 
 
 def check_every_coefficient(vehicle: VehicleFile, target: Target) -> None:
-    """Refuse a vehicle with a coefficient that a target would lose without a word.
+    """Refuse a vehicle with a coefficient that a target would drop silently.
 
     Raises
     ------
     ExportError
-        A coefficient that is not at its neutral value is neither carried by the target nor named
-        as not carried.
+        A coefficient that is not neutral has no entry for the target.
     """
     for name, value in values_of(vehicle).items():
         row = COEFFICIENTS[name]
@@ -238,7 +236,7 @@ def check_every_coefficient(vehicle: VehicleFile, target: Target) -> None:
 
 
 def not_carried(vehicle: VehicleFile, target: Target) -> tuple[str, ...]:
-    """Return a sentence for each coefficient that a target has no place for and that acts."""
+    """Return a sentence for each coefficient that acts and that a target lacks."""
     sentences = []
     for name, value in values_of(vehicle).items():
         row = COEFFICIENTS[name]
@@ -246,7 +244,7 @@ def not_carried(vehicle: VehicleFile, target: Target) -> tuple[str, ...]:
         if not isinstance(entry, NotCarried):
             continue
         same = (at for at in (row.neutral, entry.built_in) if at is not None)
-        # a bound is reached to the last digits
+        # a bound may differ in the last digits
         if not any(math.isclose(value, at, abs_tol=1e-9 * row.step) for at in same):
             sentences.append(f"{name} {quantity(value, row)} is not exported: {entry.reason}")
     return tuple(sentences)

@@ -18,6 +18,7 @@ from scipy import stats
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
+from sim_jax.constants import RAD_S_PER_RPM
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Z95, Array, robust_sd
 from tuner.ground.measurement import Curve
@@ -171,8 +172,6 @@ MAX_BYTES = 200_000_000
 MOST = 60_000
 """Samples beyond which a recording is thinned: steps of seconds need no more."""
 FEWEST = 20
-RPM = 2 * math.pi / 60
-"""rad/s per revolution a minute."""
 FASTEST = 4000.0
 """rad/s that no rotor of a multirotor turns: a column beyond it holds revolutions a minute."""
 SLOWEST_TIP = 40.0
@@ -188,7 +187,7 @@ COLUMNS: Mapping[str, Mapping[str, float]] = {
         "angle_deg": math.pi / 180,
         "angle_degrees": math.pi / 180,
     },
-    "rotor_speed": {"rotor_speed": 1.0, "rpm": RPM},
+    "rotor_speed": {"rotor_speed": 1.0, "rpm": RAD_S_PER_RPM},
     "force": {"force": 1.0},
     "command": {"command": 1.0},
     "voltage": {"voltage": 1.0},

@@ -30,8 +30,8 @@ from tuner.evaluate.validation import (
     validate,
     vehicle_fitted,
 )
-from tuner.exporters.effective import Effective, effective_in
-from tuner.exporters.export import exports_of_job
+from tuner.exporters.effective import Effective, find_effective
+from tuner.exporters.export import export_formats_of_job
 from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.findings.findings import Finding, remedy, sentence, with_alike_together
 from tuner.job.accelerations import with_accelerations
@@ -306,7 +306,7 @@ def _known(
 def _effective(physical: Run, job: Job, fitted: Fitted, listener: Listener) -> Effective | None:
     """Return the effective coefficients in Gazebo, None where it has every term."""
     flew = replace(job.settings, controller=controller_flown(job, fitted)), job.recordings
-    return effective_in(
+    return find_effective(
         physical,
         GAZEBO_CLASSIC,
         lambda _: flew,
@@ -326,7 +326,7 @@ def _write_flown(folder: Path, validation: Validation, fitted: Fitted) -> None:
 def _export(folder: Path, settings: Settings, listener: Listener) -> None:
     """Write the exports that the job asks for."""
     today = datetime.date.today()
-    for kind, outcome in exports_of_job(folder, settings.job.export, today=today):
+    for kind, outcome in export_formats_of_job(folder, settings.job.export, today=today):
         listener.on_message(export_sentence(kind, outcome))
 
 

@@ -10,7 +10,7 @@ from tests.tuner.exporters.conftest import as_the_run_says
 from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draws import draws_of
 from tuner.exporters.export import export_draws
-from tuner.exporters.target import assigned
+from tuner.exporters.target import module_assignments
 from tuner.options import ExportOptions
 from tuner.uncertainty.records import Knowledge
 from tuner.vehicle import read_vehicle, values_of
@@ -93,7 +93,7 @@ def test_draws_become_a_table_files_and_ranges(run, tmp_path):
         rows = list(csv.DictReader(file))
     assert len(rows) == 30
     assert len(list((tmp_path / "draws").glob("draw_*_isaaclab.py"))) == 30
-    low, high = assigned(tmp_path / "draws" / "ranges_isaaclab.py")["THRUSTER"][
+    low, high = module_assignments(tmp_path / "draws" / "ranges_isaaclab.py")["THRUSTER"][
         "thrust_const_range"
     ]
     constants = np.array([float(row["motor_constant"]) for row in rows]) * (2 * np.pi) ** 2

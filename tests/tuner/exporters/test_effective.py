@@ -9,7 +9,7 @@ from tests.tuner.exporters.conftest import as_fitted
 from tuner.evaluate.records import AxesRmse
 from tuner.exporters.effective import (
     carried_terms,
-    effective_in,
+    find_effective,
     lost_terms,
     pose_rmse,
     recordings_of,
@@ -45,7 +45,7 @@ def test_a_vehicle_of_which_gazebo_lacks_nothing_has_one_answer(make_run):
     def fail(*_):
         raise AssertionError("nothing is read")
 
-    assert effective_in(run, GAZEBO_CLASSIC, fail, on_message=fail) is None
+    assert find_effective(run, GAZEBO_CLASSIC, fail, on_message=fail) is None
 
 
 def test_what_gazebo_lacks_is_named_by_groups_and_taken_away(make_run):
@@ -90,7 +90,7 @@ def test_coefficients_stand_in_for_a_term_that_is_lost_and_the_set_up_stays(run)
         effects={"linear_drag_x": drag, "linear_drag_y": drag},
     )
     said, progressed = [], []
-    found = effective_in(
+    found = find_effective(
         run, GAZEBO_CLASSIC, recordings_of, on_message=said.append, on_progress=progressed.append
     )
     assert said[0].startswith("Gazebo cannot fly linear_drag: looking for the coefficients")
@@ -120,7 +120,7 @@ def test_moments_of_inertia_that_a_job_ties_are_refitted_tied(run):
         settings, recordings = recordings_of(run)
         return replace(settings, job=settings.job.replace(ties=(inertia,))), recordings
 
-    found = effective_in(run.model_copy(update={"result": result}), GAZEBO_CLASSIC, tied)
+    found = find_effective(run.model_copy(update={"result": result}), GAZEBO_CLASSIC, tied)
     before, after = values_of(run.vehicle), values_of(found.vehicle)
     moved = after["inertia_xx"] / before["inertia_xx"]
     assert moved != 1.0
@@ -134,7 +134,7 @@ def test_nothing_free_is_nothing_refitted(run):
         for name, row in run.result.coefficients.items()
     }
     result = run.result.model_copy(update={"coefficients": fixed})
-    found = effective_in(run.model_copy(update={"result": result}), GAZEBO_CLASSIC, recordings_of)
+    found = find_effective(run.model_copy(update={"result": result}), GAZEBO_CLASSIC, recordings_of)
     assert found.vehicle == GAZEBO_CLASSIC.lacking(run.vehicle, ["fuselage_drag"])
 
 

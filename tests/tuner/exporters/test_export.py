@@ -11,7 +11,7 @@ from tuner.core import shipped
 from tuner.core.errors import ExportError, InputError
 from tuner.exporters import export as exporting
 from tuner.exporters.effective import Effective
-from tuner.exporters.export import export, exports_of_job, provenance
+from tuner.exporters.export import export, export_formats_of_job, provenance
 from tuner.exporters.gates import check
 from tuner.exporters.target import Draft, write
 from tuner.options import ExportOptions
@@ -204,7 +204,7 @@ def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
     run = make_run()
     model = MODELS / "quad_x.sdf"
     asked = ExportSettings(formats=("yaml", "sdf", "px4"), into=model)
-    written = dict(exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
+    written = dict(export_formats_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
     folder = run.folder / "export"
     names = ["hovergames_updated.yaml", "quad_x.sdf", "hovergames_updated.params"]
     assert list(written.values()) == [folder / name for name in names]
@@ -212,7 +212,9 @@ def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
     assert sentence == f"The sdf export was written to {folder / 'quad_x.sdf'}."
     assert (folder / "quad_x.sdf").read_text() != model.read_text()
     make_run(**BAD[0][0])
-    for kind, refusal in exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY):
+    for kind, refusal in export_formats_of_job(
+        run.folder, asked, refly=as_the_run_says, today=TODAY
+    ):
         assert export_sentence(kind, refusal).startswith(f"The {kind} export was refused: ")
         assert "held position" in str(refusal)
 
@@ -220,7 +222,7 @@ def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
 def test_no_two_formats_of_a_job_are_one_file(make_run):
     run = make_run()
     asked = ExportSettings(formats=tuple(shipped.EXPORT_TARGETS))
-    written = dict(exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
+    written = dict(export_formats_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
     paths = [path for path in written.values() if isinstance(path, Path)]
     assert len(set(paths)) == len(paths) >= 6
 
@@ -285,7 +287,7 @@ def test_a_simulator_gets_the_effective_coefficients_and_the_file_says_so(
 ):
     run, flown = make_run(**DRAGGY, effective=EFFECTIVE), []
     found = Effective(run.effective, EFFECTIVE)
-    monkeypatch.setattr(exporting, "kept_effective", lambda *_: found)
+    monkeypatch.setattr(exporting, "cached_effective", lambda *_: found)
     done = exported(run, kind, refly=lambda r, v: in_both(r, v, flown))
     if kind == "sdf":
         assert flown[0].aerodynamics.rotor_drag_coefficient == 3e-4

@@ -7,7 +7,7 @@ from tuner.cli import main
 from tuner.core.errors import ExportError
 from tuner.exporters import effective
 from tuner.exporters import export as exporting
-from tuner.exporters.effective import kept_effective, refly
+from tuner.exporters.effective import cached_effective, refly
 from tuner.exporters.export import export
 from tuner.exporters.simulators import GZ_SIM
 from tuner.options import ExportOptions
@@ -88,12 +88,12 @@ def test_the_command_refuses_in_one_line(run, capsys):
 def test_a_simulator_gets_coefficients_of_its_own_and_flies_as_it_computes(run, monkeypatch):
     run, today = as_fitted(run), date(2024, 5, 6)
     with monkeypatch.context() as without:  # physical ones fly otherwise there
-        without.setattr(exporting, "kept_effective", lambda *_: None)
+        without.setattr(exporting, "cached_effective", lambda *_: None)
         with pytest.raises(ExportError, match="small_circle"):
             export(run, ExportOptions("gz-sim"), today=today)
     done = export(run, ExportOptions("gz-sim"), today=today)
     assert all(gate.passed for gate in done.gates)
-    kept = kept_effective(run, GZ_SIM)
+    kept = cached_effective(run, GZ_SIM)
     assert kept.result.rmse_effective.position < kept.result.rmse_unfitted.position
     assert {term.group for term in kept.result.lost} >= {"max_relative_airspeed"}
     assert kept.vehicle == GZ_SIM.flown(kept.vehicle)
@@ -102,5 +102,5 @@ def test_a_simulator_gets_coefficients_of_its_own_and_flies_as_it_computes(run, 
     def fail(*_):
         raise AssertionError("it is kept")
 
-    monkeypatch.setattr(effective, "effective_in", fail)
-    assert kept_effective(run, GZ_SIM) == kept
+    monkeypatch.setattr(effective, "find_effective", fail)
+    assert cached_effective(run, GZ_SIM) == kept

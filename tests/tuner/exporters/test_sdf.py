@@ -16,22 +16,22 @@ from tuner.exporters.sdf.model import (
     Pose,
     base_for,
     composite,
+    join_bodies,
     pose_of,
     read_model,
-    together,
 )
 from tuner.exporters.sdf.patch import sdf_draft
 from tuner.exporters.sdf.spans import (
     Edit,
     Source,
     append_child,
-    apply,
-    blanked,
+    apply_edits,
     parse,
-    rendered,
+    render,
     set_value,
+    without_jinja,
 )
-from tuner.exporters.sdf.tags import carried_values, values_in
+from tuner.exporters.sdf.tags import carried_values, read_values
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.exporters.target import not_carried, target_of, write
 from tuner.exporters.targets.sdf import TARGET
@@ -106,7 +106,7 @@ def test_a_template_keeps_its_expressions_and_sets_its_variables(vehicle):
     assert "+<input_scaling>950</input_scaling>" in diff
     assert not any("{{" in line for line in diff)
     assert sum(line.startswith("+") for line in diff) == 10
-    final = etree.fromstring(rendered(draft.text, TEMPLATE).encode())
+    final = etree.fromstring(render(draft.text, TEMPLATE).encode())
     assert [e.text for e in final.iter("motorConstant")] == ["1.45e-05"] * 4
     assert [e.text for e in final.iter("input_scaling")] == ["950"] * 4
 
@@ -124,7 +124,7 @@ def test_a_variable_that_several_rotors_use_is_set_once(vehicle, tmp_path):
 @ALL
 def test_links_together_weigh_and_turn_like_the_vehicle(path, vehicle):
     draft = sdf_draft(path, vehicle, "by a test")
-    whole = composite(read_model(parse(rendered(draft.text, path), path), 4))
+    whole = composite(read_model(parse(render(draft.text, path), path), 4))
     assert whole.mass == pytest.approx(2.243, rel=1e-11)
     np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
     assert any("'base_link' gets 2.204 kg" in note and "rotor_3" in note for note in draft.notes)
@@ -315,7 +315,7 @@ def test_a_model_we_cannot_serve_is_refused_in_one_line(vehicle, tmp_path, old, 
 
 def test_blanking_a_template_keeps_every_place():
     text = "a {# {{ x }} #} b {{ c }}\n{%- set d = 1 -%} e"
-    blank = blanked(text)
+    blank = without_jinja(text)
     assert len(blank) == len(text)
     assert blank.index("b") == text.index(" b ") + 1
     assert blank.index("e") == text.rindex("e")
@@ -330,7 +330,7 @@ def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
     model = f"<model><link name='base_link'>{draft.text}</link></model>"
     classic = simulator is GAZEBO_CLASSIC
     if classic:
-        assert values_in(parse(model, path), vehicle) == carried_values(vehicle, channels=True)
+        assert read_values(parse(model, path), vehicle) == carried_values(vehicle, channels=True)
     flown = simulator.flown(vehicle)
     assert values_of(draft.vehicle) == pytest.approx(values_of(flown), rel=1e-11)
     assert draft.text.count("<channel ") == (4 if classic else 0)
@@ -447,9 +447,9 @@ def solid_box(mass, pose, sides):
 def test_two_half_bars_are_a_bar():
     halves = [solid_box(1.0, pose_of([side, 0, 0, 0, 0, 0]), [1, 0.1, 0.1]) for side in (-0.5, 0.5)]
     bar = solid_box(2.0, pose_of([0] * 6), [2, 0.1, 0.1])
-    assert together(halves).mass == 2
-    np.testing.assert_allclose(together(halves).inertia, bar.inertia, atol=1e-15)
-    np.testing.assert_allclose(together(halves).pose.position, 0, atol=1e-15)
+    assert join_bodies(halves).mass == 2
+    np.testing.assert_allclose(join_bodies(halves).inertia, bar.inertia, atol=1e-15)
+    np.testing.assert_allclose(join_bodies(halves).pose.position, 0, atol=1e-15)
 
 
 def test_a_quarter_turn_about_z_swaps_x_and_y():
@@ -481,7 +481,7 @@ def test_base_and_others_together_are_the_wanted_whole(others, base):
     bodies = [solid_box(mass, pose_of(pose), [0.02, 0.1, 0.03]) for mass, *pose in others]
     wanted = np.diag([0.05, 0.06, 0.08])
     base_body = base_for(2.0, wanted, pose_of(base), bodies)
-    whole = together([base_body, *bodies])
+    whole = join_bodies([base_body, *bodies])
     assert whole.mass == pytest.approx(2.0, rel=1e-12)
     np.testing.assert_allclose(whole.inertia, wanted, atol=1e-14)
 
@@ -490,7 +490,7 @@ def test_the_base_moves_to_where_the_common_centre_is_wanted():
     other = solid_box(0.5, pose_of([0.1, 0, 0.05, 0, 0, 1.0]), [0.02, 0.1, 0.03])
     wanted, centre = np.diag([0.05, 0.06, 0.08]), np.array([0.003, -0.002, 0.015])
     base = base_for(2.0, wanted, pose_of([0.3, 0, 0, 0.2, 0, 0]), [other], centre=centre)
-    whole = together([base, other])
+    whole = join_bodies([base, other])
     np.testing.assert_allclose(whole.pose.position, centre, atol=1e-16)
     np.testing.assert_allclose(whole.inertia, wanted, atol=1e-14)
 
@@ -509,7 +509,7 @@ PATH = Path("model.sdf")
 
 def changed(text, tag, value):
     element = next(parse(text, PATH).all(tag))
-    return apply(text, [set_value(element, value)])
+    return apply_edits(text, [set_value(element, value)])
 
 
 def test_places_are_places_in_the_text_whatever_characters_stand_before():
@@ -537,9 +537,11 @@ def test_a_value_changes_and_nothing_else():
 def test_a_new_child_stands_like_the_last():
     text = "<a>\n  <b>1</b>\n</a>"
     edit = append_child(parse(text, PATH), "c", "2")
-    assert apply(text, [edit]) == "<a>\n  <b>1</b>\n  <c>2</c>\n</a>"
+    assert apply_edits(text, [edit]) == "<a>\n  <b>1</b>\n  <c>2</c>\n</a>"
     flat = "<a><b>1</b></a>"
-    assert apply(flat, [append_child(parse(flat, PATH), "c", "2")]) == ("<a><b>1</b><c>2</c></a>")
+    assert apply_edits(flat, [append_child(parse(flat, PATH), "c", "2")]) == (
+        "<a><b>1</b><c>2</c></a>"
+    )
 
 
 @given(
@@ -576,7 +578,7 @@ def test_every_element_is_cut_out_whole(tree):
 def test_edits_that_overlap_are_our_mistake():
     source = Source(PATH, "abcd", "abcd")
     with pytest.raises(ValueError, match="overlap"):
-        apply("abcd", [Edit(source, 0, 2, ""), Edit(source, 1, 3, "")])
+        apply_edits("abcd", [Edit(source, 0, 2, ""), Edit(source, 1, 3, "")])
 
 
 @pytest.mark.parametrize("text", ["<a>", "", "<a></b>", "words", "<a>&bomb;</a>"])
@@ -603,6 +605,6 @@ def test_document_types_are_refused():
     ],
 )
 def test_a_template_without_end_is_refused(text, said, tmp_path, monkeypatch):
-    monkeypatch.setattr("tuner.exporters.sdf.spans.LONGEST_RENDERING", 3.0)
+    monkeypatch.setattr("tuner.exporters.sdf.spans.MAX_RENDERING_S", 3.0)
     with pytest.raises(ExportError, match=said):
-        rendered(text, tmp_path / "model.sdf.jinja")
+        render(text, tmp_path / "model.sdf.jinja")

@@ -13,7 +13,7 @@ from tests.tuner.exporters.conftest import MODELS
 from tuner.core.errors import ExportError
 from tuner.exporters.sdf.model import composite, read_model
 from tuner.exporters.sdf.patch import sdf_draft
-from tuner.exporters.sdf.spans import read_tree, rendered
+from tuner.exporters.sdf.spans import read_tree, render
 from tuner.exporters.simulators import GZ_SIM
 from tuner.exporters.target import read_file, write
 from tuner.vehicle import values_of
@@ -53,7 +53,7 @@ def split(folder):
 
 
 def whole_of(path, rotors=4):
-    return read_model(read_tree(path, read_file, rendered), rotors)
+    return read_model(read_tree(path, read_file, render), rotors)
 
 
 def test_numbers_are_written_where_they_live(vehicle, tmp_path):

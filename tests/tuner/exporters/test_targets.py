@@ -13,7 +13,7 @@ from tuner.core.shipped import EXPORT_TARGETS, configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.simulation_files import write_flights
 from tuner.exporters.export import export_vehicle
-from tuner.exporters.flier import flier
+from tuner.exporters.external_simulator import flier_of
 from tuner.exporters.simulators import MUJOCO, hover_command, thrust_to_weight
 from tuner.exporters.target import target_of, write
 from tuner.options import ExportOptions
@@ -121,7 +121,7 @@ def test_another_simulators_body_is_what_moves(updated, tmp_path):
     flights = tuner.simulate("circle", vehicle=updated, radius=0.3, speed=1.2, duration=4.0)
     write_flights(flights, tmp_path / "short.bag")
     flight = load_flight(tmp_path / "short.bag")
-    errors = Comparison([Recording(flight)], ControllerFile()).fly(updated, flier=flier(Gliding))
+    errors = Comparison([Recording(flight)], ControllerFile()).fly(updated, flier=flier_of(Gliding))
     (missed,) = errors.values()
     start = flight.signals["position"][0]
     flown = missed.position.recorded + missed.position.error

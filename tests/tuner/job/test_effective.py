@@ -8,7 +8,7 @@ from tuner.config import Options, TrajectorySettings
 from tuner.evaluate.closed_loop import simulate
 from tuner.evaluate.simulation_files import write_flights
 from tuner.exporters import effective
-from tuner.exporters.effective import effective_in, recordings_of
+from tuner.exporters.effective import find_effective, recordings_of
 from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.job.run import run
 from tuner.result import read_run
@@ -53,7 +53,7 @@ def test_coefficients_for_gazebo_end_at_the_bottom_of_their_valley(updated, tmp_
     (exported,) = set(re.findall("<timeConstantUp>(.*)</timeConstantUp>", sdf.read_text()))
     assert float(exported) == pytest.approx(ended["time_constant_up"])
 
-    monkeypatch.setattr(effective, "LEFT", 1e-8)
-    further = values_of(effective_in(finished, GAZEBO_CLASSIC, recordings_of).vehicle)
+    monkeypatch.setattr(effective, "MIN_TOLERANCE", 1e-8)
+    further = values_of(find_effective(finished, GAZEBO_CLASSIC, recordings_of).vehicle)
     assert ended == pytest.approx(further, rel=0.02)
     assert finished.effective.inertia == finished.vehicle.inertia  # the fit's is no rigid body's

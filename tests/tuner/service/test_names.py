@@ -11,7 +11,7 @@ from tests.tuner.service.conftest import listening
 from tests.tuner.test_names import EXAMPLES, NAMES, nothing_outside
 from tuner.config import settle
 from tuner.config.job import ExportSettings
-from tuner.exporters.export import exports_of_job
+from tuner.exporters.export import export_formats_of_job
 from tuner.result import BEST_FIT_FILE
 from tuner.service.attempt import prepare
 from tuner.service.queue import Queue
@@ -53,7 +53,9 @@ def test_a_job_over_http_stays_in_its_folder(idle, client, make_run, called):
                 (result / file.name).write_bytes(file.read_bytes())
             write_vehicle(flown, result / BEST_FIT_FILE)
             wanted = ExportSettings(formats=("yaml", "px4"))
-            list(exports_of_job(result, wanted, refly=as_the_run_says, today=date(2024, 5, 6)))
+            list(
+                export_formats_of_job(result, wanted, refly=as_the_run_says, today=date(2024, 5, 6))
+            )
     assert bool(claims) == called["vehicle"].isprintable() & bool(called["vehicle"].strip()) & (
         len(called["vehicle"]) <= 100
     )

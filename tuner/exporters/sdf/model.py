@@ -1,6 +1,6 @@
-"""What a model file holds of a multirotor: links, their mass together, motors, control channels.
+"""The multirotor of a model file: links, their common mass, motors and control channels.
 
-Poses and tensors are in the model's frame unless stated otherwise; SI units.
+Poses and tensors are in the model's frame unless stated otherwise, in SI units.
 """
 
 from __future__ import annotations
@@ -13,12 +13,7 @@ import numpy as np
 
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
-from tuner.exporters.sdf.spans import (
-    MERGED,
-    Element,
-    model_in,
-    pose_numbers,
-)
+from tuner.exporters.sdf.spans import MERGED, Element, model_in, pose_numbers
 
 
 @dataclass(frozen=True)
@@ -29,13 +24,13 @@ class Pose:
     rotation: Array
 
     def __matmul__(self, inner: Pose) -> Pose:
-        """Return the pose of a frame that is posed in this one."""
+        """Return the pose of an inner frame in the outer one."""
         return Pose(self.position + self.rotation @ inner.position, self.rotation @ inner.rotation)
 
 
 @dataclass(frozen=True)
 class Inertial:
-    """A body: mass in kg, where its centre of mass lies, its inertia about that point.
+    """A body: mass in kg, pose of its centre of mass, inertia about that point.
 
     ``pose`` places the inertial frame; ``inertia`` (3, 3) kg m² is along that frame's axes.
     """
@@ -61,11 +56,11 @@ def pose_of(numbers: Sequence[float]) -> Pose:
 IDENTITY = Pose(np.zeros(3), np.eye(3))
 
 
-def together(bodies: Sequence[Inertial]) -> Inertial:
-    """Return rigidly joined bodies as one, about their common centre, along the model's axes."""
+def join_bodies(bodies: Sequence[Inertial]) -> Inertial:
+    """Return rigidly joined bodies as one, about their common centre of mass."""
     mass = sum(body.mass for body in bodies)
     centre = sum((body.mass * body.pose.position for body in bodies), np.zeros(3)) / mass
-    inertia = sum((_about(centre, body) for body in bodies), np.zeros((3, 3)))
+    inertia = sum((_inertia_about(centre, body) for body in bodies), np.zeros((3, 3)))
     return Inertial(mass, Pose(centre, np.eye(3)), inertia)
 
 
@@ -77,7 +72,7 @@ def base_for(
     *,
     centre: Array | None = None,
 ) -> Inertial:
-    """Return the base body that makes, with the others, the wanted whole.
+    """Return the base body that gives, with the others, the wanted whole.
 
     Parameters
     ----------
@@ -86,14 +81,14 @@ def base_for(
     whole_inertia
         (3, 3) kg m², about the common centre of mass, along the model's axes.
     base
-        Inertial frame of the base, which stays where it is unless a centre is wanted.
+        Inertial frame of the base, which stays unless a centre is given.
     centre
-        (3,) where the common centre of mass shall lie; None leaves it where it comes to lie.
+        (3,) the wanted common centre of mass; None for any.
 
     Raises
     ------
     ValueError
-        No such body exists: the others are too heavy or reach too far.
+        No such body exists: the others have too much mass or inertia.
     """
     mass = whole_mass - sum(other.mass for other in others)
     if mass <= 0:
@@ -105,8 +100,10 @@ def base_for(
         moment = sum((other.mass * other.pose.position for other in others), np.zeros(3))
         base = Pose((whole_mass * centre - moment) / mass, base.rotation)
     bare = Inertial(mass, base, np.zeros((3, 3)))
-    centre = together((bare, *others)).pose.position
-    rest = _about(centre, bare) + sum((_about(centre, other) for other in others), np.zeros((3, 3)))
+    centre = join_bodies((bare, *others)).pose.position
+    rest = _inertia_about(centre, bare) + sum(
+        (_inertia_about(centre, other) for other in others), np.zeros((3, 3))
+    )
     in_model = whole_inertia - rest
     moments = np.linalg.eigvalsh(in_model)
     if moments[0] <= 0 or moments[2] > moments[0] + moments[1]:
@@ -117,29 +114,29 @@ def base_for(
     return Inertial(mass, base, base.rotation.T @ in_model @ base.rotation)
 
 
-def _about(point: Array, body: Inertial) -> Array:
+def _inertia_about(point: Array, body: Inertial) -> Array:
     """Return a body's inertia about a point, along the model's axes."""
     arm = body.pose.position - point
     shift: Array = arm @ arm * np.eye(3) - np.outer(arm, arm)
     return body.in_model + body.mass * shift
 
 
-#: How each of the two simulators calls its motor model and its control channels.
+#: Names of the motor model and the control channels in the two simulators.
 _CLASSIC_MOTOR = "gazebo_motor_model"
 _GZ_MOTOR = "multicopter-motor-model"
 _CLASSIC_CHANNELS = "control_channels"
-MOST_ROTORS = 12
-"""Of a vehicle: motors with a larger number drive something else."""
+MAX_ROTORS = 12
+"""Motors with a larger number drive something else."""
 
 
 @dataclass(frozen=True)
 class Model:
-    """A model file taken apart.
+    """A parsed model file.
 
     Attributes
     ----------
     base
-        The ``<link>`` whose inertial is ours to set.
+        The ``<link>`` whose inertial an export sets.
     """
 
     root: Element
@@ -148,29 +145,29 @@ class Model:
 
     @property
     def path(self) -> Path:
-        """The file that is not included in others."""
+        """The main file."""
         return self.root.source.path
 
     @property
     def links(self) -> list[Element]:
-        """Every link of the model itself, and of what it takes in."""
-        return [element for element, _ in _inside(self.root, IDENTITY) if element.tag == "link"]
+        """All links of the model and of merged ones."""
+        return [element for element, _ in _members(self.root, IDENTITY) if element.tag == "link"]
 
     @property
     def included(self) -> list[str]:
-        """What the model includes from other files, whose mass we cannot see."""
+        """The URIs of includes, whose mass is unknown."""
         uris = (include.find("uri") for include in self.root.all("include"))
         return [uri.value for uri in uris if uri is not None]
 
     @property
     def is_gz(self) -> bool:
         """Whether its motors are gz-sim's, not Gazebo classic's."""
-        return any(_GZ_MOTOR in _named(motor) for motor in self.motors())
+        return any(_GZ_MOTOR in _plugin_names(motor) for motor in self.motors())
 
     def rotor_links(self) -> dict[int, tuple[Element, str]]:
-        """Return number of a motor -> its rotor's link, and ``ccw`` or ``cw`` (empty where open).
+        """Return number of a motor -> its rotor's link, and ``ccw`` or ``cw`` (empty if unknown).
 
-        Motors whose number or link a template leaves open are not there.
+        Motors without a number or link, as in a template, are left out.
         """
         links = {link.attributes.get("name"): link for link in self.links}
         rotors = {}
@@ -183,13 +180,10 @@ class Model:
         return rotors
 
     def motors(self) -> list[Element]:
-        """Return the motor plugins of the vehicle's rotors.
-
-        Those of a template without a number of their own, as in a macro, count as well.
-        """
+        """Return the motor plugins of the rotors, with those of templates without number."""
         plugins = []
         for plugin in self.root.all("plugin"):
-            names = _named(plugin)
+            names = _plugin_names(plugin)
             if _CLASSIC_MOTOR in names or _GZ_MOTOR in names:
                 index = self._number_in(plugin, "motorNumber")
                 if index is None or 0 <= index < self.rotors:
@@ -197,7 +191,7 @@ class Model:
         return plugins
 
     def motor_number(self, motor: Element) -> int | None:
-        """Return which rotor a motor plugin drives; None where a template leaves that open."""
+        """Return the number of a motor plugin's rotor; None if a template has none."""
         index = self._number_in(motor, "motorNumber")
         return None if index is None else int(index)
 
@@ -218,22 +212,22 @@ class Model:
         return channels
 
     def pose_of_link(self, link: Element) -> Pose:
-        """Return where a link lies in the model's frame.
+        """Return the pose of a link in the model's frame.
 
         Raises
         ------
         ExportError
-            It counts from a frame that is no link and no frame of the model.
+            Its reference frame is no link or frame of the model.
         """
-        return self._placed(link, ())
+        return self._pose_in_model(link, ())
 
     def pose_of_inertial(self, link: Element) -> Pose:
-        """Return where a link's inertial frame lies in the model's frame."""
+        """Return the pose of a link's inertial frame in the model's frame."""
         inertial = link.find("inertial")
-        return self.pose_of_link(link) @ (self._written(inertial) if inertial else IDENTITY)
+        return self.pose_of_link(link) @ (self._written_pose(inertial) if inertial else IDENTITY)
 
-    def _written(self, element: Element) -> Pose:
-        """Return an element's ``<pose>`` as it is written, in whatever frame it counts from."""
+    def _written_pose(self, element: Element) -> Pose:
+        """Return an element's ``<pose>`` in its own reference frame."""
         pose, numbers = element.find("pose"), pose_numbers(element)
         if pose is None or not numbers:
             return IDENTITY
@@ -245,22 +239,22 @@ class Model:
             numbers[3:] = np.deg2rad(numbers[3:]).tolist()
         return pose_of(numbers)
 
-    def _placed(self, element: Element, passed: tuple[str, ...]) -> Pose:
+    def _pose_in_model(self, element: Element, passed: tuple[str, ...]) -> Pose:
         pose = element.find("pose")
         named = pose.attributes.get("relative_to", "") if pose else ""
         frame = named or element.attributes.get("attached_to", "")
         if frame in {"", "__model__"}:
             within = next(
-                (at for member, at in _inside(self.root, IDENTITY) if member is element), IDENTITY
+                (at for member, at in _members(self.root, IDENTITY) if member is element), IDENTITY
             )
-            return within @ self._written(element)
-        return self._frame(frame, passed) @ self._written(element)
+            return within @ self._written_pose(element)
+        return self._pose_of_frame(frame, passed) @ self._written_pose(element)
 
-    def _frame(self, name: str, passed: tuple[str, ...]) -> Pose:
-        for element, _ in _inside(self.root, IDENTITY):
+    def _pose_of_frame(self, name: str, passed: tuple[str, ...]) -> Pose:
+        for element, _ in _members(self.root, IDENTITY):
             same = element.attributes.get("name") == name
             if same and element.tag in {"link", "frame"} and name not in passed:
-                return self._placed(element, (*passed, name))
+                return self._pose_in_model(element, (*passed, name))
         raise ExportError(
             self.path, f"has a pose relative to '{name}'", "give it relative to a link or frame"
         )
@@ -270,14 +264,14 @@ class Model:
         return None if child is None else child.number
 
 
-def _named(plugin: Element) -> str:
-    """Return what a plugin is called, gz-sim's motor model by one name."""
+def _plugin_names(plugin: Element) -> str:
+    """Return file and name of a plugin; gz-sim's motor model has one spelling."""
     names = plugin.attributes.get("filename", "") + plugin.attributes.get("name", "")
     return names.replace("MulticopterMotorModel", _GZ_MOTOR)
 
 
 def read_model(root: Element, rotors: int) -> Model:
-    """Take a model apart that was read from a file.
+    """Return the model of a parsed file.
 
     Raises
     ------
@@ -285,14 +279,14 @@ def read_model(root: Element, rotors: int) -> Model:
         It holds no model, no link, or no motor plugin.
     """
     element, path = model_in(root), root.source.path
-    links = [member for member, _ in _inside(element, IDENTITY) if member.tag == "link"]
+    links = [member for member, _ in _members(element, IDENTITY) if member.tag == "link"]
     missing = [include for include in element.all("include") if include.attributes.get("merge")]
     if not links:
         remedy = "give the SDF of a multirotor"
         if missing:
             remedy = "put the folders of the models that it includes beside its own"
         raise ExportError(path, "has no <link>", remedy)
-    model = Model(element, _base(element, links), rotors)
+    model = Model(element, _base_link(element, links), rotors)
     if not model.motors():
         raise ExportError(
             path,
@@ -303,17 +297,17 @@ def read_model(root: Element, rotors: int) -> Model:
     return model
 
 
-def _inside(parent: Element, frame: Pose) -> Iterator[tuple[Element, Pose]]:
-    """Yield what an element holds, through what was merged into it, and the frame of each."""
+def _members(parent: Element, frame: Pose) -> Iterator[tuple[Element, Pose]]:
+    """Yield an element's children and those of merged models, and the frame of each."""
     for child in parent.children:
         if child.tag == MERGED:
             numbers = [float(word) for word in child.attributes["at"].split()]
-            yield from _inside(child.children[0], frame @ pose_of(numbers))
+            yield from _members(child.children[0], frame @ pose_of(numbers))
         else:
             yield child, frame
 
 
-def _base(root: Element, links: list[Element]) -> Element:
+def _base_link(root: Element, links: list[Element]) -> Element:
     by_name = {link.attributes.get("name", ""): link for link in links}
     for name in (root.attributes.get("canonical_link", ""), "base_link"):
         if name in by_name:
@@ -322,7 +316,7 @@ def _base(root: Element, links: list[Element]) -> Element:
 
 
 def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
-    """Yield each link that has mass, with its mass and inertia in the model's frame."""
+    """Yield each link with mass, and its body in the model's frame."""
     for link in model.links:
         inertial = link.find("inertial")
         if inertial is None:
@@ -345,4 +339,4 @@ def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
 
 def composite(model: Model) -> Inertial:
     """Return all links of a model as one body."""
-    return together([body for _, body in inertials(model)])
+    return join_bodies([body for _, body in inertials(model)])

@@ -1,4 +1,4 @@
-"""A vehicle's coefficients into a model: which tags are ours, and what each becomes."""
+"""Patch a model with a vehicle's coefficients."""
 
 from __future__ import annotations
 
@@ -12,35 +12,32 @@ from pydantic import ValidationError
 from tuner.core.errors import ExportError
 from tuner.exporters.sdf import spans, tags
 from tuner.exporters.sdf.model import (
-    MOST_ROTORS,
+    MAX_ROTORS,
     Inertial,
     Model,
     base_for,
     composite,
     inertials,
+    join_bodies,
     read_model,
-    together,
 )
-from tuner.exporters.sdf.spans import MERGED, Edit, Element, blanked, read_tree, rendered
-from tuner.exporters.sdf.tags import rotor_origin, values_in
+from tuner.exporters.sdf.spans import MERGED, Edit, Element, read_tree, render, without_jinja
+from tuner.exporters.sdf.tags import read_values, rotor_origin
 from tuner.exporters.simulators import (
-    FASTEST_GZ,
     GAZEBO_CLASSIC,
     GZ_SIM,
-    gz_unit,
+    MAX_GZ_SPEED,
+    gz_speed_unit,
     rotor_speed,
-    with_speeds_in,
+    with_speed_unit,
 )
-from tuner.exporters.target import Draft, differences, read_file, xml_comment
+from tuner.exporters.target import PLACE_TOLERANCE_M, Draft, differences, read_file, xml_comment
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
-#: Products of inertia below this part of the trace are taken as none.
-NO_PRODUCT = 1e-9
+#: Products of inertia below this share of the trace are zero.
+MAX_ZERO_PRODUCT = 1e-9
 PROVENANCE = "Coefficients by tune"
-
-#: m within which a rotor counts as sitting where the vehicle file has it.
-PLACE_TOLERANCE = 0.005
 
 
 def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
@@ -49,28 +46,28 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     Parameters
     ----------
     path
-        The model: SDF of Gazebo classic or gz-sim, or a Jinja template of one. What it includes and
-        merges from folders beside its own is patched where it stands.
+        The model: SDF of Gazebo classic or gz-sim, or a Jinja template of one. Models that it
+        merges from folders beside its own are patched, too.
     provenance
-        One line that says where they come from; it becomes a comment in each file that changes.
+        One line on their origin, for a comment in each changed file.
 
     Raises
     ------
     ExportError
-        The model cannot be understood, or would not come out with the wanted numbers.
+        The model is not understood, or would not hold the wanted numbers.
     """
     rotors = len(vehicle.rotors)
-    model = read_model(read_tree(path, read_file, lambda text, _: blanked(text)), rotors)
-    whole = read_model(read_tree(path, read_file, rendered), rotors)
+    model = read_model(read_tree(path, read_file, lambda text, _: without_jinja(text)), rotors)
+    whole = read_model(read_tree(path, read_file, render), rotors)
     simulator = GZ_SIM if whole.is_gz else GAZEBO_CLASSIC
     flown = simulator.flown(vehicle)
-    unit = gz_unit(flown) if whole.is_gz else 1.0
-    vehicle, asked = with_speeds_in(flown, unit), vehicle
-    base = _base(whole, vehicle)
+    unit = gz_speed_unit(flown) if whole.is_gz else 1.0
+    vehicle, asked = with_speed_unit(flown, unit), vehicle
+    base = _base_body(whole, vehicle)
     edits = [*_inertial_edits(model, base), *_motor_edits(model, vehicle)]
     if tags.center_of_mass(vehicle) is not None:
         edits += _pose_edits(model, whole, base)
-    edits = list(dict.fromkeys(map(_through_variable, edits)))
+    edits = list(dict.fromkeys(map(_edit_of_variable, edits)))
     places = [(edit.source, edit.start, edit.end) for edit in edits if edit.end > edit.start]
     if len(set(places)) < len(places):
         raise ExportError(
@@ -82,20 +79,22 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
 
     def faults(file: Path, instead: Mapping[Path, Path]) -> list[str]:
         standing = {**instead, path: file}
-        root = read_tree(path, lambda p: read_file(standing.get(p, p)), rendered)
-        return differences(wanted, values_in(root, vehicle))
+        root = read_tree(path, lambda p: read_file(standing.get(p, p)), render)
+        return differences(wanted, read_values(root, vehicle))
 
-    final = read_tree(path, lambda p: patched.get(p) or read_file(p), rendered)
+    final = read_tree(path, lambda p: patched.get(p) or read_file(p), render)
     wanted = tags.carried_values(vehicle, channels=bool(whole.channels()))
-    written_values = values_in(final, vehicle)
+    written_values = read_values(final, vehicle)
     wrong = differences(wanted, written_values)
     if wrong:
         raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
-    geometry = _other_rotors(whole, vehicle, base)
-    there = with_rotors_of(read_model(final, rotors), tags.as_flown(vehicle, written_values))
+    geometry = _rotor_differences(whole, vehicle, base)
+    there = with_rotors_of(
+        read_model(final, rotors), tags.with_model_values(vehicle, written_values)
+    )
     return Draft(
         patched.pop(path, model.root.source.raw),
-        with_speeds_in(there, 1.0 / unit),
+        with_speed_unit(there, 1.0 / unit),
         tuple(_notes(whole, asked, vehicle, base, unit)),
         faults,
         gates=(Gate("rotors sit and turn there as the vehicle's do", geometry),),
@@ -104,19 +103,19 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
 
 
 def simulator_of(path: Path) -> str:
-    """Return the name of the simulator that a model is for.
+    """Return the name of a model's simulator.
 
     Raises
     ------
     ExportError
         It is no model of a multirotor.
     """
-    model = read_model(read_tree(path, read_file, rendered), MOST_ROTORS)
+    model = read_model(read_tree(path, read_file, render), MAX_ROTORS)
     return (GZ_SIM if model.is_gz else GAZEBO_CLASSIC).name
 
 
 def _patched(model: Model, edits: Sequence[Edit], provenance: str) -> dict[Path, str]:
-    """Return each file that changes -> its new text, with a comment where its model begins."""
+    """Return changed file -> its new text, with a comment on the origin in its model."""
     merged = (include.children[0] for include in model.root.all(MERGED))
     begins = {element.source: element for element in (*merged, model.root)}
     patched = {}
@@ -124,14 +123,14 @@ def _patched(model: Model, edits: Sequence[Edit], provenance: str) -> dict[Path,
         of_file = [edit for edit in edits if edit.source == source]
         if of_file or len(begins) == 1:
             comment = _provenance_edit(element, provenance)
-            patched[source.path] = spans.apply(source.raw, [*of_file, comment])
+            patched[source.path] = spans.apply_edits(source.raw, [*of_file, comment])
     return patched
 
 
-def _base(model: Model, vehicle: VehicleFile) -> Inertial:
-    """Return the base link's body that makes the whole model weigh and turn like the vehicle.
+def _base_body(model: Model, vehicle: VehicleFile) -> Inertial:
+    """Return the base link's body with which the model has the vehicle's mass and inertia.
 
-    It moves only for a vehicle whose centre of mass is not where rotor positions count from.
+    It moves only if the centre of mass is not the origin of rotor positions.
     """
     others = [body for link, body in inertials(model) if link is not model.base]
     inertia, offset, centre = vehicle.inertia, tags.center_of_mass(vehicle), None
@@ -170,21 +169,23 @@ def _inertial_edits(model: Model, base: Inertial) -> Iterator[Edit]:
             f"base link '{model.base.attributes.get('name')}' has no <inertial> with <inertia>",
             "give it one, its numbers do not matter",
         )
-    yield from _set(inertial, {"mass": base.mass})
+    yield from _value_edits(inertial, {"mass": base.mass})
     entries = base.inertia
-    yield from _set(tensor, {"ixx": entries[0, 0], "iyy": entries[1, 1], "izz": entries[2, 2]})
+    yield from _value_edits(
+        tensor, {"ixx": entries[0, 0], "iyy": entries[1, 1], "izz": entries[2, 2]}
+    )
     products = {"ixy": entries[0, 1], "ixz": entries[0, 2], "iyz": entries[1, 2]}
     for tag, value in products.items():
-        none = abs(value) < NO_PRODUCT * np.trace(entries)
+        none = abs(value) < MAX_ZERO_PRODUCT * np.trace(entries)
         if not none or tensor.find(tag) is not None:
-            yield from _set(tensor, {tag: 0.0 if none else value})
+            yield from _value_edits(tensor, {tag: 0.0 if none else value})
 
 
 def _pose_edits(model: Model, whole: Model, base: Inertial) -> Iterator[Edit]:
-    """Yield the edit that puts the base's inertial frame where the base's centre lies.
+    """Yield the edit that moves the base's inertial frame to the base's centre of mass.
 
-    ``model`` is the text to edit, ``whole`` what it is once rendered. The frame's angles stay as
-    they are written; places have all digits, for the centre is the small difference of large ones.
+    ``model`` is the text to edit, ``whole`` the rendered model. The frame's angles stay; its
+    position has all digits, for the centre is the small difference of large numbers.
     """
     link = whole.pose_of_link(whole.base)
     place = link.rotation.T @ (base.pose.position - link.position)
@@ -202,7 +203,7 @@ def _pose_edits(model: Model, whole: Model, base: Inertial) -> Iterator[Edit]:
 def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
     uneven = tags.motor_constants(vehicle)
     for motor in model.motors():
-        wanted = tags.values(vehicle, "motor")
+        wanted = tags.tag_values(vehicle, "motor")
         if uneven is not None:
             index = model.motor_number(motor)
             if index is None:
@@ -211,14 +212,14 @@ def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
                     "draws its rotors from a template, and this vehicle's differ in motor_constant",
                     "give each rotor a plugin of its own",
                 )
-            wanted[tags.MOTOR_CONSTANT] = uneven[tags.of_rotor(index)]
-        yield from _set(motor, wanted)
+            wanted[tags.MOTOR_CONSTANT] = uneven[tags.rotor_constant_name(index)]
+        yield from _value_edits(motor, wanted)
     for channel in model.channels():
-        yield from _set(channel, tags.values(vehicle, "channel"))
+        yield from _value_edits(channel, tags.tag_values(vehicle, "channel"))
 
 
-def _set(parent: Element, values: dict[str, float]) -> Iterator[Edit]:
-    """Yield the edits that give children values; those that have them already stay untouched."""
+def _value_edits(parent: Element, values: dict[str, float]) -> Iterator[Edit]:
+    """Yield the edits that set the values of children, without those that are equal already."""
     for tag, value in values.items():
         child = parent.find(tag)
         if child is None:
@@ -229,8 +230,8 @@ def _set(parent: Element, values: dict[str, float]) -> Iterator[Edit]:
                 yield spans.set_value(child, tags.as_text(value))
 
 
-def _through_variable(edit: Edit) -> Edit:
-    """Return an edit of a ``{{ variable }}`` as an edit of the number it is set to."""
+def _edit_of_variable(edit: Edit) -> Edit:
+    """Return an edit of a ``{{ variable }}`` as an edit of the variable's number."""
     source, place = edit.source, slice(edit.start, edit.end)
     old = source.raw[place]
     if old == source.text[place]:
@@ -252,7 +253,7 @@ def _through_variable(edit: Edit) -> Edit:
 
 
 def _provenance_edit(model: Element, provenance: str) -> Edit:
-    """Return the edit of a file that puts our comment first in a model, or for an earlier one."""
+    """Return the edit that adds our comment to a model, or replaces an earlier one."""
     comment = f"<!-- {PROVENANCE}: {xml_comment(provenance)} -->"
     earlier = re.search(rf"<!-- {PROVENANCE}: .*?-->", model.source.raw, re.DOTALL)
     if earlier:
@@ -264,7 +265,7 @@ def _provenance_edit(model: Element, provenance: str) -> Edit:
 def _notes(
     model: Model, asked: VehicleFile, vehicle: VehicleFile, base: Inertial, unit: float
 ) -> Iterator[str]:
-    """Yield what was done, and what of the vehicle the format has no place for."""
+    """Yield remarks on the patched model, and on properties that the format lacks."""
     name = model.base.attributes.get("name", "")
     others = [(link, body) for link, body in inertials(model) if link is not model.base]
     if others:
@@ -286,33 +287,33 @@ def _notes(
     if unit < 1:
         yield (
             f"rotors turn at up to {rotor_speed(vehicle, 1.0) / unit:.0f} rad/s and PX4 lets "
-            f"gz-sim be told of {FASTEST_GZ:.0f} at most: speeds are scaled by {unit:.6g} and "
+            f"gz-sim be told of {MAX_GZ_SPEED:.0f} at most: speeds are scaled by {unit:.6g} and "
             "motorConstant and rotorDragCoefficient to match, which moves nothing otherwise"
         )
     if tags.center_of_mass(vehicle) is not None:
         place = ", ".join(tags.as_text(round(number, 9)) for number in base.pose.position)
         yield f"the inertial of '{name}' moves to ({place}) m for the vehicle's centre of mass"
-    yield from tags.lost_in(asked)
+    yield from tags.plugin_deviations(asked)
 
 
 def _more_rotors(model: Model, vehicle: VehicleFile) -> str:
-    """Return that a model has more rotors than a vehicle, as a clause; empty if it does not."""
-    count, own = len(read_model(model.root, MOST_ROTORS).rotor_links()), len(vehicle.rotors)
+    """Return a clause if a model has more rotors than a vehicle; else an empty text."""
+    count, own = len(read_model(model.root, MAX_ROTORS).rotor_links()), len(vehicle.rotors)
     return f"the model has {count} rotors, the vehicle {own}" if count > own else ""
 
 
-def _other_rotors(model: Model, vehicle: VehicleFile, base: Inertial) -> tuple[str, ...]:
-    """Return how the model's rotors are others than the vehicle file's, a clause each."""
+def _rotor_differences(model: Model, vehicle: VehicleFile, base: Inertial) -> tuple[str, ...]:
+    """Return a clause for each difference of the model's rotors from the vehicle file's."""
     more = _more_rotors(model, vehicle)
     clauses = [more] if more else []
     others = [body for link, body in inertials(model) if link is not model.base]
-    centre = together([base, *others]).pose.position
+    centre = join_bodies([base, *others]).pose.position
     offset = np.array(tags.center_of_mass(vehicle) or (0.0, 0.0, 0.0))
     for index, (link, turns) in sorted(model.rotor_links().items()):
         rotor = vehicle.rotors[index]
         place = model.pose_of_link(link).position - centre
         expected = np.array(rotor.position) - offset
-        if np.abs(place - expected).max() > PLACE_TOLERANCE:
+        if np.abs(place - expected).max() > PLACE_TOLERANCE_M:
             clauses.append(
                 f"rotor_{index} sits {place.round(4).tolist()} m from the centre of mass, the "
                 f"vehicle file's {expected.round(4).tolist()} m"
@@ -323,17 +324,17 @@ def _other_rotors(model: Model, vehicle: VehicleFile, base: Inertial) -> tuple[s
 
 
 def with_rotors_of(model: Model, vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle with its rotors where a model has them, and turning as they do there."""
+    """Return a vehicle with the positions and turning directions of a model's rotors."""
     centre = composite(model).pose.position
     offset = np.array(tags.center_of_mass(vehicle) or (0.0, 0.0, 0.0))
     rotors = list(vehicle.rotors)
     for index, (link, turns) in model.rotor_links().items():
         place = model.pose_of_link(link).position - centre + offset
-        if np.abs(place - np.array(rotors[index].position)).max() > PLACE_TOLERANCE:
+        if np.abs(place - np.array(rotors[index].position)).max() > PLACE_TOLERANCE_M:
             rotors[index] = rotors[index].replace(position=tuple(place.tolist()))
         if turns in ("ccw", "cw"):
             rotors[index] = rotors[index].replace(spin=turns)
     try:
         return vehicle.replace(rotors=tuple(rotors))
-    except ValidationError:  # in another order than the mixer's, which a gate says
+    except ValidationError:  # a gate reports another order than the mixer's
         return vehicle

@@ -1,9 +1,8 @@
-"""XML with the place of every element in its text, and edits of the text by place.
+"""XML elements with their positions in the text, and edits of the text by position.
 
-Jinja templates of models are read with their expressions blanked out, or rendered. A model that is
-split over files is one tree. In it each ``<include merge="true">`` holds the model that it names:
-simulators take that into the model itself. Includes are followed within the folder tree that holds
-the model's own folder; what lies elsewhere is left as it stands.
+Jinja templates of models are parsed with their expressions blanked out, or rendered. A model of
+several files is one tree, in which each ``<include merge="true">`` holds the included model, as
+simulators merge it. Includes are followed within the parent of the model's folder.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _FILLER = "J"
 
 @dataclass(frozen=True)
 class Source:
-    """A file of a model: its text as it stands, and as it was prepared to be taken apart."""
+    """A file of a model: its raw text, and the text to parse."""
 
     path: Path
     raw: str
@@ -35,16 +34,16 @@ class Source:
 
 @dataclass
 class Element:
-    """An element and where it lies.
+    """An element and its position.
 
     Attributes
     ----------
     source
-        Its file, ``text`` of which is meant below.
+        Its file; positions are in its ``text``.
     start, end
-        The whole element is ``text[start:end]``.
+        Of the whole element.
     content, content_end
-        What lies between its tags is ``text[content:content_end]``; empty for ``<tag/>``.
+        Of the content between its tags; empty for ``<tag/>``.
     """
 
     source: Source
@@ -58,12 +57,12 @@ class Element:
 
     @property
     def value(self) -> str:
-        """What it holds, without comments and surrounding space."""
+        """Its content without comments and surrounding space."""
         return _COMMENT.sub("", self.source.text[self.content : self.content_end]).strip()
 
     @property
     def number(self) -> float | None:
-        """The number that it holds, None if it holds something else, or none that is finite."""
+        """Its finite number; None for other content."""
         try:
             number = float(self.value)
         except ValueError:
@@ -88,7 +87,7 @@ class Element:
 
 @dataclass(frozen=True)
 class Edit:
-    """A text to put in the place of another in a file."""
+    """The replacement of a part of a file."""
 
     source: Source
     start: int
@@ -102,16 +101,16 @@ def parse(text: str, path: Path, raw: str | None = None) -> Element:
     Parameters
     ----------
     text
-        Characters; places count in them.
+        The text to parse, of which positions count.
     raw
-        The file as it stands, where the text was made from it.
+        The raw text of the file, if it differs.
 
     Raises
     ------
     ExportError
         It is not well-formed, or declares a document type (entities are not expanded here).
     """
-    # One byte a character, so that the parser's byte places are places in the text.
+    # One byte per character, so that the parser's byte positions are positions in the text.
     plain = re.sub(r"[^\x00-\x7f]", "x", without_comments(text))
     parser = expat.ParserCreate("utf-8")
     source = Source(path, text if raw is None else raw, text)
@@ -151,7 +150,7 @@ def without_comments(text: str) -> str:
 
 
 def _after_tag(text: str, start: int) -> int:
-    """Return the place after the ``>`` that ends the tag beginning at a place."""
+    """Return the position after a tag that begins at another."""
     quote = ""
     for place in range(start, len(text)):
         character = text[place]
@@ -165,7 +164,7 @@ def _after_tag(text: str, start: int) -> int:
 
 
 def set_value(element: Element, value: str) -> Edit:
-    """Return the edit that gives a childless element another value, its comments kept."""
+    """Return the edit that sets the value of a childless element and keeps its comments."""
     source, start, end = element.source, element.content, element.content_end
     if start == element.end:
         start_tag = source.text[element.start : element.end].rstrip("/>").rstrip()
@@ -178,7 +177,7 @@ def set_value(element: Element, value: str) -> Edit:
 
 
 def append_child(parent: Element, tag: str, value: str) -> Edit:
-    """Return the edit that adds an element behind the last child, indented like it."""
+    """Return the edit that adds an element after the last child, with its indentation."""
     child = f"<{tag}>{value}</{tag}>"
     if not parent.children:
         return Edit(parent.source, parent.content, parent.content, child)
@@ -187,13 +186,13 @@ def append_child(parent: Element, tag: str, value: str) -> Edit:
 
 
 def indent_of(element: Element) -> str:
-    """Return the line break and space before an element; empty where it does not begin a line."""
+    """Return the line break and space before an element; empty if it does not begin a line."""
     text, start = element.source.raw, element.start
     before = text[text.rfind("\n", 0, start) + 1 : start]
     return "" if before.strip() else "\n" + before
 
 
-def apply(text: str, edits: Iterable[Edit]) -> str:
+def apply_edits(text: str, edits: Iterable[Edit]) -> str:
     """Return the text with all edits done; they must not overlap."""
     pieces: list[str] = []
     place = 0
@@ -209,31 +208,31 @@ _EXPRESSION = re.compile(r"\{\{.*?\}\}", re.DOTALL)
 _STATEMENT = re.compile(r"\{%.*?%\}|\{#.*?#\}", re.DOTALL)
 
 
-def blanked(text: str) -> str:
-    """Return a text of the same length and lines without Jinja in it.
+def without_jinja(text: str) -> str:
+    """Return a text of the same length and lines without Jinja.
 
-    Expressions become letters, so that they are no numbers; statements and comments become space.
+    Expressions become letters, which are no numbers; statements and comments become space.
     """
     text = _STATEMENT.sub(lambda match: re.sub(r"[^\n]", " ", match.group()), text)
     return _EXPRESSION.sub(lambda match: re.sub(r"[^\n]", _FILLER, match.group()), text)
 
 
-def rendered(text: str, path: Path) -> str:
-    """Return what a template gives with no variables set; a text without Jinja as it is.
+def render(text: str, path: Path) -> str:
+    """Return a template rendered without variables; a text without Jinja as it is.
 
     Raises
     ------
     ExportError
-        It cannot be rendered so, or takes more than `LONGEST_RENDERING`.
+        It cannot be rendered, or takes longer than `MAX_RENDERING_S`.
     """
     if not (_EXPRESSION.search(text) or _STATEMENT.search(text)):
         return text
     try:
         done = subprocess.run(
-            [sys.executable, "-P", "-c", _RENDER],
+            [sys.executable, "-P", "-c", _RENDER_SCRIPT],
             input=text.encode(),
             capture_output=True,
-            timeout=LONGEST_RENDERING,
+            timeout=MAX_RENDERING_S,
             check=False,
         )
     except subprocess.TimeoutExpired:
@@ -246,9 +245,9 @@ def rendered(text: str, path: Path) -> str:
     return done.stdout.decode()
 
 
-LONGEST_RENDERING = 20.0
-"""s; a model takes a tenth of one."""
-_RENDER = """
+MAX_RENDERING_S = 20.0
+"""A model takes a tenth of a second."""
+_RENDER_SCRIPT = """
 import sys
 try:
     import resource
@@ -265,13 +264,12 @@ if len(text) > 10_000_000:
     sys.exit("it comes to more than 10 MB")
 sys.stdout.buffer.write(text.encode())
 """
-"""A program of its own, for a template may loop, or multiply its text, without end."""
+"""It runs as a process of its own: a template may loop, or multiply its text, without end."""
 
 
 MERGED = "merged__"
-"""Tag of an include that was followed: it holds the included model; its ``at`` is the model's pose,
-``x y z roll pitch yaw``."""
-DEEPEST = 8
+"""Tag of an include that holds the included model; ``at`` is its pose, ``x y z roll pitch yaw``."""
+MAX_INCLUDE_DEPTH = 8
 _NAME = re.compile(r"(?:model://)?([A-Za-z0-9_][A-Za-z0-9._-]{0,99})/?")
 
 
@@ -281,12 +279,12 @@ def read_tree(
     prepare: Callable[[str, Path], str],
     above: tuple[Path, ...] = (),
 ) -> Element:
-    """Return the root of a model's file; in each include that is followed is the model it names.
+    """Return the root of a model's file, with included models in their includes.
 
     Parameters
     ----------
     prepare
-        Text and path -> the XML to take apart, places kept where it is to be edited.
+        Text and path -> the XML to parse, with the same positions if it is to be edited.
     above
         Files that include this one.
 
@@ -295,14 +293,14 @@ def read_tree(
     ExportError
         A file cannot be read, holds no model, or includes itself.
     """
-    if path in above or len(above) > DEEPEST:
+    if path in above or len(above) > MAX_INCLUDE_DEPTH:
         raise ExportError(path, "is included in itself", "take the include out")
     raw = read(path)
     root = parse(prepare(raw, path), path, raw)
     if root.first("include") is None:
         return root
     for include in model_in(root).children:
-        file = _included(include)
+        file = _included_file(include)
         if file is not None:
             model = model_in(read_tree(file, read, prepare, (*above, path)))
             include.attributes = {"at": _pose(include) or _pose(model) or "0 0 0 0 0 0"}
@@ -330,8 +328,8 @@ def sources(root: Element) -> list[Source]:
     return list(dict.fromkeys((root.source, *merged)))
 
 
-def _included(include: Element) -> Path | None:
-    """Return the file that an element includes and merges; None where that is none of ours."""
+def _included_file(include: Element) -> Path | None:
+    """Return the file that an element merges; None if it is not followed."""
     if include.tag != "include" or include.attributes.get("merge") not in ("true", "1"):
         return None
     uri = include.find("uri")
@@ -344,12 +342,12 @@ def _included(include: Element) -> Path | None:
 
 
 def pose_numbers(element: Element) -> list[float]:
-    """Return the six numbers of an element's ``<pose>``; none where it has none.
+    """Return the six numbers of an element's ``<pose>``; an empty list without one.
 
     Raises
     ------
     ExportError
-        They are others.
+        It has no six finite numbers.
     """
     pose = element.find("pose")
     words = pose.value.split() if pose else []

@@ -1,6 +1,6 @@
-"""The tags that are ours, as the registry of coefficients has them: their values, and reading back.
+"""SDF tags of coefficients, from the registry: their values, written and read back.
 
-A written model is read again by another parser: the numbers in it, and no others.
+A written model is read back by another parser.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of, with_va
 
 Parent = Literal["inertial", "inertia", "motor", "channel"]
 
-#: A motor plugin's tag that is no coefficient, as flights do not show it -> key of `Motor`.
+#: A motor plugin's tag without a coefficient, and its key in `Motor`.
 SPEED_LIMIT, SPEED_LIMIT_KEY = "maxRotVelocity", "max_rotor_velocity"
 
 MOTOR_CONSTANT = "motorConstant"
@@ -29,13 +29,13 @@ CENTER_OF_MASS = tuple(f"center_of_mass_{axis}" for axis in "xyz")
 
 
 def tags_in(parent: Parent) -> dict[str, str]:
-    """Return tag -> name of the number that it holds.
+    """Return tag -> name of its number.
 
     Parameters
     ----------
     parent
-        The element that the tags stand in: ``motor`` is a motor model plugin, of Gazebo classic and
-        gz-sim alike, ``channel`` a control channel of PX4's interface plugin for Gazebo classic.
+        Their parent element: ``motor`` is a motor model plugin of Gazebo classic or gz-sim,
+        ``channel`` a control channel of PX4's interface plugin for Gazebo classic.
     """
     tags = {SPEED_LIMIT: SPEED_LIMIT_KEY} if parent == "motor" else {}
     for name, row in COEFFICIENTS.items():
@@ -46,27 +46,27 @@ def tags_in(parent: Parent) -> dict[str, str]:
 
 
 def numbers_of(vehicle: VehicleFile) -> dict[str, float]:
-    """Return name -> value of all that may have a tag."""
+    """Return name -> value of all numbers that may have a tag."""
     return values_of(vehicle) | {SPEED_LIMIT_KEY: vehicle.motor.max_rotor_velocity}
 
 
-def values(vehicle: VehicleFile, parent: Parent) -> dict[str, float]:
-    """Return tag to value for a vehicle; not those of coefficients that it leaves out."""
+def tag_values(vehicle: VehicleFile, parent: Parent) -> dict[str, float]:
+    """Return tag -> value of a vehicle, without coefficients that it lacks."""
     numbers = numbers_of(vehicle)
     return {tag: numbers[name] for tag, name in tags_in(parent).items() if name in numbers}
 
 
 def center_of_mass(vehicle: VehicleFile) -> tuple[float, ...] | None:
-    """Return m from where rotor positions count to the centre of mass; None where they agree."""
+    """Return the m from the origin of rotor positions to the centre of mass; None if equal."""
     if not any(vehicle.effects.get(name) for name in CENTER_OF_MASS):
         return None
     return tuple(vehicle.effects.get(name, 0.0) for name in CENTER_OF_MASS)
 
 
 def motor_constants(vehicle: VehicleFile) -> dict[str, float] | None:
-    """Return what each rotor's motor constant is called -> its value; None where all are alike.
+    """Return name -> each rotor's motor constant; None if all are equal.
 
-    The rotors' scales are factors on thrust and torque, whose product is 1: the last one follows.
+    The product of the rotors' scales of thrust and torque is 1, from which the last one follows.
     """
     count = len(vehicle.rotors)
     scales = [vehicle.effects.get(f"rotor_thrust_scale_{i + 1}") for i in range(count)]
@@ -76,23 +76,23 @@ def motor_constants(vehicle: VehicleFile) -> dict[str, float] | None:
         scales[-1] = 1.0 / math.prod(scale for scale in scales if scale is not None)
     constant = vehicle.aerodynamics.motor_constant
     return {
-        of_rotor(i): constant if scale is None else constant * scale
+        rotor_constant_name(i): constant if scale is None else constant * scale
         for i, scale in enumerate(scales)
     }
 
 
-def of_rotor(index: int) -> str:
-    """Return what the motor constant of one rotor among uneven ones is called."""
+def rotor_constant_name(index: int) -> str:
+    """Return the name of one rotor's motor constant."""
     return f"motor_constant of rotor_{index}"
 
 
 def carried_values(vehicle: VehicleFile, *, channels: bool) -> dict[str, float]:
-    """Return name -> value of what a model of a vehicle must hold.
+    """Return name -> value of the numbers that a model of a vehicle must hold.
 
     Parameters
     ----------
     channels
-        Whether it has control channels, as models for Gazebo classic have.
+        Whether it has control channels, as for Gazebo classic.
     """
     carried: set[str] = set()
     for name, row in COEFFICIENTS.items():
@@ -115,60 +115,61 @@ def carried_values(vehicle: VehicleFile, *, channels: bool) -> dict[str, float]:
 
 
 def as_text(value: float) -> str:
-    """Return a number as it is written into a model: twelve digits at most, no needless ones."""
+    """Return a number as text of at most twelve digits."""
     return format(value, ".12g")
 
 
-def as_flown(vehicle: VehicleFile, read: dict[str, float]) -> VehicleFile:
-    """Return a vehicle, as its simulator flies it, with the numbers that a model holds.
-
-    Of uneven rotors it holds each one's motor constant, which are the vehicle's own.
-    """
+def with_model_values(vehicle: VehicleFile, read: dict[str, float]) -> VehicleFile:
+    """Return a vehicle with the numbers of a model, except uneven rotors' motor constants."""
     limit = read[SPEED_LIMIT_KEY]
     coefficients = {name: value for name, value in read.items() if name in COEFFICIENTS}
     flown = with_values(vehicle, coefficients)
     return flown.replace(motor=flown.motor.replace(max_rotor_velocity=limit))
 
 
-def lost_in(vehicle: VehicleFile) -> tuple[str, ...]:
-    """Return what of a vehicle, beside coefficients, the plugins fly differently."""
+def plugin_deviations(vehicle: VehicleFile) -> tuple[str, ...]:
+    """Return clauses on properties of a vehicle that the plugins fly differently."""
     if vehicle.aerodynamics.reaction_torque == "body":
         return ()
     return ("the plugins' reaction torque acts about the body's z axis, not the world's",)
 
 
-def values_in(root: Element, vehicle: VehicleFile) -> dict[str, float]:
-    """Return what a rendered model holds, name -> value; what it does not hold is not there.
+def read_values(root: Element, vehicle: VehicleFile) -> dict[str, float]:
+    """Return name -> value of the numbers in a rendered model.
 
     Parameters
     ----------
     vehicle
-        How many rotors it has and where, whether they are alike, and whether its centre of mass is
-        where rotor positions count from.
+        Gives the rotors, whether they are equal, and whether rotor positions count from its
+        centre of mass.
 
     Raises
     ------
     ExportError
-        Its rotors do not agree with each other.
+        Its rotors have different values.
     """
     rotors, motor_tags, path = len(vehicle.rotors), tags_in("motor"), root.source.path
     trees = [ElementTree.fromstring(without_comments(file.text)) for file in sources(root)]
     ours = {str(number) for number in range(rotors)}
-    plugins = [e for tree in trees for e in tree.iter("plugin") if _text(e, "motorNumber") in ours]
+    plugins = [
+        e for tree in trees for e in tree.iter("plugin") if _child_text(e, "motorNumber") in ours
+    ]
     channels = [
         e
         for tree in trees
         for e in tree.iter("channel")
-        if _text(e, "input_index") in ours
-        and (_text(e, "joint_control_type") or "velocity").startswith("velocity")
+        if _child_text(e, "input_index") in ours
+        and (_child_text(e, "joint_control_type") or "velocity").startswith("velocity")
     ]
     read: dict[str, float] = {}
     if motor_constants(vehicle) is not None:
         del motor_tags[MOTOR_CONSTANT]
         for plugin in plugins:
-            index = int(_text(plugin, "motorNumber"))
-            read |= _agreed([plugin], {MOTOR_CONSTANT: of_rotor(index)}, path)
-    read |= _agreed(plugins, motor_tags, path) | _agreed(channels, tags_in("channel"), path)
+            index = int(_child_text(plugin, "motorNumber"))
+            read |= _shared_values([plugin], {MOTOR_CONSTANT: rotor_constant_name(index)}, path)
+    read |= _shared_values(plugins, motor_tags, path) | _shared_values(
+        channels, tags_in("channel"), path
+    )
     model = read_model(root, rotors)
     whole = composite(model)
     if center_of_mass(vehicle) is not None:
@@ -181,17 +182,17 @@ def values_in(root: Element, vehicle: VehicleFile) -> dict[str, float]:
     return read | {name: body[tag] for tag, name in tags.items() if tag in body}
 
 
-def _text(element: ElementTree.Element, tag: str) -> str:
+def _child_text(element: ElementTree.Element, tag: str) -> str:
     return (element.findtext(tag) or "").strip()
 
 
-def _agreed(
+def _shared_values(
     elements: Iterable[ElementTree.Element], tags: dict[str, str], path: Path
 ) -> dict[str, float]:
     """Return the values that elements share."""
     read: dict[str, float] = {}
     for tag, name in tags.items():
-        texts = {_text(element, tag) for element in elements}
+        texts = {_child_text(element, tag) for element in elements}
         try:
             values = {float(text) if text else None for text in texts}
         except ValueError:
@@ -207,9 +208,9 @@ def _agreed(
 
 
 def rotor_origin(model: Model, vehicle: VehicleFile) -> Array | None:
-    """Return the point (3,) m of a model from which the vehicle file's rotor positions count.
+    """Return the origin (3,) m of the vehicle file's rotor positions in a model.
 
-    None where not every rotor is a link of its own, ``rotor_0`` and on.
+    None unless every rotor is a link, ``rotor_0`` and on.
     """
     links = {link.attributes.get("name"): link for link in model.links}
     places = [

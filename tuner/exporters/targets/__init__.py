@@ -1,5 +1,4 @@
-"""The export targets: each module here is one, under the name that ``--format`` takes.
+"""The export targets: each module here is one, named as in ``--format``.
 
-To add a target, add a module with a `tuner.exporters.target.Target` of the name ``TARGET``: what it
-can carry, how it is written and how it is read back.
+To add a target, add a module with a `tuner.exporters.target.Target` named ``TARGET``.
 """

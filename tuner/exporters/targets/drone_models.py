@@ -9,26 +9,21 @@ from typing import Any
 
 import numpy as np
 
-from sim_jax.constants import GRAVITY
+from sim_jax.constants import GRAVITY, RAD_S_PER_RPM
 from tuner.core.disk import file_name
 from tuner.core.numerics import Array
 from tuner.core.yaml_document import commented
-from tuner.exporters.flier import flier
+from tuner.exporters.external_simulator import flier_of
 from tuner.exporters.simulators import DRONE_MODELS, rotor_speed, thrust_at
-from tuner.exporters.target import Draft, Target, differences, flattened, read_file
+from tuner.exporters.target import PLACE_TOLERANCE_M, Draft, Target, differences, flatten, read_file
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
-RPM = 2 * math.pi / 60
-"""rad/s of one rpm."""
-PLACES_AGREE = 0.005
-"""m within which arms count as alike."""
-
 
 def params(vehicle: VehicleFile) -> dict[str, Any]:
-    """Return the parameters of its first-principles model, of a vehicle as it flies it."""
+    """Return the parameters of the first-principles model of a vehicle by its laws."""
     aero, motor, inertia = vehicle.aerodynamics, vehicle.motor, vehicle.inertia
-    thrust = aero.motor_constant * RPM**2
+    thrust = aero.motor_constant * RAD_S_PER_RPM**2
     x, y = ([math.copysign(1.0, r.position[axis]) for r in vehicle.rotors] for axis in (0, 1))
     drag = [-vehicle.effects.get(f"linear_drag_{axis}", 0.0) for axis in "xyz"]
     return {
@@ -63,24 +58,22 @@ def drone_models_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Dra
     apart = max(arms) - min(arms)
     other = (f"its rotors sit in no square: arms of {min(arms):g} to {max(arms):g} m",)
     counts = () if vehicle.is_quad else ("it has four rotors",)
-    square = other if apart > PLACES_AGREE else ()
+    square = other if apart > PLACE_TOLERANCE_M else ()
     return Draft(
         text,
         flown,
         (),
-        lambda path, _: differences(
-            flattened(wanted), flattened(tomllib.loads(read_file(path))[key])
-        ),
+        lambda path, _: differences(flatten(wanted), flatten(tomllib.loads(read_file(path))[key])),
         gates=(Gate("the simulator has such rotors", square or counts),),
         flier=_flier(wanted),
     )
 
 
 def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
-    """Return what flies parameters with drone-models' dynamics; None where it is not installed.
+    """Return the flier of drone-models' dynamics; None if that is not installed.
 
-    It flies with the environment variable SCIPY_ARRAY_API=1, without which it refuses to load.
-    Its functions give derivatives: a step is one of Runge and Kutta's of fourth order.
+    It needs the environment variable SCIPY_ARRAY_API=1. It has derivatives only: a step is one of
+    the classic Runge-Kutta method.
     """
     try:
         from drone_models.first_principles import dynamics  # noqa: PLC0415
@@ -94,7 +87,7 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
     inverse = np.linalg.inv(arrays["J"])
 
     class Flying:
-        """As of `tuner.exporters.flier.Body`."""
+        """As of `tuner.exporters.external_simulator.ExternalBody`."""
 
         def __init__(self, step: float) -> None:
             self.period, self.state = step, np.zeros(17)
@@ -102,12 +95,19 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
         def begin(self, state: Array, rotor_speed: Array) -> None:
             # position, attitude x y z w, velocity, body rate, rotor speeds in rpm
             order = [0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]
-            self.state = np.concatenate([state[order], rotor_speed / RPM])
+            self.state = np.concatenate([state[order], rotor_speed / RAD_S_PER_RPM])
 
         def step(self, asked: Array) -> Array:
             def change(s: Array) -> Array:
                 found = dynamics(
-                    s[:3], s[3:7], s[7:10], s[10:13], asked / RPM, s[13:], J_inv=inverse, **arrays
+                    s[:3],
+                    s[3:7],
+                    s[7:10],
+                    s[10:13],
+                    asked / RAD_S_PER_RPM,
+                    s[13:],
+                    J_inv=inverse,
+                    **arrays,
                 )
                 found = list(found)
                 rate, vector, scalar = s[10:13], s[3:6], s[6]  # its own change of attitude is wrong
@@ -126,9 +126,9 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
             return state[[0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]]
 
         def rotor_speed(self) -> Array:
-            return self.state[13:] * RPM
+            return self.state[13:] * RAD_S_PER_RPM
 
-    return flier(Flying)
+    return flier_of(Flying)
 
 
 TARGET = Target("drone-models", ".toml", drone_models_draft, DRONE_MODELS)

@@ -1,4 +1,4 @@
-"""SDF of gz-sim, whose motor model computes otherwise than Gazebo classic's."""
+"""SDF of gz-sim, whose motor model differs from Gazebo classic's."""
 
 from __future__ import annotations
 
@@ -8,10 +8,4 @@ from tuner.exporters.simulators import GZ_SIM
 from tuner.exporters.target import Target
 from tuner.exporters.targets.sdf import TARGET as SDF
 
-TARGET: Target = replace(
-    SDF,
-    name="gz-sim",
-    suffix="_gz.sdf",
-    simulator=GZ_SIM,
-    others=(),
-)
+TARGET: Target = replace(SDF, name="gz-sim", suffix="_gz.sdf", simulator=GZ_SIM, others=())

@@ -7,11 +7,11 @@ from typing import Any
 
 from tuner.core.yaml_document import commented
 from tuner.exporters.simulators import ISAAC_LAB, hover_speed, rotor_speed, thrust_at
-from tuner.exporters.target import Draft, Target, assigned, differences, flattened
+from tuner.exporters.target import Draft, Target, differences, flatten, module_assignments
 from tuner.vehicle import VehicleFile
 
-TURN = 2 * math.pi
-"""rad of a turn: Isaac Lab counts rotor speeds in turns per second."""
+RAD_PER_TURN = 2 * math.pi
+"""Isaac Lab has rotor speeds in turns per second."""
 _USE = """
 # from isaaclab_contrib.actuators import ThrusterCfg
 # from isaaclab_contrib.assets import MultirotorCfg
@@ -22,12 +22,12 @@ _USE = """
 
 
 def configuration(vehicle: VehicleFile) -> dict[str, dict[str, Any]]:
-    """Return name of a class's arguments -> them, of a vehicle as Isaac Lab flies it.
+    """Return section -> arguments of Isaac Lab's configuration of a vehicle by its laws.
 
-    Ranges that are sampled from are a number twice; ``--draws`` gives wider ones.
+    Both ends of a sampled range are equal; ``--draws`` gives wider ones.
     """
     motor, aero, inertia = vehicle.motor, vehicle.aerodynamics, vehicle.inertia
-    constant = aero.motor_constant * TURN**2
+    constant = aero.motor_constant * RAD_PER_TURN**2
     spins = [1.0 if rotor.spin == "ccw" else -1.0 for rotor in vehicle.rotors]
     x, y = ([rotor.position[axis] for rotor in vehicle.rotors] for axis in (0, 1))
     none = [0.0] * len(vehicle.rotors)
@@ -62,7 +62,7 @@ def configuration(vehicle: VehicleFile) -> dict[str, dict[str, Any]]:
         "BODY": {
             "mass": vehicle.mass,
             "diagonal_inertia": [inertia.xx, inertia.yy, inertia.zz],
-            "hover_rps": hover_speed(vehicle) / TURN,
+            "hover_rps": hover_speed(vehicle) / RAD_PER_TURN,
         },
     }
 
@@ -85,7 +85,7 @@ def isaaclab_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
         isaaclab_text(wanted, provenance),
         flown,
         (),
-        lambda path, _: differences(flattened(wanted), flattened(assigned(path))),
+        lambda path, _: differences(flatten(wanted), flatten(module_assignments(path))),
     )
 
 

@@ -1,4 +1,4 @@
-"""JSON of a vehicle for a simulator of one's own: every number, its unit, and what follows."""
+"""JSON of a vehicle for other simulators: all numbers with units, thrust and hover."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
-from tuner.exporters.flier import flier
+from tuner.exporters.external_simulator import flier_of
 from tuner.exporters.simulators import MUJOCO, drag_at_hover, full_thrust, rotor_speed, thrust_at
 from tuner.exporters.target import Draft, Target, differences, read_file, xml_comment
 from tuner.vehicle import VehicleFile
@@ -25,7 +25,7 @@ _USE = """
 
 
 def mjcf(vehicle: VehicleFile, provenance: str) -> str:
-    """Return the model of a vehicle as MuJoCo flies it."""
+    """Return the model of a vehicle by MuJoCo's laws."""
     inertia, motor, aero = vehicle.inertia, vehicle.motor, vehicle.aerodynamics
     places = [" ".join(map(_number, rotor.position)) for rotor in vehicle.rotors]
     centre = np.mean([rotor.position for rotor in vehicle.rotors], axis=0)
@@ -72,7 +72,7 @@ def mjcf(vehicle: VehicleFile, provenance: str) -> str:
 
 
 def _damping(vehicle: VehicleFile) -> tuple[float, float, float]:
-    """Return the damping of rotation, N m s/rad; about up, that of the rotors' drag, too."""
+    """Return the damping of rotation, N m s/rad; about z with that of rotor drag."""
     x, y, z = (vehicle.effects.get(f"angular_drag_{axis}", 0.0) for axis in "xyz")
     arms = np.mean([np.square(rotor.position[:2]) for rotor in vehicle.rotors], axis=0)
     drag = drag_at_hover(vehicle)
@@ -85,7 +85,7 @@ def _number(value: float) -> str:
 
 
 def read_mjcf(path: Path) -> dict[str, float]:
-    """Return what a model that this target wrote holds, name -> number."""
+    """Return name -> number of a model by this target."""
     root = ElementTree.fromstring(read_file(path))
     held: dict[str, float] = {}
     for element, keys in (
@@ -101,7 +101,7 @@ def read_mjcf(path: Path) -> dict[str, float]:
 
 
 def mujoco_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
-    """Return a model; the gate flies it in MuJoCo where that is installed."""
+    """Return a model; the gate flies it in MuJoCo if that is installed."""
     flown = MUJOCO.flown(vehicle)
     inertia = flown.inertia
     wanted = {
@@ -130,7 +130,7 @@ def mujoco_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
 
 
 def _flier(text: str, vehicle: VehicleFile) -> Callable[..., Any] | None:
-    """Return what flies a model in MuJoCo; None where that is not installed."""
+    """Return the flier of a model in MuJoCo; None if that is not installed."""
     try:
         import mujoco  # noqa: PLC0415 (an extra)
     except ImportError:
@@ -144,7 +144,7 @@ def _flier(text: str, vehicle: VehicleFile) -> Callable[..., Any] | None:
     count, constant = len(vehicle.rotors), vehicle.aerodynamics.motor_constant
 
     class Flying:
-        """As of `tuner.exporters.flier.Body`."""
+        """As of `tuner.exporters.external_simulator.ExternalBody`."""
 
         def __init__(self, step: float) -> None:
             model.opt.timestep = step
@@ -166,7 +166,7 @@ def _flier(text: str, vehicle: VehicleFile) -> Callable[..., Any] | None:
             speeds: Array = self.data.act[:count] / constant
             return speeds
 
-    return flier(Flying)
+    return flier_of(Flying)
 
 
 TARGET = Target("mujoco", ".xml", mujoco_draft, MUJOCO)

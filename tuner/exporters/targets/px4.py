@@ -16,23 +16,21 @@ from pathlib import Path
 from tuner.core.errors import ExportError
 from tuner.core.yaml_document import commented
 from tuner.exporters.simulators import (
-    FASTEST_GZ,
     GZ_SIM,
+    MAX_GZ_SPEED,
     SIH,
     Simulator,
     drag_at_hover,
     full_thrust,
-    gz_unit,
+    gz_speed_unit,
     hover_command,
     hover_speed,
     rotor_speed,
 )
-from tuner.exporters.target import Draft, Target, differences, read_file
+from tuner.exporters.target import PLACE_TOLERANCE_M, Draft, Target, differences, read_file
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
-PLACES_AGREE = 0.005
-"""m within which rotors count as sitting symmetrically."""
 INT32, FLOAT = 6, 9
 """MAVLink's numbers of parameter types, as ground stations write them."""
 
@@ -56,7 +54,7 @@ def parameters(vehicle: VehicleFile, simulator: Simulator) -> dict[str, float | 
             f"{rotor_speed(flown, 0):.0f} to {rotor_speed(flown, 1):.0f}",
             "check mass, motor_constant and input_scaling",
         )
-    own = _sih(flown) if simulator is SIH else _speeds(flown)
+    own = _sih(flown) if simulator is SIH else _gz_speeds(flown)
     exact = {**_allocation(flown), **own, "MPC_THR_HOVER": hover}
     return {n: v if isinstance(v, int) else float(f"{v:.9g}") for n, v in exact.items()}
 
@@ -102,9 +100,9 @@ def _sih(vehicle: VehicleFile) -> dict[str, float | int]:
     }
 
 
-def _speeds(vehicle: VehicleFile) -> dict[str, float | int]:
+def _gz_speeds(vehicle: VehicleFile) -> dict[str, float | int]:
     """Return the rotor speeds in whole rad/s between which the gz-sim bridge maps commands."""
-    unit, numbers = gz_unit(vehicle), range(1, len(vehicle.rotors) + 1)
+    unit, numbers = gz_speed_unit(vehicle), range(1, len(vehicle.rotors) + 1)
     low, high = (round(unit * rotor_speed(vehicle, command)) for command in (0.0, 1.0))
     return {
         **{f"SIM_GZ_EC_MIN{number}": low for number in numbers},
@@ -132,12 +130,12 @@ def px4_draft(vehicle: VehicleFile, provenance: str, simulator: Simulator, *_: o
         lambda path, _: differences(wanted, read_parameters(path)),
         gates=(
             Gate("PX4 accepts every parameter", outside_range(wanted)),
-            Gate("the simulator has such rotors", _other_rotors(vehicle, simulator)),
+            Gate("the simulator has such rotors", _rotor_faults(vehicle, simulator)),
         ),
     )
 
 
-def _other_rotors(vehicle: VehicleFile, simulator: Simulator) -> tuple[str, ...]:
+def _rotor_faults(vehicle: VehicleFile, simulator: Simulator) -> tuple[str, ...]:
     """Return how the rotors of the SIH, a symmetric quad X or a hexacopter X, are others."""
     if simulator is not SIH:
         return ()
@@ -146,7 +144,7 @@ def _other_rotors(vehicle: VehicleFile, simulator: Simulator) -> tuple[str, ...]
     clauses = []
     for axis, arm in enumerate(("SIH_L_PITCH", "SIH_L_ROLL")):
         arms = [abs(rotor.position[axis]) for rotor in vehicle.rotors]
-        if max(arms) - min(arms) > PLACES_AGREE:
+        if max(arms) - min(arms) > PLACE_TOLERANCE_M:
             clauses.append(
                 f"rotors sit {min(arms):g} to {max(arms):g} m off along {'xy'[axis]}, and {arm} "
                 "is one number"
@@ -155,7 +153,7 @@ def _other_rotors(vehicle: VehicleFile, simulator: Simulator) -> tuple[str, ...]
 
 
 def _notes(vehicle: VehicleFile, flown: VehicleFile, simulator: Simulator) -> tuple[str, ...]:
-    """Return what a reader of the parameters should know."""
+    """Return remarks for a reader of the parameters."""
     notes = []
     hover = hover_command(vehicle)
     if simulator is not SIH:
@@ -163,11 +161,11 @@ def _notes(vehicle: VehicleFile, flown: VehicleFile, simulator: Simulator) -> tu
         notes.append(
             f"CA_ROTOR*_CT is thrust in N at full command (idle {idle:.0f} rad/s: not CT·u² below)"
         )
-        if gz_unit(flown) < 1:
+        if gz_speed_unit(flown) < 1:
             notes.append(
                 f"rotors turn at up to {rotor_speed(flown, 1.0):.0f} rad/s and PX4 lets gz-sim be "
-                f"told of {FASTEST_GZ:.0f} at most: speeds are scaled by {gz_unit(flown):.6g}, as "
-                "the gz-sim export scales its model"
+                f"told of {MAX_GZ_SPEED:.0f} at most: speeds are scaled by "
+                f"{gz_speed_unit(flown):.6g}, as the gz-sim export scales its model"
             )
     there = hover_command(flown)
     if hover is not None and there is not None and abs(hover - there) > 0.005:
@@ -188,7 +186,7 @@ RANGES = {
     r"SIH_(MASS|IXX|IYY|IZZ|T_MAX|Q_MAX|L_ROLL|L_PITCH|KDV|KDW)": (0.0, math.inf),
     r"SIM_GZ_EC_(MIN|MAX)\d+": (0, 1000),
 }
-"""What PX4 accepts of the parameters that are written, by name.
+"""Parameter -> the range that PX4 accepts.
 
 Source: module.yaml of control_allocator, mc_pos_control, simulator_sih and gz_bridge, PX4 1.16.
 """

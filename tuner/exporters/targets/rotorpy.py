@@ -1,4 +1,4 @@
-"""RotorPy's parameters: a Python module with ``quad_params``, as its vehicles have."""
+"""RotorPy's parameters: a Python module with ``quad_params``."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.core.yaml_document import commented
-from tuner.exporters.flier import flier
+from tuner.exporters.external_simulator import flier_of
 from tuner.exporters.simulators import ROTORPY, rotor_speed
-from tuner.exporters.target import Draft, Target, assigned, differences, flattened
+from tuner.exporters.target import Draft, Target, differences, flatten, module_assignments
 from tuner.vehicle import VehicleFile
 
 
 def quad_params(vehicle: VehicleFile) -> dict[str, Any]:
-    """Return RotorPy's parameters of a vehicle as it flies it, its arrays as lists.
+    """Return RotorPy's parameters of a vehicle by its laws, arrays as lists.
 
     Its commands are rotor speeds; a command 0..1 asks for ``input_scaling``·u +
     ``zero_position_armed`` of them.
@@ -60,13 +60,15 @@ def rotorpy_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
         text,
         flown,
         (),
-        lambda path, _: differences(flattened(params), flattened(assigned(path).get("_P", {}))),
+        lambda path, _: differences(
+            flatten(params), flatten(module_assignments(path).get("_P", {}))
+        ),
         flier=_flier(params),
     )
 
 
 def _flier(params: dict[str, Any]) -> Callable[..., Any] | None:
-    """Return what flies parameters in RotorPy; None where that is not installed."""
+    """Return the flier of parameters in RotorPy; None if that is not installed."""
     try:
         from rotorpy.vehicles.multirotor import Multirotor  # noqa: PLC0415
     except ImportError:
@@ -79,7 +81,7 @@ def _flier(params: dict[str, Any]) -> Callable[..., Any] | None:
     }
 
     class Flying:
-        """As of `tuner.exporters.flier.Body`."""
+        """As of `tuner.exporters.external_simulator.ExternalBody`."""
 
         def __init__(self, step: float) -> None:
             self.vehicle, self.period = Multirotor(arrays), step
@@ -99,7 +101,7 @@ def _flier(params: dict[str, Any]) -> Callable[..., Any] | None:
         def rotor_speed(self) -> Array:
             return self.state["rotor_speeds"]
 
-    return flier(Flying)
+    return flier_of(Flying)
 
 
 TARGET = Target("rotorpy", "_params.py", rotorpy_draft, ROTORPY)

@@ -1,4 +1,4 @@
-"""SDF of Gazebo classic, or of gz-sim: a model that exists patched, or the tags alone."""
+"""SDF of Gazebo classic or gz-sim: a patched model, or the tags alone."""
 
 from __future__ import annotations
 
@@ -9,8 +9,14 @@ from jinja2 import Environment, StrictUndefined
 from tuner.exporters.sdf import tags
 from tuner.exporters.sdf.patch import sdf_draft, simulator_of
 from tuner.exporters.sdf.spans import parse
-from tuner.exporters.sdf.tags import values_in
-from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM, Simulator, gz_unit, with_speeds_in
+from tuner.exporters.sdf.tags import read_values
+from tuner.exporters.simulators import (
+    GAZEBO_CLASSIC,
+    GZ_SIM,
+    Simulator,
+    gz_speed_unit,
+    with_speed_unit,
+)
 from tuner.exporters.target import Draft, Target, differences, read_file, xml_comment
 from tuner.vehicle import VehicleFile
 
@@ -29,17 +35,19 @@ def sdf_or_snippet(
 
     def held_by(text: str, path: Path) -> dict[str, float]:
         model = f"<model><link name='base_link'>{text}</link></model>"
-        return values_in(parse(model, path), vehicle)
+        return read_values(parse(model, path), vehicle)
 
-    notes = tags.lost_in(vehicle)
+    notes = tags.plugin_deviations(vehicle)
     vehicle = simulator.flown(vehicle)
-    unit = gz_unit(vehicle) if simulator is GZ_SIM else 1.0
-    vehicle = with_speeds_in(vehicle, unit)
+    unit = gz_speed_unit(vehicle) if simulator is GZ_SIM else 1.0
+    vehicle = with_speed_unit(vehicle, unit)
     wanted = tags.carried_values(vehicle, channels=simulator is not GZ_SIM)
     text = _text(vehicle, simulator, provenance)
     return Draft(
         text,
-        with_speeds_in(tags.as_flown(vehicle, wanted | held_by(text, TEMPLATE)), 1.0 / unit),
+        with_speed_unit(
+            tags.with_model_values(vehicle, wanted | held_by(text, TEMPLATE)), 1.0 / unit
+        ),
         notes,
         lambda path, _: differences(wanted, held_by(read_file(path), path)),
     )
@@ -54,11 +62,11 @@ def _text(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> str:
         tags.motor_constants(vehicle),
         tags.center_of_mass(vehicle),
     )
-    motor = {tag: tags.as_text(value) for tag, value in tags.values(vehicle, "motor").items()}
+    motor = {tag: tags.as_text(value) for tag, value in tags.tag_values(vehicle, "motor").items()}
     motors = [
         motor
         if uneven is None
-        else motor | {tags.MOTOR_CONSTANT: tags.as_text(uneven[tags.of_rotor(index)])}
+        else motor | {tags.MOTOR_CONSTANT: tags.as_text(uneven[tags.rotor_constant_name(index)])}
         for index in range(len(vehicle.rotors))
     ]
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
@@ -71,7 +79,7 @@ def _text(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> str:
         center_of_mass=None if centre is None else " ".join(map(tags.as_text, centre)),
         rotors=list(zip(vehicle.rotors, motors, strict=True)),
         channel={
-            tag: tags.as_text(value) for tag, value in tags.values(vehicle, "channel").items()
+            tag: tags.as_text(value) for tag, value in tags.tag_values(vehicle, "channel").items()
         },
     )
 

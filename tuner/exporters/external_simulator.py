@@ -1,7 +1,7 @@
-"""A vehicle flown in a simulator that is not this project's, by this project's controllers.
+"""Fly a vehicle in an external simulator with this project's controllers.
 
 Position control, rate control, mixer, latencies and the recorded reference are those of
-`sim_jax.plant`; what a command does to the body is the other simulator's own.
+`sim_jax.plant`; the external simulator has rotors and rigid body.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from tuner.objective.simulation import Flown, beginning_of, recorded_of
 from tuner.vehicle.model import Model
 
 
-class Body(Protocol):
-    """One vehicle in another simulator.
+class ExternalBody(Protocol):
+    """One vehicle in an external simulator.
 
     Its state is position, velocity (m and m/s, world), attitude (w, x, y, z; body to world) and
     body rate (rad/s, body), 13 numbers.
@@ -42,19 +42,19 @@ class Body(Protocol):
         """Set the state (13,) and the rotor speeds in the vehicle file's rad/s."""
 
     def step(self, asked: Array) -> Array:
-        """Advance by a physics step in which so many rad/s are asked of the rotors; the state."""
+        """Advance by a physics step with commanded rotor speeds in rad/s; return the state."""
 
     def rotor_speed(self) -> Array:
         """Return the rotor speeds in the vehicle file's rad/s."""
 
 
-def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
-    """Return what flies segments as `tuner.objective.simulation.fly` does, in another simulator.
+def flier_of(make: Callable[[float], ExternalBody]) -> Callable[..., Flown]:
+    """Return a function like `tuner.objective.simulation.fly` for an external simulator.
 
     Parameters
     ----------
     make
-        The step in s -> a vehicle at rest.
+        Step in s -> a vehicle.
     """
 
     def fly(
@@ -95,7 +95,7 @@ def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
                 turning[:, number] = bodies[number].rotor_speed()
             return moving, turning
 
-        plant = _Elsewhere(**vars(own), turn=turn)
+        plant = _ExternalPlant(**vars(own), advance=turn)
 
         def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
             after, row = plant.sample(state, number)
@@ -108,21 +108,21 @@ def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
     return fly
 
 
-class _Elsewhere(Plant):
-    """A plant whose physics is another simulator's."""
+class _ExternalPlant(Plant):
+    """A plant whose physics are an external simulator's."""
 
-    turn: Callable[..., tuple[Array, Array]] = eqx.field(static=True, kw_only=True)
-    """Asked rotor speeds (rotors, F), and which segments have not crashed (F,) -> states (13, F)
-    and rotor speeds (rotors, F) a step later."""
+    advance: Callable[..., tuple[Array, Array]] = eqx.field(static=True, kw_only=True)
+    """Commanded rotor speeds (rotors, F), and segments without crash (F,) -> states (13, F) and
+    rotor speeds (rotors, F) a step later."""
 
     def physics(self, state: State, step: Any) -> State:
-        """Return the state after one step of the other simulator."""
+        """Return the state after one step of the external simulator."""
         held = [jnp.stack(tuple(speeds)) for speeds in self._asked(state, step)]
         share = self.lag.share if isinstance(self.lag, SwitchedLag) else 1.0
         asked: Any = share * held[0] + (1.0 - share) * held[-1]
         dtype, batch = asked.dtype, asked.shape[1:]
         shapes = jax.ShapeDtypeStruct((13, *batch), dtype), jax.ShapeDtypeStruct(asked.shape, dtype)
-        rows, speeds = io_callback(self.turn, shapes, asked, jnp.isinf(state.crash_time))
+        rows, speeds = io_callback(self.advance, shapes, asked, jnp.isinf(state.crash_time))
         motion = Motion(
             Vec3(*rows[0:3]), Vec3(*rows[3:6]), Quaternion(*rows[6:10]), Vec3(*rows[10:13])
         )
