@@ -1,9 +1,9 @@
-"""What to log next time: signals besides, and inputs oftener.
+"""Proposals of signals to log, and of inputs to log faster.
 
 A signal is simulated at the fitted point and differentiated by all fitted coefficients; its
 information is added to theirs (Goodwin and Payne, "Dynamic System Identification: Experiment Design
-and Data Analysis", 1977). It is taken to be met as the recorded ones are: what the model lacks
-shows in all.
+and Data Analysis", 1977). Its residuals are assumed to exceed noise as much as those of recorded
+signals.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sim_jax.state import hover_speed
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array, errors_of
-from tuner.design.proposals import LogProposal
+from tuner.design.proposals import MAX_WORTHWHILE_SHARE, LogProposal
 from tuner.design.ranking import seconds_recorded
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_at
@@ -34,29 +34,26 @@ from tuner.search.progress import Fitted, plain_criterion
 from tuner.vehicle import COEFFICIENTS, VehicleFile
 from tuner.vehicle.model import vehicle_of
 
-RATE = 100.0
-"""Hz at which a signal would be logged besides."""
-TACHOMETER = 0.01
+LOG_RATE_HZ = 100.0
+"""The rate of a proposed signal."""
+TACHOMETER_NOISE = 0.01
 """Noise of a measured rotor speed, as a share of that in hover."""
 NOISE: Mapping[str, float] = {"command": 0.005, "body_rate": 0.02}
 """Noise of other signals that could be logged, in their units."""
 
-RANDOM, SMOOTH = 2.0, 16.0
-"""By what the variance that is lost between samples grows with twice the time between them: of a
-random walk, and of what is smooth. Where it grows by less, coarser samples miss all there is, and
-the least that finer ones can win back is counted."""
-LEAST = 0.25
-"""Share of the residuals' variance below which no rate is believed to take it."""
-WORTH_LOGGING = 0.9
-"""An interval that a signal leaves wider than this share of what it is is not narrowed."""
-FED_IN = 250.0
-"""Hz at which commands of any multirotor can be fed in: a rotor's lag is some samples long."""
+RANDOM_WALK_GROWTH, SMOOTH_GROWTH = 2.0, 16.0
+"""Growth of the variance lost between samples at twice their interval: of a random walk, and of a
+smooth signal. With less growth coarse samples miss everything, and the least gain is assumed."""
+MIN_VARIANCE_SHARE = 0.25
+"""No rate is assumed to reduce the residuals' variance to a smaller share."""
+INPUT_RATE_HZ = 250.0
+"""Commands at this rate can be inputs: a rotor's lag is some samples long."""
 
 
 def signals_to_add(
     fitted: Fitted, known: Array, inlets: Sequence[InletName], vehicle: VehicleFile
 ) -> list[LogProposal]:
-    """Return what signals that are not compared yet would tell.
+    """Return proposals of signals that are not compared yet.
 
     Parameters
     ----------
@@ -66,7 +63,7 @@ def signals_to_add(
     objective = fitted.objective
     silent = set.intersection(*(set(INLETS[inlet].silences) for inlet in inlets))
     fed = {name for inlet in inlets for name in INLETS[inlet].needs}
-    noise = {"rotor_speed": TACHOMETER * float(hover_speed(vehicle_of(vehicle))), **NOISE}
+    noise = {"rotor_speed": TACHOMETER_NOISE * float(hover_speed(vehicle_of(vehicle))), **NOISE}
     missing = [n for n in noise if n not in objective.segments.measured and n not in silent | fed]
     before, proposals = errors_of(known), []
     for signal in missing:
@@ -74,7 +71,11 @@ def signals_to_add(
         shrinks = dict(zip(objective.space.names, shares.tolist(), strict=True))
         proposals.append(
             LogProposal(
-                signal=signal, change="added", rate=RATE, noise=noise[signal], shrinks=shrinks
+                signal=signal,
+                change="added",
+                rate=LOG_RATE_HZ,
+                noise=noise[signal],
+                shrinks=shrinks,
             )
         )
     return proposals
@@ -83,8 +84,7 @@ def signals_to_add(
 def share_at_twice_the_rate(losses: Sequence[float]) -> float:
     """Return the share of its width that an interval keeps with an input logged twice as fast.
 
-    What lies between samples is lost with a variance that goes with some power of the time between
-    them (Richardson's extrapolation).
+    The variance lost between samples is a power of their interval (Richardson's extrapolation).
 
     Parameters
     ----------
@@ -94,37 +94,39 @@ def share_at_twice_the_rate(losses: Sequence[float]) -> float:
     lost, more = np.diff(losses)
     if lost <= 0.0:
         return 1.0
-    growth = more / lost if RANDOM <= more / lost <= SMOOTH else SMOOTH
-    return float(np.sqrt(max(1.0 - lost / growth / losses[0], LEAST)))
+    growth = more / lost if RANDOM_WALK_GROWTH <= more / lost <= SMOOTH_GROWTH else SMOOTH_GROWTH
+    return float(np.sqrt(max(1.0 - lost / growth / losses[0], MIN_VARIANCE_SHARE)))
 
 
-def beyond_noise(criterion: Criterion) -> float:
-    """Return by how much residuals of the recorded channels exceed their noise, at the median."""
+def residual_to_noise(criterion: Criterion) -> float:
+    """Return the median ratio of residuals to noise over the recorded channels."""
     return float(np.median(np.concatenate([np.asarray(s) for s in criterion.scale.values()])))
 
 
 def _information(fitted: Fitted, signal: str, noise: float) -> Array:
-    """Return the information (K, K) of a signal at the fitted point, were it logged."""
+    """Return the information (K, K) of a signal at the fitted point, if it were logged."""
     objective, criterion = fitted.objective, fitted.criterion
     ends = seconds_recorded(objective)
     seconds = objective.samples / float(objective.schedule.log_rate)
-    time = np.repeat(np.arange(1, max(int(seconds * RATE), 2))[:, None] / RATE, len(ends), axis=1)
+    time = np.repeat(
+        np.arange(1, max(int(seconds * LOG_RATE_HZ), 2))[:, None] / LOG_RATE_HZ, len(ends), axis=1
+    )
     width = 3 if signal == "body_rate" else 4
     weight = np.repeat((time <= ends)[:, None] / noise, width, axis=1)
     measured = Measured(
         time=np.asarray(time), values=np.zeros(weight.shape), weight=np.asarray(weight)
     )
     alone: Objective = eqx.tree_at(lambda o: o.segments.measured, objective, {signal: measured})
-    scale = {signal: np.full(objective.flights, beyond_noise(criterion))}
+    scale = {signal: np.full(objective.flights, residual_to_noise(criterion))}
     plain = replace(criterion, scale=scale, huber=np.inf)
     information = information_at(alone, fitted.point, plain)
     return np.asarray(information.blocks.sum(axis=(0, 1, 2)))
 
 
-def what_to_log(
+def propose_logs(
     job: Job, fitted: Fitted, known: NDArray[np.float64], vehicle: VehicleFile
 ) -> tuple[LogProposal, ...]:
-    """Return what would narrow some interval, the most helpful signal first.
+    """Return proposals that would narrow some interval, the most helpful first.
 
     Parameters
     ----------
@@ -132,18 +134,19 @@ def what_to_log(
         (K, K) information about the fitted coefficients, priors included.
     """
     found = signals_to_add(fitted, known, job.inlets, vehicle)
-    for otherwise in (_faster, _fed):
-        with suppress(InputError):  # of so few samples no flight can be simulated
+    for otherwise in (_faster_inputs, _fed_inputs):
+        with suppress(InputError):  # too few samples for a simulation
             found += otherwise(job, fitted)
-    useful = [proposal for proposal in found if min(proposal.shrinks.values()) < WORTH_LOGGING]
+    useful = [
+        proposal for proposal in found if min(proposal.shrinks.values()) < MAX_WORTHWHILE_SHARE
+    ]
     return tuple(sorted(useful, key=lambda proposal: min(proposal.shrinks.values())))
 
 
-def _faster(job: Job, fitted: Fitted) -> list[LogProposal]:
-    """Return what an input at twice its rate would be worth, where all flights enter by the same.
+def _faster_inputs(job: Job, fitted: Fitted) -> list[LogProposal]:
+    """Return the proposal of the input at twice its rate, if all flights have the same inlet.
 
-    It is seen from leaving out every other sample, and three of four. All intervals go with the
-    residuals.
+    Its gain is extrapolated from fits with every second and every fourth sample.
     """
     segments, inlets = fitted.objective.segments, set(job.inlets)
     if len(inlets) > 1 or not segments.windowed or segments.freedom is not None:
@@ -151,7 +154,7 @@ def _faster(job: Job, fitted: Fitted) -> list[LogProposal]:
     signal = INLETS[inlets.pop()].needs[0]
     losses = [_loss(fitted, fitted.objective)]
     for every in (2, 4):
-        rows = [_thinned(r, signal, every) for r in job.recordings if not r.holdout]
+        rows = [_thin(r, signal, every) for r in job.recordings if not r.holdout]
         coarser = job_of(job.settings, rows).objective.segments
         if coarser.count != segments.count:
             return []
@@ -168,18 +171,18 @@ def _loss(fitted: Fitted, objective: Objective) -> float:
     return float(np.sum(np.asarray(sums.loss)))
 
 
-def _thinned(recording: Recording, signal: str, every: int) -> Recording:
-    """Return a recording with every so manyth sample of a signal alone."""
+def _thin(recording: Recording, signal: str, every: int) -> Recording:
+    """Return a recording with one of `every` samples of a signal."""
     flight = recording.flight
     series = flight.series[signal]
     some = Series(series.time[::every], series.values[::every])
     return replace(recording, flight=replace(flight, series={**flight.series, signal: some}))
 
 
-def _fed(job: Job, fitted: Fitted) -> list[LogProposal]:
-    """Return what commands would tell of what turns the vehicle, where its attitude is followed.
+def _fed_inputs(job: Job, fitted: Fitted) -> list[LogProposal]:
+    """Return the proposal of commands as input, instead of the attitude.
 
-    Those that were logged stand for those that were not: their torques are as large.
+    The logged commands represent faster ones, of similar torques.
     """
     commands = INLETS["actuator"]
     followed = set(job.inlets) == {"attitude"}
@@ -194,10 +197,12 @@ def _fed(job: Job, fitted: Fitted) -> list[LogProposal]:
     best = job.space.numbers(fitted.point.coefficients)
     vector = fed.space.vector_of(values | {name: best[name] for name in best if name in values})
     objective = fed.objective
-    beyond = beyond_noise(fitted.criterion)
+    beyond = residual_to_noise(fitted.criterion)
     scales = {name: np.full(objective.flights, beyond) for name in objective.segments.measured}
     criterion = plain_criterion(objective, objective.samples, scales)
     information = information_at(objective, objective.start(vector), criterion)
     shares = errors_of(information.total) / errors_of(information.prior)
     shrinks = {name: float(shares[fed.space.names.index(name)]) for name in names}
-    return [LogProposal(signal="command", change="fed", rate=FED_IN, shrinks=shrinks)] * bool(names)
+    return [
+        LogProposal(signal="command", change="fed", rate=INPUT_RATE_HZ, shrinks=shrinks)
+    ] * bool(names)

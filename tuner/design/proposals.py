@@ -1,4 +1,4 @@
-"""What to fly and what to log next, as ``next_flight.json`` holds it and in sentences."""
+"""Proposals of flights and signals: ``next_flight.json``, and sentences."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from tuner.core.phrases import listed
 from tuner.core.yaml_section import refuse
 
 NEXT_FLIGHT_TABLE = "next_flight.csv"
-WORTH_FLYING = 0.9
-"""An interval that a flight leaves wider than this share of what it was is not narrowed."""
-HALVED = (0.45, 0.55)
-"""Shares of an interval that are called half of it."""
-MOST = 4
-"""Coefficients that a sentence names, those that gain most."""
+MAX_WORTHWHILE_SHARE = 0.9
+"""A flight or signal that leaves a larger share of an interval does not narrow it."""
+HALVED_RANGE = (0.45, 0.55)
+"""Shares of an interval that are called a half."""
+MAX_EFFECTS = 4
+"""A sentence names so many coefficients, those that gain most."""
 
 
 class LogProposal(Part):
-    """A signal that could be logged, and by how much it would narrow the intervals.
+    """A signal to log, and its effect on the intervals.
 
     Attributes
     ----------
@@ -37,10 +37,10 @@ class LogProposal(Part):
     rate
         Hz at which it would be logged.
     noise
-        Standard deviation that it is taken to have, in its unit; None where it is logged already.
+        Its assumed standard deviation in its unit; None if it is logged already.
     shrinks
-        Coefficient -> width of its interval with it over that without; of one that is not fitted
-        so far, that without is its prior's.
+        Coefficient -> width of its interval with the signal over that without, which is the
+        prior's if the coefficient is not fitted.
     """
 
     signal: str
@@ -54,12 +54,12 @@ Share = Annotated[float, Interval(ge=0, le=1e6)]
 
 
 class Proposal(Part):
-    """A flight that could be flown, and by how much it would narrow the intervals.
+    """A flight to fly, and its effect on the intervals.
 
     Attributes
     ----------
     name
-        Its shape, size and speed in words.
+        Shape, size and speed in words.
     trajectory
         The options of ``tune simulate`` for it.
     shrinks
@@ -88,10 +88,10 @@ class Proposals(ResultFile):
     arena
         m along x, y and up.
     seconds
-        How long each flight would last.
+        Duration of each flight.
     targets
-        The fitted coefficients that are not well known yet; if there are none, as ``all_known``
-        says, the fixed ones that would not be, were they fitted; else all fitted ones.
+        The fitted coefficients that are not well known yet. If ``all_known``, the fixed ones that
+        would not be well known if fitted, or else all fitted ones.
     fixed_targets
         Those of the targets that were not fitted.
     flights
@@ -142,31 +142,31 @@ def proposals_in_words(proposals: Proposals) -> list[str]:
         label = f"{target} (fixed so far)" if target in proposals.fixed_targets else target
         best = min(proposals.flights, key=lambda flight: flight.shrinks[target])
         share = best.shrinks[target]
-        if share > WORTH_FLYING:
+        if share > MAX_WORTHWHILE_SHARE:
             not_narrowed.append(label)
         else:
             gains.setdefault(best.name, []).append((share, label))
     sentences = []
     for flight, shares in sorted(gains.items(), key=lambda item: min(item[1])):
-        effects = listed([effect(share, label) for share, label in sorted(shares)])
+        effects = listed([effect_in_words(share, label) for share, label in sorted(shares)])
         sentences.append(f"{flight[0].upper()}{flight[1:]} would {effects}.")
     if not_narrowed:
         sentences.append(
             f"No single flight in this arena would narrow the interval of {listed(not_narrowed)} "
-            f"by more than {1 - WORTH_FLYING:.0%}."
+            f"by more than {1 - MAX_WORTHWHILE_SHARE:.0%}."
         )
     return sentences
 
 
-def effect(share: float, label: str) -> str:
-    """Return what would become of an interval that keeps a share of its width; of all by default.
+def effect_in_words(share: float, label: str) -> str:
+    """Return the effect on an interval that keeps a share of its width, in words.
 
-    ``label`` names the coefficient.
+    ``label`` names the coefficient; empty stands for all.
     """
     of = f"the interval of {label}" if label else "every interval"
-    if HALVED[0] <= share <= HALVED[1]:
+    if HALVED_RANGE[0] <= share <= HALVED_RANGE[1]:
         return f"halve {of}"
-    if share < HALVED[0]:
+    if share < HALVED_RANGE[0]:
         return f"narrow {of} to {share:.0%} of what it is"
     return f"narrow {of} by {1 - share:.0%}"
 
@@ -182,15 +182,15 @@ def _sentence(proposal: LogProposal) -> str:
         share = min(proposal.shrinks.values())
         return (
             f"Log the {signal} at {rate}: as far as the simulation misses what lies between its "
-            f"samples, that would {effect(share, '')}."
+            f"samples, that would {effect_in_words(share, '')}."
         )
     fed = proposal.change == "fed"
     gains = sorted(
         (share, f"{name} (not fitted so far)" if fed else name)
         for name, share in proposal.shrinks.items()
-        if share < WORTH_FLYING
+        if share < MAX_WORTHWHILE_SHARE
     )
-    effects = listed([effect(share, label) for share, label in gains[:MOST]])
+    effects = listed([effect_in_words(share, label) for share, label in gains[:MAX_EFFECTS]])
     if fed:
         return (
             f"Log the {signal} at {rate}, so that it can be fed in and the attitude need not be: "

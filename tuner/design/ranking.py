@@ -1,10 +1,10 @@
-"""Which further flight would narrow the intervals of what is not known well yet the most.
+"""Rank candidate flights by their effect on the intervals of coefficients.
 
-Every candidate inside an arena is simulated with the fitted coefficients, differentiated by all of
-them, and weighed with the noise that the recorded flights had in each channel; its information is
-added to theirs. The measures are those of experiment design: the D-optimal flight shrinks the
-volume of the confidence ellipsoid the most, the A-optimal one the sum of squared relative errors
-(Goodwin and Payne, "Dynamic System Identification: Experiment Design and Data Analysis", 1977).
+Every candidate inside an arena is simulated with the fitted coefficients and differentiated by
+them, with the noise of the recorded flights in each channel; its information is added to theirs.
+The D-optimal flight shrinks the volume of the confidence ellipsoid most, the A-optimal one the sum
+of squared relative errors (Goodwin and Payne, "Dynamic System Identification: Experiment Design and
+Data Analysis", 1977).
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.verdict import Verdict
 from tuner.vehicle import COEFFICIENTS
 
-CLEARANCE = 0.5
-"""Distance that a reference keeps from the walls, from which a vehicle may stray, m."""
-LEVEL = 1.0
-"""Height above the ground at which the publisher's shapes are flown, m."""
+CLEARANCE_M = 0.5
+"""Distance of a reference from the walls."""
+FLIGHT_HEIGHT_M = 1.0
+"""Height of the publisher's shapes above the ground."""
 SPEEDS = (1.5, 3.0, 4.5, 6.0)
 """Peak speeds of the reference, m/s."""
 YAW_RATES = (1.0, 2.0, 4.0, 6.0)
 """Yaw rates of the spins, rad/s."""
-SMALLEST = 0.5
-"""Radius of a shape below which it is not worth flying, m."""
-HARDEST = 9.0
-"""Acceleration of the reference beyond which it is not proposed, some 45° of tilt; m/s²."""
-SAMPLE_RATE = 100.0
-"""Highest rate at which candidates are compared, Hz; their weights stand for more samples."""
+MIN_RADIUS_M = 0.5
+"""A smaller shape is not proposed."""
+MAX_ACCELERATION = 9.0
+"""m/s². A reference with more, some 45° of tilt, is not proposed."""
+MAX_SAMPLE_RATE_HZ = 100.0
+"""Candidates are compared at this rate; their weights represent more samples."""
 
 
 @dataclass(frozen=True)
@@ -75,38 +75,37 @@ class Arena:
         if len(numbers) != 3 or not np.isfinite(numbers).all():
             raise InputError("--arena", "needs three lengths in m", "write it as 8,6,3")
         arena = Arena(*numbers)
-        smallest = 2 * CLEARANCE + 2 * SMALLEST
-        if min(arena.x, arena.y) < smallest or arena.z < LEVEL + CLEARANCE:
+        smallest = 2 * CLEARANCE_M + 2 * MIN_RADIUS_M
+        if min(arena.x, arena.y) < smallest or arena.z < FLIGHT_HEIGHT_M + CLEARANCE_M:
             raise InputError(
                 "--arena",
                 f"{arena.x:g} by {arena.y:g} by {arena.z:g} m is too small to fly in",
-                f"give at least {smallest:g},{smallest:g},{LEVEL + CLEARANCE:g}",
+                f"give at least {smallest:g},{smallest:g},{FLIGHT_HEIGHT_M + CLEARANCE_M:g}",
             )
         return arena
 
 
 def candidates(arena: Arena) -> dict[str, TrajectorySettings]:
-    """Return every shape that moves in two sizes and several speeds, and the yaw spins.
-
-    Shape, size and speed in words -> what would be flown.
-    """
+    """Return name -> moving shapes in two sizes and several speeds, and yaw spins."""
     flights: dict[str, TrajectorySettings] = {}
     for shape in shapes().values():
-        flights |= dict(_moving(shape, arena))
+        flights |= dict(_moving_candidates(shape, arena))
         for rate in YAW_RATES if shape.spins else ():
             settings = TrajectorySettings(name=shape.name, yaw_rate=rate)
             flights[f"{_noun(shape)} at {rate:g} rad/s"] = settings
     return flights
 
 
-def _moving(shape: type[Shape], arena: Arena) -> Iterator[tuple[str, TrajectorySettings]]:
+def _moving_candidates(
+    shape: type[Shape], arena: Arena
+) -> Iterator[tuple[str, TrajectorySettings]]:
     walls = zip((arena.x, arena.y), shape.extent, strict=True)
-    widest = [(wall / 2 - CLEARANCE) / extent for wall, extent in walls if extent]
+    widest = [(wall / 2 - CLEARANCE_M) / extent for wall, extent in walls if extent]
     for share in (1.0, 0.5) if widest and shape.peak_speed else ():
-        radius = max(min(widest) * share, SMALLEST)
+        radius = max(min(widest) * share, MIN_RADIUS_M)
         settings = TrajectorySettings(name=shape.name, radius=round(radius, 2))
         for speed in SPEEDS:
-            if shape.peak_acceleration * speed**2 / radius <= HARDEST:
+            if shape.peak_acceleration * speed**2 / radius <= MAX_ACCELERATION:
                 name = f"{_noun(shape)} of {settings.radius:g} m radius at {speed:g} m/s"
                 yield name, at_speed(settings, speed)
 
@@ -116,17 +115,14 @@ def _noun(shape: type[Shape]) -> str:
 
 
 def candidate_problem(
-    objective: Objective,
-    flights: Sequence[TrajectorySettings],
-    *,
-    seconds: float,
+    objective: Objective, flights: Sequence[TrajectorySettings], *, seconds: float
 ) -> Objective:
-    """Return the problem with candidates in the place of recordings, whose values are zero.
+    """Return the problem with candidates instead of recordings; their measured values are zero.
 
     Parameters
     ----------
     objective
-        The problem of the recorded flights, which are whole.
+        The problem of the recorded, whole, flights.
     """
     recorded, schedule = objective.segments, objective.schedule
     references = [
@@ -137,13 +133,13 @@ def candidate_problem(
     spins = np.array([shapes()[flight.name].spins for flight in flights])
     count = len(flights)
     segments = Segments(
-        inlet=_laid(references, recorded),
+        inlet=_reference_inlet(references, recorded),
         start=jax.tree.map(
             lambda leaf: np.broadcast_to(np.asarray(leaf, float), (count,)),
             eqx.filter_jit(hover)(objective.model.vehicle, starts),
         ),
         measured={
-            name: _sampled(
+            name: _candidate_channel(
                 measured,
                 silent=spins & (name not in SPIN_CHANNELS),
                 seconds=seconds,
@@ -153,20 +149,17 @@ def candidate_problem(
         },
         flight=np.arange(count),
         resting=None if recorded.resting is None else np.ones(count, bool),
-        log_voltage=_filled(recorded.log_voltage, count, np.nan),
-        freedom=_filled(recorded.freedom, count, 0.0),
+        log_voltage=_filled_like(recorded.log_voltage, count, np.nan),
+        freedom=_filled_like(recorded.freedom, count, 0.0),
         freed=recorded.freed,
     )
     return replace(
-        objective,
-        segments=segments,
-        samples=round(seconds * schedule.log_rate),
-        multiplicity=None,
+        objective, segments=segments, samples=round(seconds * schedule.log_rate), multiplicity=None
     )
 
 
-def _laid(references: Sequence[Published], recorded: Segments) -> ReferenceInlet:
-    """Return the references side by side, the last points held."""
+def _reference_inlet(references: Sequence[Published], recorded: Segments) -> ReferenceInlet:
+    """Return the references as lanes of one inlet, with their last points held."""
     assert isinstance(recorded.inlet, ReferenceInlet)
     inlets = [reference.inlet for reference in references]
     length = max(len(reference.lap) - 1 for reference in references)  # none acts at the end
@@ -188,43 +181,41 @@ def _laid(references: Sequence[Published], recorded: Segments) -> ReferenceInlet
     )
 
 
-def _filled(recorded: Any, count: int, value: float) -> Array | None:
-    """Return rows (n, C) of one value where the recorded flights have rows (n, F)."""
+def _filled_like(recorded: Any, count: int, value: float) -> Array | None:
+    """Return rows (n, C) of one value if the recorded flights have rows (n, F); else None."""
     return None if recorded is None else np.full((*recorded.shape[:-1], count), value)
 
 
 def seconds_recorded(objective: Objective) -> Array:
-    """Return (F,) s that each segment was recorded for."""
+    """Return the recorded duration (F,) s of each segment."""
     ends = [np.asarray(m.time).max(axis=0) for m in objective.segments.measured.values()]
     return np.asarray(np.max(ends, axis=0))
 
 
-def _sampled(
-    measured: Measured,
-    *,
-    silent: NDArray[np.bool_],
-    seconds: float,
-    recorded: Array,
+def _candidate_channel(
+    measured: Measured, *, silent: NDArray[np.bool_], seconds: float, recorded: Array
 ) -> Measured:
-    """Return one channel of every candidate, as often and as precisely recorded as in the best.
+    """Return one channel of every candidate, with the best recorded rate and precision.
 
     Parameters
     ----------
     measured
         The channel of the recorded segments.
     silent
-        (C,) for which candidates it is not compared.
+        (C,) flags of candidates for which it is not compared.
     seconds, recorded
-        How long a candidate lasts, and (F,) how long each segment was recorded, in s.
+        Duration of a candidate, and (F,) of each recorded segment, in s.
     """
     weight = np.asarray(measured.weight)
-    rows = int(seconds * SAMPLE_RATE) - 1
+    rows = int(seconds * MAX_SAMPLE_RATE_HZ) - 1
     recorded_rate = (weight > 0).sum(axis=0) / np.maximum(recorded, 1e-9)
     equivalent = np.where(
-        weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(recorded_rate / SAMPLE_RATE), 0.0
+        weight.max(axis=0) > 0,
+        weight.max(axis=0) * np.sqrt(recorded_rate / MAX_SAMPLE_RATE_HZ),
+        0.0,
     )
     segments = len(silent)
-    time = np.repeat(np.arange(1, rows + 1)[:, None] / SAMPLE_RATE, segments, axis=1)
+    time = np.repeat(np.arange(1, rows + 1)[:, None] / MAX_SAMPLE_RATE_HZ, segments, axis=1)
     values = np.zeros((rows, np.asarray(measured.values).shape[1], segments))
     if values.shape[1] > weight.shape[1]:
         values[:, 0] = 1.0  # an attitude
@@ -234,18 +225,14 @@ def _sampled(
 
 
 def rank_next_flights(
-    examination: Examination,
-    criterion: Criterion,
-    *,
-    arena: Arena,
-    seconds: float,
+    examination: Examination, criterion: Criterion, *, arena: Arena, seconds: float
 ) -> Proposals:
-    """Rank the flights that could be flown next.
+    """Rank candidate flights.
 
     Parameters
     ----------
     criterion
-        Whose weights the recorded residuals have.
+        Of the fit, with the weights of the recorded residuals.
     """
     full_problem, found = examination.full_problem, candidates(arena)
     flights, at_once = [*found.values()], full_problem.objective.segments.count
@@ -268,7 +255,7 @@ def rank_next_flights(
             jacobian,
             offsets_fitted=np.repeat(kinds[:, None], len(some), axis=1),
         )
-        inside = _inside(objective, jacobian.residuals, arena)
+        inside = _stays_inside(objective, jacobian.residuals, arena)
         gains += list(information.blocks.sum(axis=(0, 2)))
         flown += list(~information.crashed & inside)
     now = examination.information.data + examination.information.prior / PRIOR_WIDENING**2
@@ -330,7 +317,7 @@ def _volume(now: Array, gain: Array, count: int) -> float:
     return float(np.exp(-0.5 * (after - before) / count))
 
 
-def _inside(
+def _stays_inside(
     objective: Objective, residuals: dict[str, jax.Array], arena: Arena
 ) -> NDArray[np.bool_]:
     """Return (C,) whether the simulated vehicle stays between the walls, if positions are known."""

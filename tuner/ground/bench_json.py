@@ -1,4 +1,4 @@
-"""Measurements combined by generalised least squares: as a prior, as ``bench.json``, in words."""
+"""Combine measurements by generalised least squares: a prior, ``bench.json``, and sentences."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ from tuner.vehicle.joint_prior import JointPrior
 
 CONFLICT_SE = 3.0
 """Standard errors apart beyond which two measurements of one number contradict each other."""
-UNKNOWN = 1e-11
+MIN_INFORMATION_SHARE = 1e-11
 """Share of the best-known direction's information below which a direction is not measured."""
-DISAGREE = 0.01
+MAX_DISAGREEING_P = 0.01
 """p-value below which the experiments are said to disagree."""
-SMALL = 1e-6
+MAX_UNMEASURED_SHARE = 1e-6
 """Share of a coefficient that may lie in unmeasured directions, for rounding."""
 
 
 @dataclass(frozen=True)
 class Conflict:
-    """An experiment that contradicts what all others say of the same number.
+    """An experiment that contradicts all others.
 
     Attributes
     ----------
     names
         The coefficients that its number depends on.
     measured, expected
-        Its number, in scaled coordinates, and what the others predict.
+        Its number, in scaled coordinates, and the others' prediction.
     deviation
         Their difference in standard errors.
     """
@@ -58,20 +58,20 @@ Numbers = Annotated[
 
 
 class Combination(Part):
-    """What all measurements together say.
+    """The combined estimate of all measurements.
 
     Attributes
     ----------
     names
-        The N coefficients that some measurement speaks of.
+        The N measured coefficients.
     scaled
         (N,) best scaled coordinates (logarithms, where the registry says so).
     information
         (N, N) inverse covariance, singular where a combination of coefficients was not measured.
     covariance
-        (N, N) in the directions that were measured, zero in the others.
+        (N, N) in measured directions, zero in others.
     chi_square, degrees_of_freedom, p_value
-        Of the hypothesis that all agree; a p-value of 1 where nothing was measured twice.
+        Of the hypothesis that all agree; a p-value of 1 if nothing was measured twice.
     conflicts
         Experiments that the others contradict, the worst first.
     """
@@ -90,15 +90,15 @@ class Combination(Part):
     @property
     def determined(self) -> NDArray[np.bool_]:
         """(N,) whether the measurements alone determine each coefficient."""
-        _, unmeasured = _inverse(self.information, self.names)
-        return np.asarray((unmeasured**2).sum(axis=1) < SMALL)
+        _, unmeasured = _measured_covariance(self.information, self.names)
+        return np.asarray((unmeasured**2).sum(axis=1) < MAX_UNMEASURED_SHARE)
 
 
 def combine(measurements: Sequence[Measurement], known: Mapping[str, float]) -> Combination:
     """Return the generalised least squares estimate (Gauss-Markov) of all coefficients.
 
-    Of what was not measured (a torque stand without a thrust stand) the estimate moves as little
-    from the vehicle file as it can, each coefficient in units of its prior's standard deviation.
+    In unmeasured directions (a torque stand without a thrust stand) the estimate stays as near as
+    possible to the vehicle file, in units of the priors' standard deviations.
 
     Parameters
     ----------
@@ -107,9 +107,9 @@ def combine(measurements: Sequence[Measurement], known: Mapping[str, float]) -> 
     """
     names = tuple(dict.fromkeys(n for measurement in measurements for n in measurement.names))
     start = np.array([known[name] for name in names])
-    information, pull = _normal_equations(measurements, names, start)
-    covariance, unmeasured = _inverse(information, names)
-    scaled = start + covariance @ pull
+    information, gradient = _normal_equations(measurements, names, start)
+    covariance, unmeasured = _measured_covariance(information, names)
+    scaled = start + covariance @ gradient
     numbers = sum(len(measurement.value) for measurement in measurements)
     freedom = numbers - (len(names) - unmeasured.shape[1])
     residuals = [(m, m.value - _design(m, names) @ scaled) for m in measurements]
@@ -126,14 +126,14 @@ def combine(measurements: Sequence[Measurement], known: Mapping[str, float]) -> 
     )
 
 
-def _inverse(information: Array, names: Sequence[str]) -> tuple[Array, Array]:
-    """Return the covariance of what was measured, and (N, U) the directions that were not.
+def _measured_covariance(information: Array, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the covariance in measured directions, and the unmeasured directions (N, U).
 
-    The directions are those of coordinates in units of the default priors' standard deviations.
+    Directions are in units of the default priors' standard deviations.
     """
     unit = np.array([COEFFICIENTS[name].prior_sd for name in names])
     values, vectors = symmetric_eigen(information * np.outer(unit, unit))
-    measured = values > UNKNOWN * values.max(initial=1e-300)
+    measured = values > MIN_INFORMATION_SHARE * values.max(initial=1e-300)
     inverse = (vectors[:, measured] / values[measured]) @ vectors[:, measured].T
     return inverse * np.outer(unit, unit), vectors[:, ~measured]
 
@@ -145,34 +145,34 @@ def _design(measurement: Measurement, names: Sequence[str]) -> Array:
 def _normal_equations(
     measurements: Sequence[Measurement], names: Sequence[str], start: Array
 ) -> tuple[Array, Array]:
-    information, pull = np.zeros((len(names), len(names))), np.zeros(len(names))
+    information, gradient = np.zeros((len(names), len(names))), np.zeros(len(names))
     for measurement in measurements:
         design = _design(measurement, names)
         weight = scaled_inverse(measurement.covariance)
         information += design.T @ weight @ design
-        pull += design.T @ weight @ (measurement.value - design @ start)
-    return information, pull
+        gradient += design.T @ weight @ (measurement.value - design @ start)
+    return information, gradient
 
 
 def _conflicts(
     measurements: Sequence[Measurement], names: Sequence[str], start: Array
 ) -> tuple[Conflict, ...]:
-    """Return the experiments that all others together contradict, each left out in turn."""
+    """Return conflicts of each experiment with all others."""
     conflicts = []
     for left_out in measurements:
         others = [m for m in measurements if m is not left_out]
         if not others:
             continue
-        information, pull = _normal_equations(others, names, start)
-        covariance, unmeasured = _inverse(information, names)
+        information, gradient = _normal_equations(others, names, start)
+        covariance, unmeasured = _measured_covariance(information, names)
         unit = np.array([COEFFICIENTS[name].prior_sd for name in names])
-        predicted = start + covariance @ pull
+        predicted = start + covariance @ gradient
         for row, value, variance in zip(
             _design(left_out, names), left_out.value, np.diag(left_out.covariance), strict=True
         ):
             reach = np.abs(unmeasured.T @ (row * unit)).max(initial=0.0)
-            if reach > SMALL * np.linalg.norm(row * unit):
-                continue  # the others say nothing of this number
+            if reach > MAX_UNMEASURED_SHARE * np.linalg.norm(row * unit):
+                continue  # the others do not measure this number
             expected = float(row @ predicted)
             error = float(np.sqrt(variance + row @ covariance @ row))
             deviation = (float(value) - expected) / error
@@ -196,7 +196,7 @@ class ExperimentRecord(Part):
 
 
 class BenchRecord(Combination, ResultFile):
-    """The content of ``bench.json``: what the experiments say together, and each in detail."""
+    """The content of ``bench.json``: the combined estimate, and each experiment."""
 
     FILE = "bench.json"
 
@@ -204,16 +204,18 @@ class BenchRecord(Combination, ResultFile):
 
 
 def bench_record(combination: Combination, measurements: Sequence[Measurement]) -> BenchRecord:
-    """Return what to write."""
+    """Return the content of ``bench.json``."""
     return BenchRecord(
         **dict(combination),
         experiments=[
             ExperimentRecord(
                 name=each.experiment,
-                rows=[_plain(row) for row in each.rows],
+                rows=[_as_floats(row) for row in each.rows],
                 value=each.value.tolist(),
                 std_error=np.sqrt(np.diag(each.covariance)).tolist(),
-                remarks=[Remark(remark.code, _plain(remark.numbers)) for remark in each.remarks],
+                remarks=[
+                    Remark(remark.code, _as_floats(remark.numbers)) for remark in each.remarks
+                ],
                 curves=list(each.curves),
             )
             for each in measurements
@@ -222,7 +224,7 @@ def bench_record(combination: Combination, measurements: Sequence[Measurement]) 
 
 
 def joint_prior(folder: Path) -> JointPrior:
-    """Return what the ground measurements of a result folder say, as a prior of a fit.
+    """Return the prior of a fit from the ground measurements in a result folder.
 
     Raises
     ------
@@ -238,7 +240,7 @@ def joint_prior(folder: Path) -> JointPrior:
     return JointPrior(record.names, mean, information)
 
 
-def _plain(numbers: Mapping[str, float]) -> dict[str, float]:
+def _as_floats(numbers: Mapping[str, float]) -> dict[str, float]:
     return {name: float(number) for name, number in numbers.items()}
 
 
@@ -283,7 +285,7 @@ REMARKS: Mapping[str, str] = {
 
 
 def remarks_in_words(experiment: ExperimentRecord) -> list[str]:
-    """Return what the checks of an experiment noticed, as sentences."""
+    """Return the remarks on an experiment as sentences."""
     sentences = []
     for remark in experiment.remarks:
         numbers = dict(remark.numbers)
@@ -295,7 +297,7 @@ def remarks_in_words(experiment: ExperimentRecord) -> list[str]:
 
 
 def numbers_in_words(experiment: ExperimentRecord) -> list[str]:
-    """Return each number that an experiment gives by itself, as a phrase."""
+    """Return a phrase on each number of an experiment."""
     phrases = []
     for row, scaled, deviation in zip(
         experiment.rows, experiment.value, experiment.std_error, strict=True
@@ -313,10 +315,10 @@ def numbers_in_words(experiment: ExperimentRecord) -> list[str]:
 
 
 def agreement_in_words(record: BenchRecord) -> str:
-    """Return whether the experiments agree, as a sentence."""
+    """Return a sentence on the agreement of the experiments."""
     if record.degrees_of_freedom < 1:
         return "No coefficient was measured twice, so that nothing checks the experiments."
-    verdict = "disagree" if record.p_value < DISAGREE else "agree"
+    verdict = "disagree" if record.p_value < MAX_DISAGREEING_P else "agree"
     return (
         f"The experiments {verdict}: χ² is {record.chi_square:.1f} with "
         f"{record.degrees_of_freedom} degrees of freedom (p = {record.p_value:.2g})."
@@ -324,10 +326,10 @@ def agreement_in_words(record: BenchRecord) -> str:
 
 
 def bench_in_words(record: BenchRecord) -> str:
-    """Return what ground measurements gave, in one sentence."""
+    """Return a sentence on the result of ground measurements."""
     count = len(record.experiments)
     s = "s" if count != 1 else ""
-    if of_flights(record):
+    if is_of_flights(record):
         what = f"{count} flight{s} without a pose; none was simulated"
     else:
         what = f"{count} ground experiment{s}; no flight was used"
@@ -335,6 +337,6 @@ def bench_in_words(record: BenchRecord) -> str:
     return f"{len(record.names)} {come} from {what}."
 
 
-def of_flights(record: BenchRecord) -> bool:
-    """Return whether the experiments are flights without a pose, and not on the ground."""
+def is_of_flights(record: BenchRecord) -> bool:
+    """Return whether the experiments are flights without a pose."""
     return any(remark.code == "explained" for e in record.experiments for remark in e.remarks)

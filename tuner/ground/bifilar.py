@@ -16,13 +16,13 @@ from tuner.ground.measurement import Curve, Measurement, Remark, rotor_radius
 from tuner.ground.plan import Bifilar
 from tuner.vehicle import VehicleFile
 
-FEWEST_SWINGS = 5.0
-LARGE_SWING = math.radians(20)
-"""Amplitude beyond which the law's small angles are wrong by more than the correction knows."""
-BEAT = 0.15
-"""Share of the amplitude that a second frequency may have before the swing is called a beat."""
-GYRATION = (0.05, 3.0)
-"""Radius of gyration over the rotors' distance from the centre, beyond which units are wrong."""
+MIN_OSCILLATIONS = 5.0
+MAX_AMPLITUDE_RAD = math.radians(20)
+"""The law holds for small angles; larger amplitudes exceed its correction."""
+MAX_SECOND_AMPLITUDE = 0.15
+"""A second frequency with a larger share of the amplitude is a beat."""
+GYRATION_RANGE = (0.05, 3.0)
+"""Radius of gyration over the rotors' distance from the centre; other values have wrong units."""
 
 
 def bifilar_inertia(
@@ -36,7 +36,7 @@ def bifilar_inertia(
     return mass * GRAVITY * wire_distance**2 / (16 * math.pi**2 * wire_length * frequency**2)
 
 
-def bifilar(
+def measure_bifilar(
     name: str, path: str, samples: Mapping[str, Array], given: Bifilar, vehicle: VehicleFile
 ) -> Measurement:
     """Return the moment of inertia of one axis.
@@ -51,12 +51,12 @@ def bifilar(
     given
         Axis, mass and wires, whose standard errors enter the result's.
     vehicle
-        Its mass hung where no other is given; its size says whether units are right.
+        Its mass is the default; its size checks the units.
 
     Raises
     ------
     RecordingError
-        Too few oscillations, too wide ones, or none; or an inertia that no such vehicle has.
+        Too few oscillations, too wide ones, or none; or an implausible inertia.
     """
     mass, distance, length = given.mass or vehicle.mass, given.wire_distance, given.wire_length
     time, angle = samples["time"] - samples["time"][0], samples["angle"]
@@ -64,12 +64,12 @@ def bifilar(
     time, angle = time[known], angle[known]
     guess = _spectral_guess(time, angle)
     swings = guess * time[-1]
-    if swings < FEWEST_SWINGS:
-        what = f"shows {swings:.1f} oscillations, fewer than {FEWEST_SWINGS:g}"
+    if swings < MIN_OSCILLATIONS:
+        what = f"shows {swings:.1f} oscillations, fewer than {MIN_OSCILLATIONS:g}"
         raise RecordingError(path, what, "let it swing longer")
-    solution = _fit(time, angle, guess)
+    solution = _fit_swing(time, angle, guess)
     amplitude, decay, phase_rate = abs(solution.x[0]), solution.x[1], solution.x[2]
-    if amplitude > LARGE_SWING:
+    if amplitude > MAX_AMPLITUDE_RAD:
         what = f"swings by {math.degrees(amplitude):.0f} degrees"
         raise RecordingError(
             path, what, "release it within 20 degrees, the law is for small angles"
@@ -82,7 +82,7 @@ def bifilar(
     error = _frequency_error(solution, residual)
     inertia = bifilar_inertia(frequency, mass=mass, wire_distance=distance, wire_length=length)
     gyration = math.sqrt(inertia / mass)
-    low, high = (share * rotor_radius(vehicle) for share in GYRATION)
+    low, high = (share * rotor_radius(vehicle) for share in GYRATION_RANGE)
     if not low < gyration < high:
         what = f"gives a radius of gyration of {gyration:.3g} m, not one of {low:.2g} to {high:.2g}"
         raise RecordingError(path, what, "check mass (kg), wires (m) and time (s)")
@@ -96,14 +96,14 @@ def bifilar(
         Remark("swing", {"oscillations": swings, "amplitude": amplitude, "frequency": frequency})
     ]
     second = _second_frequency(time, residual) / amplitude
-    if second > BEAT:
+    if second > MAX_SECOND_AMPLITUDE:
         remarks.append(Remark("beat", {"share": second}))
     drift = abs(solution.x[5]) * time[-1]
     if drift > 0.2 * amplitude:
         remarks.append(Remark("drift", {"drift": drift}))
     dense = np.linspace(0.0, time[-1], 2000)
     titles = (f"Swing about {given.axis}", "time, s", "angle, rad")
-    curve = Curve.of(titles, (time, angle), (dense, _swing(solution.x, dense)))
+    curve = Curve.of(titles, (time, angle), (dense, _damped_swing(solution.x, dense)))
     return Measurement(
         name,
         ({f"inertia_{given.axis * 2}": 1.0},),
@@ -114,7 +114,7 @@ def bifilar(
     )
 
 
-def _swing(parameters: Array, time: Array) -> Array:
+def _damped_swing(parameters: Array, time: Array) -> Array:
     amplitude, decay, frequency, phase, offset, drift = parameters
     # a pendulum's period grows by amplitude²/16; integrated over the decaying amplitude
     slow = (
@@ -139,14 +139,14 @@ def _spectral_guess(time: Array, angle: Array) -> float:
     return float(frequencies[int(np.argmax(power))])
 
 
-def _fit(time: Array, angle: Array, guess: float) -> Any:
+def _fit_swing(time: Array, angle: Array, guess: float) -> Any:
     turns = 2 * math.pi * guess * time
     waves = np.column_stack([np.cos(turns), -np.sin(turns), np.ones_like(time)])
     cosine, sine, offset = np.linalg.lstsq(waves, angle, rcond=None)[0]
     half = 0.5 * float(np.ptp(angle))
     start = np.array([half, 0.5 / time[-1], guess, math.atan2(sine, cosine), offset, 0.0])
     return least_squares(
-        lambda p: _swing(p, time) - angle, start, x_scale=np.maximum(np.abs(start), 1e-3)
+        lambda p: _damped_swing(p, time) - angle, start, x_scale=np.maximum(np.abs(start), 1e-3)
     )
 
 

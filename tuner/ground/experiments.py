@@ -1,4 +1,4 @@
-"""An experiment of ``bench.yaml`` into a measurement: its recording read, its law applied."""
+"""Measurements from the experiments of ``bench.yaml``."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from tuner.ground.bifilar import bifilar
-from tuner.ground.hovers import hover_weights, yaw_spin
+from tuner.ground.bifilar import measure_bifilar
+from tuner.ground.hovers import measure_hover_weights, measure_yaw_spin
 from tuner.ground.measurement import Measurement
 from tuner.ground.plan import (
     Bifilar,
@@ -20,16 +20,16 @@ from tuner.ground.plan import (
     TorqueStand,
     YawSpin,
 )
-from tuner.ground.propeller import propeller
-from tuner.ground.rig_data import place_of, read_columns, swing_of
-from tuner.ground.stands import rpm_curve, stand
-from tuner.ground.step_response import step_response
+from tuner.ground.propeller import measure_propeller
+from tuner.ground.rig_data import read_columns, read_swing, recording_path
+from tuner.ground.stands import measure_rpm_curve, measure_stand
+from tuner.ground.step_response import measure_step_response
 from tuner.vehicle import VehicleFile
 from tuner.vehicle.vehicle import ARM, size_of
 
 
 def names_of(experiments: Sequence[Experiment]) -> tuple[str, ...]:
-    """Return a name for each experiment: its kind and axis, numbered where it is not alone."""
+    """Return a unique name of each experiment: its kind and axis, and a number if needed."""
     plain = [" ".join((e.kind, getattr(e, "axis", ""))).strip() for e in experiments]
     counts, seen, names = Counter(plain), Counter[str](), []
     for name in plain:
@@ -41,37 +41,37 @@ def names_of(experiments: Sequence[Experiment]) -> tuple[str, ...]:
 def measure(  # noqa: PLR0911 (one return a kind)
     name: str, experiment: Experiment, vehicle: VehicleFile, folder: Path
 ) -> Measurement:
-    """Return what an experiment measures.
+    """Return the measurement of an experiment.
 
     Parameters
     ----------
     vehicle
-        Its mass, rotors and, where a spin's fast pair was not measured, its motor constant.
+        Gives mass, rotors and, for a spin without the fast pair's speed, motor constant.
     folder
-        From which paths of recordings count.
+        Paths of recordings are relative to it.
 
     Raises
     ------
     InputError
-        The recording cannot be read or does not show what the experiment needs.
+        The recording cannot be read or is not suitable.
     """
     match experiment:
         case HoverWeights():
-            return hover_weights(name, experiment, vehicle, folder)
+            return measure_hover_weights(name, experiment, vehicle, folder)
         case YawSpin():
-            return yaw_spin(name, experiment, vehicle, folder)
+            return measure_yaw_spin(name, experiment, vehicle, folder)
         case Propeller():
-            return propeller(name, experiment, folder)
-    path, arm = place_of(folder, experiment.recording), ARM * size_of(vehicle).arm
+            return measure_propeller(name, experiment, folder)
+    path, arm = recording_path(folder, experiment.recording), ARM * size_of(vehicle).arm
     match experiment:
         case Bifilar(axis=axis):
-            return bifilar(name, str(path), swing_of(path, axis), experiment, vehicle)
+            return measure_bifilar(name, str(path), read_swing(path, axis), experiment, vehicle)
         case ThrustStand() | TorqueStand():
             samples = read_columns(path, ("rotor_speed", "force"), arm=arm)
-            return stand(name, str(path), samples, experiment, vehicle)
+            return measure_stand(name, str(path), samples, experiment, vehicle)
         case RpmCurve():
             samples = read_columns(path, ("command", "rotor_speed"), ("voltage",), arm=arm)
-            return rpm_curve(name, str(path), samples, experiment)
+            return measure_rpm_curve(name, str(path), samples, experiment)
         case StepResponse():
             samples = read_columns(path, ("command", "rotor_speed"), arm=arm)
-            return step_response(name, str(path), samples)
+            return measure_step_response(name, str(path), samples)

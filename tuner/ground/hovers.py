@@ -1,7 +1,6 @@
-"""Hovers with weights and steady yaw spins: what the balance of force and torque says.
+"""Measurements from hovers with weights and steady yaw spins, by balances of force and torque.
 
-Equations are those of the thesis; where its text slips, the law here is the corrected one, and its
-docstring names the slip.
+Equations are those of the thesis; docstrings name its slips, which are corrected here.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from numpy.typing import NDArray
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.ground.measurement import Curve, Measurement, Remark, rotor_radius
-from tuner.ground.plan import FASTEST_SPIN, SLOWEST_SPIN, HoverWeights, YawSpin
-from tuner.ground.rig_data import place_of, steady_flight
+from tuner.ground.plan import MAX_SPIN_RATE, MIN_SPIN_RATE, HoverWeights, YawSpin
+from tuner.ground.rig_data import recording_path, steady_flight
 from tuner.vehicle import VehicleFile
 
 
@@ -60,7 +59,7 @@ def spin_drag_over_torque(
     return np.asarray((np.asarray(fast) - np.asarray(slow)) / (np.asarray(yaw_rate) * radius**2))
 
 
-def hover_weights(
+def measure_hover_weights(
     name: str, given: HoverWeights, vehicle: VehicleFile, folder: Path
 ) -> Measurement:
     """Return the motor constant from hovers of mass m and rotor speed Ω: m g = n k Ω² (6.4.1).
@@ -68,10 +67,10 @@ def hover_weights(
     Parameters
     ----------
     given
-        The hovers, and the standard errors of one; where three and more scatter by more, their
-        scatter counts.
+        The hovers, and the standard errors of one; a larger scatter of three and more replaces
+        them.
     vehicle
-        How many rotors carry it.
+        Gives the number of rotors.
     folder
         From which paths of recordings count.
 
@@ -85,7 +84,7 @@ def hover_weights(
         if point.rotor_speed is not None:
             speeds.append(point.rotor_speed)
             continue
-        flight = steady_flight(place_of(folder, point.recording))
+        flight = steady_flight(recording_path(folder, point.recording))
         speeds.append(float(np.sqrt(np.mean(flight.rotor_speed**2))))  # thrust goes with the square
         curves.append(flight.curve)
     mass, speed = np.array([point.mass for point in given.points]), np.array(speeds)
@@ -108,12 +107,12 @@ def hover_weights(
     )  # fmt: skip
 
 
-def yaw_spin(name: str, given: YawSpin, vehicle: VehicleFile, folder: Path) -> Measurement:
+def measure_yaw_spin(name: str, given: YawSpin, vehicle: VehicleFile, folder: Path) -> Measurement:
     """Return the relation of rotor drag to torque from spins: yaw rate, slow pair, fast pair.
 
     rotor_drag_coefficient / (moment_constant · motor_constant) = (Ω_fast - Ω_slow)/(ω r²)
-    (Eq. 8.3, see `spin_drag_over_torque`). Where the fast pair was not measured it follows from
-    the weight and the motor constant, on which the relation then depends.
+    (Eq. 8.3, see `spin_drag_over_torque`). An unmeasured fast pair follows from the weight and the
+    motor constant, on which the relation then depends.
 
     Parameters
     ----------
@@ -138,9 +137,9 @@ def yaw_spin(name: str, given: YawSpin, vehicle: VehicleFile, folder: Path) -> M
         if point.yaw_rate is not None and point.rotor_speed_slow is not None:
             points.append((point.yaw_rate, point.rotor_speed_slow, point.rotor_speed_fast))
             continue
-        path = place_of(folder, point.recording)
+        path = recording_path(folder, point.recording)
         flight = steady_flight(path)
-        if not SLOWEST_SPIN <= abs(flight.yaw_rate) <= FASTEST_SPIN:
+        if not MIN_SPIN_RATE <= abs(flight.yaw_rate) <= MAX_SPIN_RATE:
             raise RecordingError(path, "does not yaw, or has no body rate", "spin it steadily")
         pairs = sorted((flight.rotor_speed[:2].mean(), flight.rotor_speed[2:].mean()))
         points.append((flight.yaw_rate, float(pairs[0]), float(pairs[1])))

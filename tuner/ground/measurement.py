@@ -1,7 +1,7 @@
-"""What an experiment yields: a few numbers that depend on coefficients, with their covariance.
+"""Measurements: a few numbers that depend on coefficients, with their covariance.
 
-The numbers are linear in scaled coordinates: the logarithm of a coefficient where the registry has
-it so, else the value.
+The numbers are linear in scaled coordinates: the value of a coefficient, or its logarithm if the
+registry says so.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from numpy.typing import NDArray
 from tuner.core.numerics import Array
 from tuner.vehicle import COEFFICIENTS, VehicleFile
 
-MOST_DRAWN = 800
-"""Samples of a curve that are kept."""
+MAX_CURVE_SAMPLES = 800
+"""A longer curve is thinned."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One panel of an experiment's picture.
+    """One panel of an experiment's plot.
 
     Attributes
     ----------
     title, x_label, y_label
         For the axes, units included.
     x, measured
-        n samples, of those that are known no more than `MOST_DRAWN`.
+        n samples, at most `MAX_CURVE_SAMPLES`.
     used
-        n: which of them the estimate rests on.
+        n: whether each was used.
     fit_x, fit
         m: the fitted law.
     law
-        Whether they are a law, from which there are residuals; else they are levels, as points.
+        Whether they are a law with residuals; else they are levels, as points.
     """
 
     title: str
@@ -69,8 +69,8 @@ class Curve:
         """
         x, measured = samples
         known = np.flatnonzero(np.isfinite(x) & np.isfinite(measured))
-        known = known[:: max(1, -(-len(known) // MOST_DRAWN))]
-        thinned = slice(None, None, max(1, -(-len(fit[0]) // MOST_DRAWN)))
+        known = known[:: max(1, -(-len(known) // MAX_CURVE_SAMPLES))]
+        thinned = slice(None, None, max(1, -(-len(fit[0]) // MAX_CURVE_SAMPLES)))
         used = np.ones(len(x), bool) if used is None else used
         return cls(
             *titles,
@@ -85,7 +85,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Remark:
-    """What an experiment's check noticed: a code with its numbers, worded when it is shown."""
+    """A remark on an experiment: a code with its numbers."""
 
     code: str
     numbers: Mapping[str, float] = field(default_factory=dict)
@@ -93,7 +93,7 @@ class Remark:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one experiment says.
+    """The result of one experiment.
 
     The K numbers ``value`` are linear in the coefficients' scaled coordinates (the logarithm of
     those that are searched in logarithms, else the number itself):
@@ -102,7 +102,7 @@ class Measurement:
     Attributes
     ----------
     experiment
-        Name for people: the kind, and what tells several of a kind apart.
+        Unique name of the experiment.
     rows
         K mappings, coefficient name -> factor on its scaled coordinate.
     value
@@ -120,7 +120,7 @@ class Measurement:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The coefficients that the experiment speaks of, in the order of first mention."""
+        """The measured coefficients, in the order of first mention."""
         return tuple(dict.fromkeys(name for row in self.rows for name in row))
 
 

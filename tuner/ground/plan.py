@@ -18,7 +18,7 @@ Length = Annotated[Number, Ge(0.005), Le(20)]
 """m."""
 RotorCount = Annotated[Whole, Ge(1), Le(8)]
 Text = Annotated[str, Len(1, 1000)]
-SLOWEST_SPIN, FASTEST_SPIN = 0.2, 50.0
+MIN_SPIN_RATE, MAX_SPIN_RATE = 0.2, 50.0
 """rad/s of yaw within which a spin says something."""
 
 
@@ -144,7 +144,7 @@ class SpinPoint(Section):
             raise ValueError("it should have yaw_rate and rotor_speed_slow, or recording")
         if self.recording is not None and (*numbers, self.rotor_speed_fast) != (None,) * 3:
             raise ValueError("it should have numbers or recording, not both")
-        if self.yaw_rate is not None and not SLOWEST_SPIN <= abs(self.yaw_rate) <= FASTEST_SPIN:
+        if self.yaw_rate is not None and not MIN_SPIN_RATE <= abs(self.yaw_rate) <= MAX_SPIN_RATE:
             raise ValueError("it should have a yaw_rate of 0.2 to 50 rad/s")
         return self
 

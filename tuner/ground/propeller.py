@@ -12,12 +12,12 @@ from tuner.core.files import read_bytes
 from tuner.core.numerics import Array
 from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.ground.plan import Propeller
-from tuner.ground.rig_data import place_of
+from tuner.ground.rig_data import recording_path
 
-THEORY = 0.4
-"""Standard deviation of the logarithm by which a table's propeller on a vehicle differs from it."""
-TORQUE_THEORY = 0.3
-"""The same of the ratio of torque to thrust, in which part of the error cancels."""
+THRUST_PRIOR_SD = 0.4
+"""Of the logarithm of thrust: propellers on a vehicle differ so much from their table."""
+TORQUE_RATIO_PRIOR_SD = 0.3
+"""Of the logarithm of torque over thrust, in which part of the error cancels."""
 MAX_BYTES = 1_000_000
 
 
@@ -43,7 +43,7 @@ def propeller_moment_constant(
 
 
 def read_static_table(path: Path) -> Array:
-    """Return (n, 3) RPM, C_T and C_P of a static table as UIUC's propeller data site has it.
+    """Return (n, 3) RPM, C_T and C_P of a static table of UIUC's propeller data site.
 
     Raises
     ------
@@ -71,13 +71,13 @@ def read_static_table(path: Path) -> Array:
     return table
 
 
-def propeller(name: str, given: Propeller, folder: Path) -> Measurement:
-    """Return motor and moment constant of a propeller from C_T and C_P, of a table the medians.
+def measure_propeller(name: str, given: Propeller, folder: Path) -> Measurement:
+    """Return motor and moment constant of a propeller from C_T and C_P, or medians of a table.
 
     Parameters
     ----------
     folder
-        From which a table's path counts.
+        A table's path is relative to it.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def propeller(name: str, given: Propeller, folder: Path) -> Measurement:
     curves: tuple[Curve, ...] = ()
     thrust, power = given.thrust_coefficient, given.power_coefficient
     if thrust is None or power is None:
-        speeds, *columns = read_static_table(place_of(folder, given.table)).T
+        speeds, *columns = read_static_table(recording_path(folder, given.table)).T
         thrust, power = (float(np.median(column)) for column in columns)
         titles = ("Propeller table", "RPM", "thrust coefficient")
         curve = Curve.of(titles, (speeds, columns[0]), (speeds, np.full(len(speeds), thrust)))
@@ -100,7 +100,7 @@ def propeller(name: str, given: Propeller, folder: Path) -> Measurement:
         name,
         ({"motor_constant": 1.0}, {"moment_constant": 1.0}),
         values,
-        np.diag([THEORY**2, TORQUE_THEORY**2]),
+        np.diag([THRUST_PRIOR_SD**2, TORQUE_RATIO_PRIOR_SD**2]),
         (Remark("theory", {"thrust_coefficient": thrust, "power_coefficient": power}),),
         curves,
     )

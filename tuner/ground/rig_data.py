@@ -1,7 +1,6 @@
-"""Recordings of rigs and flights for ground measurements: columns by name, steady parts, means.
+"""Recordings for ground measurements: columns by name, steady parts, means, pendulum angles.
 
-Columns come in SI units by their names; of a flight count the steady part of a hover or a spin, and
-a pendulum's angle.
+The names of columns give their units.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ from tuner.ground.measurement import Curve
 from tuner.recordings.content import Content, ReadOptions, read_content
 from tuner.recordings.recording import TABLE_TOPIC, Clock, Request, TabularRecording
 
-OUTLIER = 3.0
-"""Standard deviations (robust) beyond which a tachometer's sample is dropped (thesis 6.3.2)."""
-MIDDLE = (0.3, 0.95)
-"""Share of a step, from and to, that is its middle: transients over, the next not begun."""
-TRUSTED = 4
-"""Degrees of freedom from which the residuals' own scatter is the only measure of error."""
-FEWEST_IN_LEVEL = 8
-"""Samples without which a step has no mean."""
+OUTLIER_SIGMAS = 3.0
+"""A tachometer's sample that is off by more robust standard deviations is dropped (6.3.2)."""
+PLATEAU_SHARES = (0.3, 0.95)
+"""The part of a step that is its plateau, after the transient and before the next step."""
+MIN_TRUSTED_FREEDOM = 4
+"""With as many degrees of freedom the residuals' scatter alone measures the error."""
+MIN_PLATEAU_SAMPLES = 8
+"""A shorter plateau has no mean."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Plateau:
     Attributes
     ----------
     samples
-        Indices of the samples that count.
+        Indices of its samples.
     begin, end
         s.
     """
@@ -52,17 +51,17 @@ class Plateau:
     end: float
 
 
-def levels_of(signal: Array, time: Array, *, shortest: float, step: float) -> list[Plateau]:
+def find_plateaus(signal: Array, time: Array, *, shortest: float, step: float) -> list[Plateau]:
     """Return the steady parts of a signal that moves in steps.
 
     Parameters
     ----------
     signal
-        (n,) what was stepped: a command, or a rotor's speed, NaN where it was not measured.
+        (n,) a command or a rotor's speed, NaN where not measured.
     time
         (n,) s.
     shortest
-        s below which a level is a transient.
+        s; a shorter level is a transient.
     step
         Change of the level that counts as a step, in the signal's unit.
     """
@@ -77,7 +76,7 @@ def levels_of(signal: Array, time: Array, *, shortest: float, step: float) -> li
             count = index - first + 1
             level += (smooth[index] - level) / min(count, width)
             continue
-        plateau = _middle(time, first, index)
+        plateau = _plateau(time, first, index)
         if plateau is not None and time[index - 1] - time[first] >= shortest:
             plateaus.append(plateau)
         if index < len(smooth):
@@ -90,24 +89,26 @@ def _known(signal: Array) -> tuple[Array, Array]:
     return known.astype(float), signal[known]
 
 
-def _middle(time: Array, first: int, end: int) -> Plateau | None:
+def _plateau(time: Array, first: int, end: int) -> Plateau | None:
     begin, last = time[first], time[end - 1]
-    low, high = (begin + share * (last - begin) for share in MIDDLE)
+    low, high = (begin + share * (last - begin) for share in PLATEAU_SHARES)
     samples = first + np.flatnonzero((time[first:end] >= low) & (time[first:end] <= high))
-    return Plateau(samples, float(low), float(high)) if len(samples) >= FEWEST_IN_LEVEL else None
+    return (
+        Plateau(samples, float(low), float(high)) if len(samples) >= MIN_PLATEAU_SAMPLES else None
+    )
 
 
-def without_outliers(values: Array) -> NDArray[np.bool_]:
-    """Return (n,) which values lie within `OUTLIER` robust standard deviations of their median."""
+def is_inlier(values: Array) -> NDArray[np.bool_]:
+    """Return (n,) flags of values within `OUTLIER_SIGMAS` robust deviations of their median."""
     finite = np.isfinite(values)
     if not finite.any():
         return finite
     middle = np.median(values[finite])
     spread = max(float(robust_sd(values[finite] - middle)), 1e-12 * abs(middle))
-    return np.asarray(finite & (np.abs(values - middle) <= OUTLIER * spread))
+    return np.asarray(finite & (np.abs(values - middle) <= OUTLIER_SIGMAS * spread))
 
 
-def kept_levels(
+def usable_plateaus(
     stepped: Array,
     time: Array,
     speed: Array,
@@ -116,13 +117,13 @@ def kept_levels(
     shortest: float,
     step: float,
 ) -> tuple[list[tuple[Plateau, NDArray[np.intp]]], NDArray[np.bool_], int]:
-    """Return steady parts of what was stepped, each with the samples of the speed that count.
+    """Return the plateaus of a stepped signal, each with its usable samples of the speed.
 
-    Also (n,) which samples those are, and how many were dropped; parameters as of `levels_of`.
+    Also (n,) flags of these samples, and the number of dropped ones; see `find_plateaus`.
     """
     parts, used, dropped = [], np.zeros(len(time), bool), 0
-    for plateau in levels_of(stepped, time, shortest=shortest, step=step):
-        kept = without_outliers(speed[plateau.samples]) & usable[plateau.samples]
+    for plateau in find_plateaus(stepped, time, shortest=shortest, step=step):
+        kept = is_inlier(speed[plateau.samples]) & usable[plateau.samples]
         dropped += int((~kept).sum())
         inside = plateau.samples[kept]
         if len(inside) >= 4:
@@ -132,11 +133,7 @@ def kept_levels(
 
 
 def mean_and_error(values: Array) -> tuple[float, float]:
-    """Return a plateau's mean and the standard error of it, correlation between samples included.
-
-    The variance of the mean comes from the means of blocks, which neighbouring samples that move
-    together make larger than the variance over the count.
-    """
+    """Return a plateau's mean and standard error, from means of blocks of correlated samples."""
     count = len(values)
     blocks = min(8, count // 4)
     plain = float(values.std(ddof=1)) / np.sqrt(count)
@@ -146,71 +143,61 @@ def mean_and_error(values: Array) -> tuple[float, float]:
     return float(values.mean()), max(plain, float(means.std(ddof=1)) / np.sqrt(blocks))
 
 
-def widened(covariance: Array, chi_square: float, freedom: int) -> Array:
+def widen(covariance: Array, chi_square: float, freedom: int) -> Array:
     """Return a covariance with the scatter of the residuals: Birge's ratio and Student's t.
 
-    A few residuals that happen to be small do not narrow it.
+    Few small residuals do not narrow it.
 
     Parameters
     ----------
     covariance
         Of weighted least squares.
     chi_square, freedom
-        Sum of the squared weighted residuals, and the degrees of freedom that they have.
+        Sum of the squared weighted residuals, and their degrees of freedom.
     """
     ratio = chi_square / max(freedom, 1)
-    ratio = max(ratio, 1.0) if freedom < TRUSTED else ratio
-    return np.asarray(covariance * ratio * student(freedom) ** 2)
+    ratio = max(ratio, 1.0) if freedom < MIN_TRUSTED_FREEDOM else ratio
+    return np.asarray(covariance * ratio * student_factor(freedom) ** 2)
 
 
-def student(freedom: int) -> float:
-    """Return by what factor few degrees of freedom widen an interval (Student's t)."""
+def student_factor(freedom: int) -> float:
+    """Return the factor by which few degrees of freedom widen an interval (Student's t)."""
     return float(stats.t.ppf(0.975, max(freedom, 1))) / Z95
 
 
 MAX_BYTES = 200_000_000
-MOST = 60_000
-"""Samples beyond which a recording is thinned: steps of seconds need no more."""
-FEWEST = 20
-FASTEST = 4000.0
-"""rad/s that no rotor of a multirotor turns: a column beyond it holds revolutions a minute."""
-SLOWEST_TIP = 40.0
-"""m/s at the length of an arm that each propeller's fastest test exceeds: such rpm are rad/s."""
-FULL_COMMAND = 1.5
-VOLTS = (1.0, 100.0)
+MAX_SAMPLES = 60_000
+"""A longer recording is thinned: steps of seconds need no more."""
+MIN_SAMPLES = 20
+MAX_ROTOR_SPEED = 4000.0
+"""rad/s. No rotor turns faster: such a column is in revolutions a minute."""
+MIN_TIP_SPEED = 40.0
+"""m/s at the length of an arm. The fastest test of a propeller exceeds it: such rpm are rad/s."""
+MAX_COMMAND = 1.5
+VOLTAGE_RANGE = (1.0, 100.0)
 """V of a battery."""
 
+ATTITUDE = ("qw", "qx", "qy", "qz")
 COLUMNS: Mapping[str, Mapping[str, float]] = {
-    "angle": {
-        "angle": 1.0,
-        "angle_rad": 1.0,
-        "angle_deg": math.pi / 180,
-        "angle_degrees": math.pi / 180,
-    },
+    "angle": {"angle": 1.0, "angle_rad": 1.0}
+    | dict.fromkeys(("angle_deg", "angle_degrees"), math.pi / 180),
     "rotor_speed": {"rotor_speed": 1.0, "rpm": RAD_S_PER_RPM},
-    "force": {"force": 1.0},
-    "command": {"command": 1.0},
-    "voltage": {"voltage": 1.0},
-    "qw": {"qw": 1.0},
-    "qx": {"qx": 1.0},
-    "qy": {"qy": 1.0},
-    "qz": {"qz": 1.0},
+    **{name: {name: 1.0} for name in ("force", "command", "voltage", *ATTITUDE)},
 }
 """Quantity -> column name -> factor to SI units."""
-TIMES = ("time", "t")
+TIME_COLUMNS = ("time", "t")
 """Columns that may hold the time, in s."""
-SHORTEST = 3.0
-"""s of steady flight without which there is no mean."""
-STEP = 0.05
-"""Change of the mean rotor speed, relative to its median, beyond which flight is not steady."""
+MIN_STEADY_S = 3.0
+"""A shorter steady part of a flight has no mean."""
+STEADY_TOLERANCE = 0.05
+"""Larger changes of the mean rotor speed, relative to its median, end a steady part."""
 TABLES = (".csv", ".tsv", ".txt", ".parquet")
-ATTITUDE = ("qw", "qx", "qy", "qz")
 AXES = ("x", "y", "z")
-VERTICAL = 0.9
-"""Least cosine between the body axis that hangs vertical and the vertical."""
+MIN_VERTICAL_COSINE = 0.9
+"""Between the hanging body axis and the vertical."""
 
 
-def place_of(folder: Path, recording: str | None) -> Path:
+def recording_path(folder: Path, recording: str | None) -> Path:
     """Return the path of a recording, or of a table, that ``bench.yaml`` names."""
     return folder / Path(recording or "").expanduser()
 
@@ -247,12 +234,12 @@ def read_columns(
     wanted, optional
         Quantities of `COLUMNS`; those that are optional may lack.
     arm
-        m from the vehicle's centre to a rotor, which bounds its propeller.
+        m from the vehicle's centre to a rotor, which bounds its measure_propeller.
 
     Returns
     -------
     dict
-        ``time`` in s from the first sample, and the quantities; no more than `MOST` samples.
+        ``time`` in s from the first sample, and the quantities; at most `MAX_SAMPLES`.
 
     Raises
     ------
@@ -269,12 +256,12 @@ def read_columns(
             names = " or ".join(COLUMNS[quantity])
             needed = ", ".join(("time", *wanted))
             raise RecordingError(path, f"has no column {names}", f"it needs {needed}")
-    if not any(name in table.columns for name in TIMES):
+    if not any(name in table.columns for name in TIME_COLUMNS):
         raise RecordingError(path, "has no column time", "add it, in s")
-    clocks = tuple(Clock(field=name, unit="s") for name in TIMES)
+    clocks = tuple(Clock(field=name, unit="s") for name in TIME_COLUMNS)
     contents = table.read({TABLE_TOPIC: Request(tuple(chosen.values()), clocks)})
     rows = contents.samples[TABLE_TOPIC]
-    if len(rows.receive) < FEWEST:
+    if len(rows.receive) < MIN_SAMPLES:
         what = f"holds {len(rows.receive)} samples with a time"
         raise RecordingError(path, what, "record the whole experiment")
     time = (rows.receive - rows.receive[0]) * 1e-9
@@ -284,20 +271,20 @@ def read_columns(
     for quantity, column in chosen.items():
         samples[quantity] = rows.fields[column] * COLUMNS[quantity][column]
         _check_unit(path, quantity, column, samples[quantity], arm)
-    stride = -(-len(time) // MOST)
+    stride = -(-len(time) // MAX_SAMPLES)
     return {quantity: values[::stride] for quantity, values in samples.items()}
 
 
 def _check_unit(path: Path, quantity: str, column: str, values: Array, arm: float) -> None:
     known = np.abs(values[np.isfinite(values)])
-    if len(known) < FEWEST:
+    if len(known) < MIN_SAMPLES:
         raise RecordingError(path, f"column {column} holds hardly a number", "check the file")
     top, low = float(np.quantile(known, 0.99)), float(np.nanquantile(values, 0.01))
     complaints = {
         "rotor_speed": (
-            (top > FASTEST, f"reaches {top:.0f} rad/s, too fast for a rotor",
+            (top > MAX_ROTOR_SPEED, f"reaches {top:.0f} rad/s, too fast for a rotor",
              "name the column rpm if it holds revolutions a minute"),
-            (top * arm < SLOWEST_TIP,
+            (top * arm < MIN_TIP_SPEED,
              f"stays below {top:.1f} rad/s, too slow for a rotor on an arm of {arm:.3g} m",
              "name the column rotor_speed if it holds rad/s, and check the vehicle's rotors"),
         ),
@@ -306,12 +293,13 @@ def _check_unit(path: Path, quantity: str, column: str, values: Array, arm: floa
              "name the column angle_deg if it holds degrees"),
         ),
         "command": (
-            (top > FULL_COMMAND, f"reaches {top:.0f}, commands lie in 0..1",
+            (top > MAX_COMMAND, f"reaches {top:.0f}, commands lie in 0..1",
              "scale it to 0..1 of full command"),
         ),
         "voltage": (
-            (not VOLTS[0] <= low <= top <= VOLTS[1], f"goes from {low:.3g} to {top:.3g} V",
-             f"write a battery's volts, {VOLTS[0]:g} to {VOLTS[1]:g}"),
+            (not VOLTAGE_RANGE[0] <= low <= top <= VOLTAGE_RANGE[1],
+             f"goes from {low:.3g} to {top:.3g} V",
+             f"write a battery's volts, {VOLTAGE_RANGE[0]:g} to {VOLTAGE_RANGE[1]:g}"),
         ),
     }  # fmt: skip
     for wrong, what, remedy in complaints.get(quantity, ()):
@@ -328,7 +316,7 @@ class SteadyFlight:
     rotor_speed
         (4,) rad/s in PX4's motor order.
     yaw_rate
-        rad/s; NaN where it was not recorded.
+        rad/s; NaN if not recorded.
     """
 
     rotor_speed: Array
@@ -336,13 +324,13 @@ class SteadyFlight:
     curve: Curve
 
 
-def swing_of(path: Path, axis: str) -> dict[str, Array]:
-    """Return ``time`` s and ``angle`` rad about the vertical: of a table, or of any recording.
+def read_swing(path: Path, axis: str) -> dict[str, Array]:
+    """Return ``time`` s and ``angle`` rad about the vertical from a table or any recording.
 
     Parameters
     ----------
     axis
-        The body axis that ought to hang vertical, where an attitude was recorded.
+        The body axis that should hang vertical, for a recorded attitude.
 
     Raises
     ------
@@ -377,10 +365,12 @@ def steady_flight(path: Path) -> SteadyFlight:
     if len(time) < 20:
         raise RecordingError(path, "has hardly a rotor speed", "give the point by its numbers")
     mean = np.nanmean(speeds, axis=1)
-    parts = levels_of(mean, time, shortest=SHORTEST, step=STEP * float(np.median(mean)))
+    parts = find_plateaus(
+        mean, time, shortest=MIN_STEADY_S, step=STEADY_TOLERANCE * float(np.median(mean))
+    )
     turning = [part for part in parts if np.median(mean[part.samples]) > 0.5 * mean.max()]
     if not turning:
-        what = f"is nowhere steady for {SHORTEST:g} s"
+        what = f"is nowhere steady for {MIN_STEADY_S:g} s"
         raise RecordingError(path, what, "hold the hover or the spin longer")
     longest = max(turning, key=lambda part: part.end - part.begin)
     inside = longest.samples
@@ -390,7 +380,7 @@ def steady_flight(path: Path) -> SteadyFlight:
     for column in speeds[inside].T:
         if not np.isfinite(column).any():
             raise RecordingError(path, "lacks a rotor's speed", "give the point by its numbers")
-        rotors.append(float(column[without_outliers(column)].mean()))
+        rotors.append(float(column[is_inlier(column)].mean()))
     yaw_rate = np.nan
     if "body_rate" in series:
         rates = series["body_rate"]
@@ -410,14 +400,14 @@ def _content(path: Path) -> Content:
 
 
 def angle_of_attitude(path: str, quaternion: Array, axis: str) -> Array:
-    """Return the angle (n,), rad, about the vertical, of a body that hangs by one of its axes.
+    """Return the angle (n,), rad, about the vertical of a body that hangs by one of its axes.
 
     Parameters
     ----------
     quaternion
         (n, 4) w, x, y, z: body to world, world z up; rows that are not finite give NaN.
     axis
-        The body axis that ought to hang vertical.
+        The body axis that should hang vertical.
 
     Raises
     ------
@@ -428,12 +418,12 @@ def angle_of_attitude(path: str, quaternion: Array, axis: str) -> Array:
     turned = Rotation.from_quat(quaternion[known], scalar_first=True).as_matrix()
     mean = turned[:, 2].mean(axis=0) if known.any() else np.zeros(3)
     hanging = int(np.argmax(np.abs(mean)))
-    if abs(mean[hanging]) < VERTICAL:
+    if abs(mean[hanging]) < MIN_VERTICAL_COSINE:
         raise RecordingError(path, "hangs by no body axis", "hang it by the axis to be measured")
     if AXES[hanging] != axis:
         what = f"hangs by its body axis {AXES[hanging]}, and axis says {axis}"
         raise RecordingError(path, what, "correct the axis, or hang it by the other one")
-    # the heading of a body axis that lies level tells the turn about the vertical
+    # the angle is the heading of a level body axis
     level = turned[:, :, (hanging + 1) % 3]
     angle = np.full(len(known), np.nan)
     angle[known] = np.unwrap(np.arctan2(level[:, 1], level[:, 0]))

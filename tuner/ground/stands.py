@@ -15,22 +15,22 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array, scaled_inverse
 from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.ground.plan import RpmCurve, ThrustStand, TorqueStand
-from tuner.ground.rig_data import kept_levels, mean_and_error, widened
+from tuner.ground.rig_data import mean_and_error, usable_plateaus, widen
 from tuner.vehicle import VehicleFile
 from tuner.vehicle.vehicle import ARM, size_of
 
-SHORTEST = 1.0
-"""s below which a level of the rotor speed is a transient."""
-STEP = 0.03
-"""Change of the rotor speed, relative to its largest, that counts as a step."""
-FEWEST = 4
-"""Levels without which slope, offset and drift cannot be told apart."""
-LEAST_SPEED_RATIO = 1.3
-"""Ratio of the fastest to the slowest level without which an offset looks like another slope."""
-LIFT = (0.05, 20.0)
-"""Largest thrust of all rotors over the weight, beyond which a unit or lever is wrong."""
-TWIST = (0.005, 20.0)
-"""The same of the largest drag torque of all rotors over the weight at the end of an arm."""
+MIN_LEVEL_S = 1.0
+"""A shorter level of the rotor speed is a transient."""
+SPEED_STEP = 0.03
+"""A larger change of the rotor speed, relative to its largest, is a step."""
+MIN_LEVELS = 4
+"""Fewer levels do not separate slope, offset and drift."""
+MIN_SPEED_RATIO = 1.3
+"""With a smaller ratio of fastest to slowest level an offset looks like a slope."""
+THRUST_RANGE = (0.05, 20.0)
+"""Largest thrust of all rotors over the weight; other values have a wrong unit or lever."""
+TORQUE_RANGE = (0.005, 20.0)
+"""Largest drag torque of all rotors over the weight times an arm, likewise."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class _Level:
 
 THRUST = {"motor_constant": 1.0}
 TORQUE = {"moment_constant": 1.0, "motor_constant": 1.0}
-"""What F · lever / (n Ω²) is the product of: k of a thrust stand, k_M k_F of a torque stand."""
+"""Powers of coefficients in F · lever / (n Ω²): k of a thrust stand, k_M k_F of a torque stand."""
 
 
-def stand(
+def measure_stand(
     name: str,
     path: str,
     samples: Mapping[str, Array],
@@ -61,15 +61,15 @@ def stand(
     samples
         ``time`` s, ``rotor_speed`` rad/s, ``force`` N.
     given
-        Which stand, how many rotors turned, and its lever with the relative standard error.
+        The stand, its number of rotors, and its lever with the relative standard error.
     vehicle
-        What the rotors have to carry.
+        Checks the plausibility.
 
     Raises
     ------
     RecordingError
         There are too few steps, they are too short, the force does not grow with the speed, or
-        thrust or torque are none of the vehicle's.
+        thrust or torque are implausible for the vehicle.
     """
     title, row, lever, lever_error = (
         ("Thrust stand", THRUST, given.lever_ratio, given.lever_ratio_error)
@@ -78,15 +78,15 @@ def stand(
     )
     time, speed, force = samples["time"], samples["rotor_speed"], samples["force"]
     levels, used, dropped = _levels(time, speed, force)
-    if len(levels) < FEWEST:
-        what = f"holds {len(levels)} steady levels of rotor speed of {SHORTEST:g} s and more"
-        raise RecordingError(path, what, f"record {FEWEST} or more, each for some seconds")
+    if len(levels) < MIN_LEVELS:
+        what = f"holds {len(levels)} steady levels of rotor speed of {MIN_LEVEL_S:g} s and more"
+        raise RecordingError(path, what, f"record {MIN_LEVELS} or more, each for some seconds")
     fastest, slowest = max(v.speed for v in levels), min(v.speed for v in levels)
-    if fastest < LEAST_SPEED_RATIO * slowest:
+    if fastest < MIN_SPEED_RATIO * slowest:
         what = f"has levels from {slowest:.0f} to {fastest:.0f} rad/s, too alike for a slope"
         raise RecordingError(path, what, "step from slow to fast")
     design = np.array([[v.speed**2, 1.0, v.time - levels[0].time] for v in levels])
-    if len(levels) < FEWEST + 2:
+    if len(levels) < MIN_LEVELS + 2:
         design = design[:, :2]
     measured = np.array([v.force for v in levels])
     solution, covariance = _weighted(design, measured, levels)
@@ -101,9 +101,9 @@ def stand(
         Remark("offset", {"force": float(solution[1])}),
     ]
     relative = design[:, 0] / design[:, 0].max()
-    bent = _weighted(np.column_stack([design, relative**2]), measured, levels)
-    bend, bend_error = float(bent[0][-1]), math.sqrt(bent[1][-1, -1])  # of Ω⁴ beside Ω²
-    if abs(bend) > 3 * bend_error and len(levels) >= FEWEST + 2:
+    curved = _weighted(np.column_stack([design, relative**2]), measured, levels)
+    bend, bend_error = float(curved[0][-1]), math.sqrt(curved[1][-1, -1])  # of Ω⁴ beside Ω²
+    if abs(bend) > 3 * bend_error and len(levels) >= MIN_LEVELS + 2:
         remarks.append(Remark("not_quadratic", {"deviation": bend / bend_error}))
     squares = design[:, 0]
     order = np.argsort(squares)
@@ -124,12 +124,14 @@ def stand(
     constant, top = slope * lever / given.rotors, float(np.nanquantile(speed, 0.95))
     thrust = len(vehicle.rotors) * constant * top**2
     weight = vehicle.mass * GRAVITY
-    lifts = LIFT[0] < thrust / weight < LIFT[1]
+    lifts = THRUST_RANGE[0] < thrust / weight < THRUST_RANGE[1]
     if row == THRUST and not lifts:
         what = f"gives {thrust:.3g} N of thrust at {top:.0f} rad/s to a vehicle of {vehicle.mass:g}"
         raise RecordingError(path, f"{what} kg", "check the force (N) and the lever ratio")
-    turns = TWIST[0] < thrust / (weight * ARM * size_of(vehicle).arm) < TWIST[1]  # of torque, N m
-    if row == TORQUE and not turns:
+    twists = (
+        TORQUE_RANGE[0] < thrust / (weight * ARM * size_of(vehicle).arm) < TORQUE_RANGE[1]
+    )  # of torque, N m
+    if row == TORQUE and not twists:
         what = f"gives {thrust:.3g} N m of torque at {top:.0f} rad/s to a vehicle of"
         remedy = "check the force (N) and the lever arm (m)"
         raise RecordingError(path, f"{what} {vehicle.mass:g} kg", remedy)
@@ -140,9 +142,9 @@ def stand(
 
 
 def _levels(time: Array, speed: Array, force: Array) -> tuple[list[_Level], NDArray[np.bool_], int]:
-    step = STEP * float(np.nanquantile(speed, 0.98))
-    parts, used, dropped = kept_levels(
-        speed, time, speed, np.isfinite(force), shortest=SHORTEST, step=step
+    step = SPEED_STEP * float(np.nanquantile(speed, 0.98))
+    parts, used, dropped = usable_plateaus(
+        speed, time, speed, np.isfinite(force), shortest=MIN_LEVEL_S, step=step
     )
     levels = [
         _Level(
@@ -156,10 +158,9 @@ def _levels(time: Array, speed: Array, force: Array) -> tuple[list[_Level], NDAr
 
 
 def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Array, Array]:
-    """Return the weighted least squares solution and covariance, Student's t for few levels.
+    """Return the weighted least squares solution and covariance, with Student's t for few levels.
 
-    A speed's error counts as a force's through the slope; the residuals' scatter about the law
-    scales them.
+    A speed's error becomes a force's by the slope; the residuals' scatter scales both.
     """
     slope = float(np.linalg.lstsq(design, measured, rcond=None)[0][0])
     variance = np.array(
@@ -172,21 +173,23 @@ def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Arr
     solution = inverse @ (design.T @ (weight * measured))
     residual = measured - design @ solution
     chi_square = float(residual @ (weight * residual))
-    return solution, widened(inverse, chi_square, len(levels) - design.shape[1])
+    return solution, widen(inverse, chi_square, len(levels) - design.shape[1])
 
 
-SHORTEST_COMMAND = 0.8
+MIN_COMMAND_S = 0.8
 COMMAND_STEP = 0.015
-"""Change of the command that counts as a step."""
-FEWEST_COMMANDS = 4
-VOLTAGE_RANGE = 1.015
-"""Ratio of the highest to the lowest voltage without which its exponent is not asked for."""
-QUADRATIC_THRESHOLD = 3.0
-"""Standard errors from which a quadratic term is believed."""
+"""A larger change of the command is a step."""
+MIN_COMMANDS = 4
+MIN_VOLTAGE_RATIO = 1.015
+"""With a smaller ratio of highest to lowest voltage its exponent is not fitted."""
+MIN_QUADRATIC_SIGMAS = 3.0
+"""A quadratic term with fewer standard errors is not significant."""
 
 
-def rpm_curve(name: str, path: str, samples: Mapping[str, Array], given: RpmCurve) -> Measurement:
-    """Return input scaling, zero position and, if the data ask for them, curvature and exponent.
+def measure_rpm_curve(
+    name: str, path: str, samples: Mapping[str, Array], given: RpmCurve
+) -> Measurement:
+    """Return input scaling, zero position and, if significant, curvature and exponent.
 
     Ω = (a u + b u² + c) (V/V_ref)^γ (Eq. 4.2, 4.4.1), one point for the middle of every step.
 
@@ -195,7 +198,7 @@ def rpm_curve(name: str, path: str, samples: Mapping[str, Array], given: RpmCurv
     samples
         ``time`` s, ``command`` 0..1, ``rotor_speed`` rad/s, and ``voltage`` V if it was recorded.
     given
-        With V_ref; else it is the highest that was recorded.
+        Gives V_ref; by default the highest recorded voltage.
 
     Raises
     ------
@@ -204,18 +207,18 @@ def rpm_curve(name: str, path: str, samples: Mapping[str, Array], given: RpmCurv
     """
     time, command, speed = samples["time"], samples["command"], samples["rotor_speed"]
     steady = np.isfinite(command) & np.isfinite(samples.get("voltage", command))
-    parts, used, dropped = kept_levels(
-        command, time, speed, steady, shortest=SHORTEST_COMMAND, step=COMMAND_STEP
+    parts, used, dropped = usable_plateaus(
+        command, time, speed, steady, shortest=MIN_COMMAND_S, step=COMMAND_STEP
     )
     battery = samples.get("voltage", np.ones(len(time)))
     points = [
         (float(np.mean(command[at])), *mean_and_error(speed[at]), float(np.mean(battery[at])))
         for _, at in parts
     ]
-    if len({round(point[0] / COMMAND_STEP) for point in points}) < FEWEST_COMMANDS:
-        what = f"holds {len(points)} steady steps of the command of {SHORTEST_COMMAND:g} s and more"
+    if len({round(point[0] / COMMAND_STEP) for point in points}) < MIN_COMMANDS:
+        what = f"holds {len(points)} steady steps of the command of {MIN_COMMAND_S:g} s and more"
         raise RecordingError(
-            path, what, f"record {FEWEST_COMMANDS} or more commands, each for seconds"
+            path, what, f"record {MIN_COMMANDS} or more commands, each for seconds"
         )
     u, omega, error, volts = (np.array(column) for column in zip(*points, strict=True))
     if not np.ptp(omega) > 0 or np.corrcoef(u, omega)[0, 1] < 0.8:
@@ -226,15 +229,15 @@ def rpm_curve(name: str, path: str, samples: Mapping[str, Array], given: RpmCurv
     if "voltage" in samples and not 0.5 < reference / float(volts.max()) < 2.0:
         what = f"holds {volts.min():.3g} to {volts.max():.3g} V, far from {reference:g} V"
         raise RecordingError(path, what, "give a reference_voltage of that battery")
-    sags = "voltage" in samples and float(volts.max() / volts.min()) > VOLTAGE_RANGE
+    sags = "voltage" in samples and float(volts.max() / volts.min()) > MIN_VOLTAGE_RATIO
     ratio = volts / reference if "voltage" in samples else np.ones_like(u)
-    straight = _fit(u, omega, error, ratio, quadratic=False, sags=sags)
+    straight = _fit_rpm_curve(u, omega, error, ratio, quadratic=False, sags=sags)
     bent = (
-        _fit(u, omega, error, ratio, quadratic=True, sags=sags)
-        if len(u) > FEWEST_COMMANDS
+        _fit_rpm_curve(u, omega, error, ratio, quadratic=True, sags=sags)
+        if len(u) > MIN_COMMANDS
         else None
     )
-    curved = bent is not None and abs(bent[0][2]) > QUADRATIC_THRESHOLD * math.sqrt(bent[1][2, 2])
+    curved = bent is not None and abs(bent[0][2]) > MIN_QUADRATIC_SIGMAS * math.sqrt(bent[1][2, 2])
     solution, covariance = bent if curved and bent is not None else straight
     remarks = [Remark("levels", {"levels": len(u), "outliers": dropped})]
     if "voltage" in samples:
@@ -280,10 +283,10 @@ def rpm_curve(name: str, path: str, samples: Mapping[str, Array], given: RpmCurv
     )
 
 
-def _fit(
+def _fit_rpm_curve(
     u: Array, omega: Array, error: Array, ratio: Array, *, quadratic: bool, sags: bool
 ) -> tuple[Array, Array]:
-    """Return a, c, b, γ and their covariance; what is not asked for is zero."""
+    """Return a, c, b, γ and their covariance; those not fitted are zero."""
     places = [0, 1, *([2] if quadratic else []), *([3] if sags else [])]
 
     def residuals(free: Array) -> Array:
@@ -296,7 +299,7 @@ def _fit(
     solution = least_squares(residuals, start, x_scale=np.array([500.0, 100.0, 100.0, 0.5])[places])
     freedom = max(len(u) - len(places), 1)
     inverse = np.linalg.pinv(solution.jac.T @ solution.jac)
-    small = widened(inverse, 2 * solution.cost, freedom)
+    small = widen(inverse, 2 * solution.cost, freedom)
     values, covariance = np.zeros(4), np.zeros((4, 4))
     values[places] = solution.x
     covariance[np.ix_(places, places)] = small

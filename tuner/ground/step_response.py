@@ -1,4 +1,4 @@
-"""Command steps to the motors' time constants and delay: the exact first-order response."""
+"""Time constants and delay of motors from command steps, by the exact first-order response."""
 
 from __future__ import annotations
 
@@ -14,40 +14,39 @@ from scipy.optimize import least_squares
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array, robust_sd, scaled_solve
 from tuner.ground.measurement import Curve, Measurement, Remark
-from tuner.ground.rig_data import OUTLIER, student
+from tuner.ground.rig_data import OUTLIER_SIGMAS, student_factor
 from tuner.vehicle.vehicle import longest
 
-LAGS = (0.001, 1.0)
-"""s, of motors with a propeller."""
-STEP = 0.02
-"""Change of the command between two samples that counts as a step."""
-FEWEST = 2
-"""Steps up, and steps down, without which a time constant has no error."""
-LEAST_TIME_CONSTANTS = 3.0
-"""Time constants that a step must last for its level to be known."""
-NOT_FIRST_ORDER = 0.1
-"""Share of the residuals' sum of squares that a second lag may explain in a first-order motor."""
-GUESSES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
-"""Time constants, s, from the best of which the fit begins."""
-EARLIEST = 0.05
-"""s by which a speed may react before its command's stamp, where two loggers wrote them."""
-REPORT_ABOVE = 2.0
-"""Standard errors by which it must do so for a remark."""
-MOST_STEPS = 200
-MOST = 12_000
-"""Samples beyond which those long after a step are thinned."""
+LAG_RANGE_S = (0.001, 1.0)
+"""Of motors with a propeller."""
+COMMAND_STEP = 0.02
+"""A larger change of the command between two samples is a step."""
+MIN_STEPS = 2
+"""With fewer steps up, or down, a time constant has no standard error."""
+MIN_TIME_CONSTANTS = 3.0
+"""A step must last for so many time constants to show its level."""
+MAX_SECOND_LAG_SHARE = 0.1
+"""A second lag that explains more of the residuals' squares contradicts a first-order motor."""
+START_TIME_CONSTANTS_S = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
+"""The fit starts from the best of these."""
+MAX_LEAD_S = 0.05
+"""A speed may react so early before its command's stamp if two loggers wrote them."""
+MIN_REPORTED_SIGMAS = 2.0
+"""A remark needs so many standard errors of it."""
+MAX_STEPS = 200
+MAX_SAMPLES = 12_000
+"""Samples long after a step are thinned beyond this count."""
 
 
-def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measurement:
+def measure_step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measurement:
     """Return time constants up and down, s, and the actuator latency, s.
 
     Between two steps of the command the speed approaches its level as exp(-(t - delay)/τ), with
     τ = time_constant_up while it rises and time_constant_down while it falls (Eq. 5.3); every level
-    is fitted. Where two loggers wrote speed and command, their clocks may differ, and the speed may
-    react before its command's stamp: the delay is estimated in both directions. One below zero is
-    no latency; how far the clocks are off, in either direction, is then in its interval, and a
-    remark says so. A second lag is tried beside it: where it explains much, the shape is not first
-    order (thesis 5.4.1), and a remark says so.
+    is fitted. The clocks of two loggers may differ, so that the speed reacts before its command's
+    stamp. Therefore the delay may be negative: the latency is then zero, its interval holds the
+    clocks' offset, and a remark says so. Another remark says if a second lag explains much, so that
+    the response is not first order (thesis 5.4.1).
 
     Parameters
     ----------
@@ -65,48 +64,48 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     near = _near_steps(time, command)
     time, command, speed = time[near], command[near], speed[near]
     edges = _edges(command)
-    if len(edges) > MOST_STEPS:
+    if len(edges) > MAX_STEPS:
         what = f"has a command that changes {len(edges)} times"
-        raise RecordingError(path, what, f"record no more than {MOST_STEPS} steps of the command")
+        raise RecordingError(path, what, f"record no more than {MAX_STEPS} steps of the command")
     rises = command[np.minimum(edges + 1, len(command) - 1)] > command[edges - 1]
     for direction, count in (("up", int(rises.sum())), ("down", int((~rises).sum()))):
-        if count < FEWEST:
+        if count < MIN_STEPS:
             what = f"holds {count} steps {direction} of the command"
-            raise RecordingError(path, what, f"record {FEWEST} or more in each direction")
+            raise RecordingError(path, what, f"record {MIN_STEPS} or more in each direction")
     steps = _Steps(time, np.concatenate([[0], edges, [len(time)]]), rises)
-    kept = _near_neighbours(speed)
-    first = _fit(steps, speed, kept, _first_guess(steps, speed, kept), second=False)
+    kept = _is_no_spike(speed)
+    first = _fit_lags(steps, speed, kept, _first_guess(steps, speed, kept), second=False)
     residual = steps.simulated(first, speed, kept) - speed
     spread = float(robust_sd(residual[kept]))
-    kept &= np.abs(residual) <= 2 * OUTLIER * spread
-    lags = _fit(steps, speed, kept, first, second=False)
+    kept &= np.abs(residual) <= 2 * OUTLIER_SIGMAS * spread
+    lags = _fit_lags(steps, speed, kept, first, second=False)
     up, down, delay = np.exp(lags[0]), np.exp(lags[1]), lags[2]
     shortest = float(np.diff(time[edges]).min(initial=np.inf))
-    if shortest < LEAST_TIME_CONSTANTS * max(up, down):
+    if shortest < MIN_TIME_CONSTANTS * max(up, down):
         slower = max(up, down)
         what = f"has steps of {shortest:.2g} s, too short for a time constant of {slower:.2g} s"
         raise RecordingError(path, what, "hold each command longer")
     covariance = _covariance(steps, lags, speed, kept)
-    # a step shows at the first sample after it: half an interval late on average, but by as much
-    # at every step where the log and the commands keep time
+    # a step shows at the first sample after it, half an interval late on average; the delay is
+    # the same at every step if log and commands are synchronous
     interval = float(np.median(np.diff(time)))
     covariance[2, 2] += interval**2 / 12
     latency = delay + 0.5 * interval
-    _check_motor(path, up, down, latency)
+    _check_lags(path, up, down, latency)
     early = max(-latency, 0.0)
-    reported = early > REPORT_ABOVE * math.sqrt(covariance[2, 2])
+    reported = early > MIN_REPORTED_SIGMAS * math.sqrt(covariance[2, 2])
     covariance[2, 2] += early**2  # clocks that differ may do so in either direction
     outliers = int((~kept).sum())
     numbers = {"up": int(rises.sum()), "down": int((~rises).sum()), "outliers": outliers}
     remarks = [Remark("steps", numbers)]
     if reported:
         remarks.append(Remark("command_late", {"seconds": early}))
-    richer = _fit(steps, speed, kept, lags, second=True)
+    richer = _fit_lags(steps, speed, kept, lags, second=True)
     plain = steps.simulated(lags, speed, kept)
     misfit = [float(np.sum((fit - speed)[kept] ** 2)) for fit in
               (plain, steps.simulated(richer, speed, kept))]  # fmt: skip
     explained = 1.0 - misfit[1] / max(misfit[0], 1e-300)
-    if explained > NOT_FIRST_ORDER:
+    if explained > MAX_SECOND_LAG_SHARE:
         lag = float(np.exp(richer[3]))
         remarks.append(Remark("not_first_order", {"explained": explained, "lag": lag}))
     titles = ("Step response", "time, s", "rotor speed, rad/s")
@@ -120,11 +119,13 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     )
 
 
-def _check_motor(path: str, up: float, down: float, latency: float) -> None:
-    """Refuse lags, in s, that no motor has."""
-    if not LAGS[0] <= min(up, down) <= max(up, down) <= LAGS[1]:
+def _check_lags(path: str, up: float, down: float, latency: float) -> None:
+    """Refuse implausible lags, in s."""
+    if not LAG_RANGE_S[0] <= min(up, down) <= max(up, down) <= LAG_RANGE_S[1]:
         what = f"gives time constants of {up:.2g} s up and {down:.2g} s down, motors have "
-        raise RecordingError(path, f"{what}{LAGS[0]:g} to {LAGS[1]:g} s", "check the time (s)")
+        raise RecordingError(
+            path, f"{what}{LAG_RANGE_S[0]:g} to {LAG_RANGE_S[1]:g} s", "check the time (s)"
+        )
     if latency > (most := longest("actuator_latency")):
         what = f"shows each command {latency:.2g} s late, motors up to {most:g} s"
         raise RecordingError(path, what, "stamp command and rotor speed by one clock")
@@ -132,32 +133,32 @@ def _check_motor(path: str, up: float, down: float, latency: float) -> None:
 
 def _edges(command: Array) -> NDArray[np.intp]:
     """Return the samples with which a new level of the command begins."""
-    edges = np.flatnonzero(np.abs(np.diff(command)) > STEP) + 1
+    edges = np.flatnonzero(np.abs(np.diff(command)) > COMMAND_STEP) + 1
     return np.asarray(edges[np.diff(edges, prepend=-10) > 1])
 
 
 def _near_steps(time: Array, command: Array) -> NDArray[np.bool_]:
-    """Return (n,) which samples to use: all, or of a long recording those after steps and some."""
+    """Return (n,) flags of used samples: in a long recording those after steps, and some others."""
     count = len(command)
-    near = np.arange(count) % max(1, 2 * count // MOST) == 0
+    near = np.arange(count) % max(1, 2 * count // MAX_SAMPLES) == 0
     edges = _edges(command)
-    reach = MOST // (2 * max(len(edges), 1))
-    before = min(max(2, round(EARLIEST / float(np.median(np.diff(time))))), reach)
-    for edge in edges[:MOST_STEPS]:
+    reach = MAX_SAMPLES // (2 * max(len(edges), 1))
+    before = min(max(2, round(MAX_LEAD_S / float(np.median(np.diff(time))))), reach)
+    for edge in edges[:MAX_STEPS]:
         near[max(edge - before, 0) : edge + reach] = True
     return np.asarray(near)
 
 
 @dataclass(frozen=True)
 class _Steps:
-    """The steps of a recording: sample times (n,) in s, begins of the levels, which ones rise."""
+    """The steps of a recording: sample times (n,) in s, bounds of the levels, rising steps."""
 
     time: Array
     bounds: NDArray[np.intp]
     rises: NDArray[np.bool_]
 
     def design(self, lags: Array) -> Array:
-        """Return (n, levels): the speed is linear in the levels once the lags are given."""
+        """Return (n, levels): the speed is linear in the levels for given lags."""
         levels = len(self.bounds) - 1
         design = np.zeros((len(self.time), levels))
         state = np.eye(levels)[0]
@@ -196,14 +197,14 @@ def _decay(time: Array, constant: float, lag: float) -> Array:
     return np.asarray((constant * slow - lag * quick) / (constant - lag))
 
 
-def _near_neighbours(speed: Array) -> NDArray[np.bool_]:
-    """Return (n,) which samples are no spikes of the tachometer."""
+def _is_no_spike(speed: Array) -> NDArray[np.bool_]:
+    """Return (n,) flags of samples that are no spikes of the tachometer."""
     difference = np.abs(speed - median_filter(speed, size=5, mode="nearest"))
     spread = max(float(robust_sd(difference)), 1e-9)
-    return np.asarray(difference <= 6 * OUTLIER * spread)
+    return np.asarray(difference <= 6 * OUTLIER_SIGMAS * spread)
 
 
-def _fit(
+def _fit_lags(
     steps: _Steps, speed: Array, kept: NDArray[np.bool_], start: Array, *, second: bool
 ) -> Array:
     """Return the logarithms of both time constants, the delay in s, and of a second lag.
@@ -211,13 +212,13 @@ def _fit(
     Parameters
     ----------
     start
-        (3,) where to begin with the first three.
+        (3,) of the first three.
     second
-        Whether there is a second lag; else it is left out.
+        Whether there is a second lag.
     """
     shortest = float(np.diff(steps.time[steps.bounds[1:-1]]).min(initial=1.0))
     more = int(second)
-    earliest = -min(EARLIEST, 0.5 * shortest)
+    earliest = -min(MAX_LEAD_S, 0.5 * shortest)
     low = np.array([math.log(1e-4), math.log(1e-4), earliest, *[math.log(1e-5)] * more])
     high = np.array([math.log(10.0), math.log(10.0), 0.5 * shortest, *[0.0] * more])
     begin = np.array([*start, *[start[:2].min() + math.log(0.3)] * more])
@@ -233,17 +234,17 @@ def _fit(
 
 
 def _first_guess(steps: _Steps, speed: Array, kept: NDArray[np.bool_]) -> Array:
-    """Return where to begin: the common time constant, of a few, that meets the speeds best."""
+    """Return the best start of a few common time constants."""
 
     def misfit(start: Array) -> float:
         return float(np.sum((steps.simulated(start, speed, kept) - speed)[kept] ** 2))
 
-    starts = [np.array([math.log(c), math.log(c), 0.002]) for c in GUESSES]
+    starts = [np.array([math.log(c), math.log(c), 0.002]) for c in START_TIME_CONSTANTS_S]
     return min(starts, key=misfit)
 
 
 def _covariance(steps: _Steps, lags: Array, speed: Array, kept: NDArray[np.bool_]) -> Array:
-    """Return the covariance (3, 3), from white noise or from steps that differ, the larger."""
+    """Return the covariance (3, 3): that of white noise, or a sandwich over steps if larger."""
     design = steps.design(lags)
     levels = _levels(design[kept], speed[kept])
     columns = []
@@ -261,8 +262,8 @@ def _covariance(steps: _Steps, lags: Array, speed: Array, kept: NDArray[np.bool_
     ])  # fmt: skip
     clusters = len(scores)
     sandwich = inverse @ (scores.T @ scores) @ inverse * clusters / max(clusters - 1, 1)
-    # few steps make the sandwich erratic: chance alone is taken off before it may widen
+    # few steps make the sandwich erratic: it must exceed chance to widen
     chance = 1.0 + math.sqrt(2.0 / max(clusters - 1, 1))
-    ratio = np.diag(sandwich) * student(clusters - 1) ** 2 / np.diag(white) / chance
+    ratio = np.diag(sandwich) * student_factor(clusters - 1) ** 2 / np.diag(white) / chance
     grown = np.sqrt(np.maximum(ratio, 1.0))
     return np.asarray((white * np.outer(grown, grown))[:3, :3])

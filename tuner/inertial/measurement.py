@@ -1,10 +1,10 @@
-"""A flight without a pose as a measurement of coefficients: what it says, and what it leaves open.
+"""Measurements of coefficients from flights without a pose.
 
-Thrust over mass and torque over inertia are all that specific force and body rate show. With the
-weighed mass and the vehicle file's curve of rotor speed over command, that is the motor constant
-and two moments of inertia; about z the moment constant over the third. The angular acceleration
-that no command asks for is a steady moment over inertia: the vehicle's trim. Without a tachometer
-the curve stays as it is, and only the motor constant times the square of its scale is known.
+Specific force and body rate show thrust over mass and torque over inertia. With the weighed mass
+and the vehicle file's curve of rotor speed over command, these give the motor constant, two moments
+of inertia, and about z the moment constant over the third. Angular acceleration without command is
+a steady moment over inertia: the vehicle's trim. Without a tachometer only the motor constant times
+the square of the curve's scale is known.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from tuner.core.errors import RecordingError
 from tuner.core.phrases import clause
 from tuner.findings.findings import remedy, sentence
 from tuner.ground.measurement import Curve, Measurement, Remark, scaled_of
-from tuner.inertial.fit import NAMES, OUTPUTS, STEADY, Response, fit_response
+from tuner.inertial.fit import NUMBER_NAMES, OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
 from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.loader import InertialFlight
 from tuner.vehicle import VehicleFile
 
-NUMBERS: tuple[Mapping[str, float], ...] = (
+POWERS: tuple[Mapping[str, float], ...] = (
     {"time_constant_up": 1.0},
     {"time_constant_down": 1.0},
     {"actuator_latency": 1.0},
@@ -37,16 +37,16 @@ NUMBERS: tuple[Mapping[str, float], ...] = (
     {"torque_trim_y": 1.0},
     {"torque_trim_z": 1.0},
 )
-"""Powers of the coefficients in each number of a `Response`: nothing recorded tells the scale of
-the rotors' curve, whose square goes with the motor constant."""
+"""Powers of the coefficients in each number of a `Response`. The scale of the rotors' curve is not
+observable; its square multiplies the motor constant."""
 OUTPUT_OF = dict(zip(STEADY, OUTPUTS, strict=False))
-"""The angular acceleration that each constant is of."""
-LEAST_EXPLAINED = 0.1
-"""Share of an output's variance below which nothing is taken from it."""
-LARGEST_ERROR = 0.25
-"""Relative standard error from which a gain says nothing: what it is of stays as it was."""
-CERTAIN_ERROR = 0.1
-"""That below which a gain of the wrong sign is the vehicle file's fault, and no chance."""
+"""Constant -> its output."""
+MIN_EXPLAINED = 0.1
+"""An output with a smaller explained share of its variance is not used."""
+MAX_RELATIVE_ERROR = 0.25
+"""A gain with a larger relative standard error is not used."""
+MAX_CERTAIN_ERROR = 0.1
+"""A gain of the wrong sign with a smaller one is an error of the vehicle file, not chance."""
 TITLES = {
     "roll": "angular acceleration about x, rad/s²",
     "pitch": "angular acceleration about y, rad/s²",
@@ -56,26 +56,28 @@ TITLES = {
 
 
 def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measurement:
-    """Return what a flight without a pose says of a vehicle of known mass and geometry.
+    """Return the measurement of a flight without a pose, for a known mass and geometry.
 
     Raises
     ------
     RecordingError
-        Its commands turn the vehicle the other way.
+        Its commands turn the vehicle the other way, or it does not move.
     """
     stretches = stretches_of(flight.series, flight.flying)
     longest = max(flight.flying, key=lambda span: span[1] - span[0])
     for finding in order_findings(flight.name, flight.series, vehicle, longest):
         raise RecordingError(flight.path, clause(sentence(finding)), clause(remedy(finding)))
     response = fit_response(stretches, vehicle)
-    wrong = [name for name in _shown(response, CERTAIN_ERROR) if response.gains[name] <= 0.0]
+    wrong = [
+        name for name in _outputs_within(response, MAX_CERTAIN_ERROR) if response.gains[name] <= 0.0
+    ]
     if wrong:
         raise RecordingError(
             flight.path,
             f"its commands turn the vehicle against the vehicle file in {', '.join(wrong)}",
             "check the motor order in the topic map, and the rotors' spins in the vehicle file",
         )
-    used = _used(response)
+    used = _used_numbers(response)
     if not set(used) & set(OUTPUTS):
         raise RecordingError(
             flight.path,
@@ -85,24 +87,26 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
     return _measurement(flight.name, response, used, vehicle)
 
 
-def _shown(response: Response, dim: float) -> list[str]:
-    """Return the outputs whose gains have relative standard errors below some."""
-    error = dict(zip(NAMES, np.sqrt(np.diag(response.covariance)), strict=True))
+def _outputs_within(response: Response, dim: float) -> list[str]:
+    """Return the outputs whose gains have relative standard errors below a limit."""
+    error = dict(zip(NUMBER_NAMES, np.sqrt(np.diag(response.covariance)), strict=True))
     return [
         name
         for name in OUTPUTS
-        if response.explained[name] > LEAST_EXPLAINED
+        if response.explained[name] > MIN_EXPLAINED
         and error[name] < dim * abs(response.gains[name])
     ]
 
 
-def _used(response: Response) -> tuple[str, ...]:
-    """Return the names of the numbers that the flight shows at all."""
-    error = dict(zip(NAMES, np.sqrt(np.diag(response.covariance)), strict=True))
-    shown = {name for name in _shown(response, LARGEST_ERROR) if response.gains[name] > 0.0}
-    lags = {name for name in ("up", "down") if error[name] < 2.0 * LARGEST_ERROR} | {"late"}
+def _used_numbers(response: Response) -> tuple[str, ...]:
+    """Return the names of the numbers that are used."""
+    error = dict(zip(NUMBER_NAMES, np.sqrt(np.diag(response.covariance)), strict=True))
+    shown = {
+        name for name in _outputs_within(response, MAX_RELATIVE_ERROR) if response.gains[name] > 0.0
+    }
+    lags = {name for name in ("up", "down") if error[name] < 2.0 * MAX_RELATIVE_ERROR} | {"late"}
     steady = {name for name, output in OUTPUT_OF.items() if output in shown}
-    return tuple(name for name in NAMES if name in shown | lags | steady)
+    return tuple(name for name in NUMBER_NAMES if name in shown | lags | steady)
 
 
 def _measurement(
@@ -126,7 +130,7 @@ def _measurement(
         name: over[output] / gains[output] for name, output in OUTPUT_OF.items() if name in used
     }
     values |= {name: response.steady[name] * moment for name, moment in inertia.items()}
-    places = [NAMES.index(number) for number in used]
+    places = [NUMBER_NAMES.index(number) for number in used]
     # gains enter by their logarithms, constants as moments
     slope = np.array(
         [1.0 / gains[n] if n in OUTPUTS else inertia[n] if n in STEADY else 1.0 for n in used]
@@ -135,7 +139,7 @@ def _measurement(
     explained = {name: 100.0 * max(response.explained[name], 0.0) for name in OUTPUTS}
     return Measurement(
         experiment=name,
-        rows=tuple(NUMBERS[place] for place in places),
+        rows=tuple(POWERS[place] for place in places),
         value=np.array([values[number] for number in used]),
         covariance=covariance,
         remarks=(Remark("explained", explained),),
@@ -149,7 +153,7 @@ def _measurement(
     )
 
 
-def agreeing(
+def widen_to_agree(
     measurements: Sequence[Measurement], chi_square: float, freedom: int
 ) -> tuple[Measurement, ...]:
     """Return the measurements with covariances as wide as their disagreement (Birge ratio).

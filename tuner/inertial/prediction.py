@@ -1,12 +1,12 @@
-"""How well a vehicle's body rate is predicted from its commands alone, and how far ahead.
+"""Errors of open-loop predictions of the body rate from commands, by time ahead.
 
-From the measured body rate on, open loop::
+From the measured body rate::
 
     I dω/dt = Σ lever·k·Ω² + trim - ω × Iω
 
-with Ω the rotor speeds that follow the commands. Air is left out: without a pose it is not known
-how fast the vehicle flies. What commands do not say of the torque adds up, so that holding the body
-rate is right more nearly from some time on: beyond it errors say nothing of a vehicle.
+with Ω the rotor speeds that follow the commands. Airspeed is unknown without a pose, and left out.
+Errors of the torque accumulate, so that a constant body rate becomes the better prediction after
+some time; later errors do not measure a vehicle.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from itertools import starmap
 import numpy as np
 
 from tuner.core.numerics import Array
-from tuner.inertial.signals import Stretch, smoothed
+from tuner.inertial.signals import Stretch, low_pass
 from tuner.objective.rotor_response import Lags, rotor_speeds
 from tuner.objective.rotor_signals import levers
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
 from tuner.vehicle.model import model_of
 
-AHEAD = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
-"""s."""
-STRIDE = 0.1
-"""s from one prediction to the next."""
+HORIZONS_S = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+"""Times ahead of the errors."""
+STRIDE_S = 0.1
+"""Time from one prediction to the next."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class RateErrors:
     Attributes
     ----------
     seconds
-        One of `AHEAD`.
+        One of `HORIZONS_S`.
     initial, fitted
-        By the vehicle that the fit began with, and by the one that it ended with.
+        By the initial and by the fitted vehicle.
     hold
-        By the body rate that was measured at the beginning.
+        By a constant body rate.
     """
 
     seconds: float
@@ -53,35 +53,37 @@ class RateErrors:
 def rate_errors(
     stretches: Sequence[Stretch], initial: VehicleFile, fitted: VehicleFile
 ) -> tuple[RateErrors, ...]:
-    """Return how well a flight's body rates are predicted; none where none flies long enough."""
+    """Return the errors of a flight's predictions; none without a stretch."""
     if not stretches:
         return ()
     missed = [
-        np.concatenate([_missed(stretch, vehicle) for stretch in stretches], axis=1)
+        np.concatenate([_prediction_errors(stretch, vehicle) for stretch in stretches], axis=1)
         for vehicle in (initial, fitted, None)
     ]
     errors = np.linalg.norm(missed, axis=-1).mean(axis=-1)
-    return tuple(starmap(RateErrors, zip(AHEAD, *errors.tolist(), strict=True)))
+    return tuple(starmap(RateErrors, zip(HORIZONS_S, *errors.tolist(), strict=True)))
 
 
-def _missed(stretch: Stretch, vehicle: VehicleFile | None) -> Array:
-    """Return the errors (S, n, 3) rad/s of predictions that begin every `STRIDE`."""
-    measured, inside = smoothed(stretch.body_rate, stretch.step), np.flatnonzero(stretch.inside)
-    places = [round(seconds / stretch.step) for seconds in AHEAD]
-    begin = inside[: max(0, len(inside) - places[-1]) : round(STRIDE / stretch.step)]
+def _prediction_errors(stretch: Stretch, vehicle: VehicleFile | None) -> Array:
+    """Return the errors (S, n, 3) rad/s of predictions that begin every `STRIDE_S`."""
+    measured, inside = low_pass(stretch.body_rate, stretch.step), np.flatnonzero(stretch.inside)
+    places = [round(seconds / stretch.step) for seconds in HORIZONS_S]
+    begin = inside[: max(0, len(inside) - places[-1]) : round(STRIDE_S / stretch.step)]
     rates = [measured[begin]]
     if vehicle is not None:
         value = values_of(vehicle)
         inertia = np.array([value[f"inertia_{axis}{axis}"] for axis in "xyz"])
         trim = np.array([value.get(f"torque_trim_{axis}", 0.0) for axis in "xyz"])
-        torque = value["motor_constant"] * _squares(stretch, vehicle) @ levers(vehicle) + trim
+        torque = (
+            value["motor_constant"] * _squared_speeds(stretch, vehicle) @ levers(vehicle) + trim
+        )
         for step in range(places[-1]):
             moment = torque[begin + step] - np.cross(rates[-1], inertia * rates[-1])
             rates.append(rates[-1] + stretch.step * moment / inertia)
     return np.stack([rates[min(n, len(rates) - 1)] - measured[begin + n] for n in places])
 
 
-def _squares(stretch: Stretch, vehicle: VehicleFile) -> Array:
+def _squared_speeds(stretch: Stretch, vehicle: VehicleFile) -> Array:
     motor, value = model_of(vehicle, ControllerFile()).vehicle.motor, values_of(vehicle)
     lags = Lags(value["time_constant_up"], value["time_constant_down"], value["actuator_latency"])
     return np.square(rotor_speeds(stretch.command, stretch.step, motor, lags))

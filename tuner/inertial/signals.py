@@ -1,4 +1,4 @@
-"""Gyro, accelerometer and commands on one clock, in the band in which rotors turn a vehicle."""
+"""Gyro, accelerometer and commands on one clock, in the band of rigid-body motion."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from tuner.core.numerics import Array
 from tuner.objective.inlets import linear_interpolation
 from tuner.recordings.flight import Series
 
-CUTOFF = 30.0
-"""Hz of the low-pass that measured and modelled signals pass alike: above it are propellers' and
-frames' vibrations, below it what motors of tens of ms can follow."""
-FASTEST = 500.0
-"""Hz of the common clock, at most."""
-END_MARGIN = 0.5
-"""s at both ends of a stretch that are left out: take-off, landing and the filters' ends."""
-BLOCK = 1.0
-"""s, longer than residuals are alike: the standard errors count such blocks, not samples."""
+CUTOFF_HZ = 30.0
+"""Low-pass of measured and modelled signals, between the band of motors with lags of tens of ms and
+vibrations of propellers and frame."""
+MAX_RATE_HZ = 500.0
+"""Of the common clock."""
+END_MARGIN_S = 0.5
+"""Both ends of a stretch are left out: take-off, landing and the filters' transients."""
+BLOCK_S = 1.0
+"""Longer than the correlation of residuals: standard errors count blocks, not samples."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Stretch:
     body_rate
         (n, 3) rad/s.
     force
-        (n, 3) m/s², the specific force that the accelerometer shows.
+        (n, 3) m/s², the specific force of the accelerometer.
     command
         (n, 4) 0..1.
     """
@@ -52,13 +52,13 @@ class Stretch:
 
     @property
     def inside(self) -> NDArray[np.bool_]:
-        """Which samples are far enough from the ends to be compared."""
-        ends = self.time[0] + END_MARGIN, self.time[-1] - END_MARGIN
+        """(n,) flags of samples that are not near the ends."""
+        ends = self.time[0] + END_MARGIN_S, self.time[-1] - END_MARGIN_S
         return np.asarray((self.time > ends[0]) & (self.time < ends[1]), dtype=np.bool_)
 
     @property
-    def coarser(self) -> Stretch:
-        """The same at half the rate."""
+    def at_half_rate(self) -> Stretch:
+        """The stretch at half the rate."""
         even = len(self.time) // 2 * 2
         command = self.command[:even].reshape(-1, 2, self.command.shape[1]).mean(axis=1)
         every = slice(0, even, 2)
@@ -70,11 +70,11 @@ def stretches_of(
 ) -> tuple[Stretch, ...]:
     """Return the stretches in the air on the clock of the slowest of the three signals."""
     names = ("body_rate", "acceleration", "command")
-    rate = min(FASTEST, *(series[name].rate for name in names))
+    rate = min(MAX_RATE_HZ, *(series[name].rate for name in names))
     stretches = []
     for begin, end in flying:
         count = int((end - begin) * rate)
-        if count >= 4 * END_MARGIN * rate - 1:
+        if count >= 4 * END_MARGIN_S * rate - 1:
             time = begin + np.arange(count) / rate
             stretches.append(
                 Stretch(time, *(linear_interpolation(series[name], time) for name in names))
@@ -82,23 +82,18 @@ def stretches_of(
     return tuple(stretches)
 
 
-def smoothed(values: Array, step: float) -> Array:
-    """Return (n, k) values without what is above the band, not delayed."""
-    return low_passed(values, step, CUTOFF)
-
-
-def low_passed(values: Array, step: float, cutoff: float) -> Array:
-    """Return (n, k) values without what is above a frequency in Hz, not delayed."""
+def low_pass(values: Array, step: float, cutoff: float = CUTOFF_HZ) -> Array:
+    """Return (n, k) values, low-passed without delay at a cutoff in Hz."""
     sections = signal.butter(2, cutoff, fs=1.0 / step, output="sos")
     return np.asarray(signal.sosfiltfilt(sections, values, axis=0))
 
 
 def blocks_of(stretches: tuple[Stretch, ...], order: int) -> NDArray[np.int64]:
-    """Return the number of its block for every compared step, but the first few of a stretch."""
+    """Return the block number of each compared step, without the first `order` of a stretch."""
     numbers, first = [], 0
     for stretch in stretches:
         inside = stretch.time[:-1][stretch.inside[:-1]][order:]
-        block = first + ((inside - inside[0]) / BLOCK).astype(np.int64)
+        block = first + ((inside - inside[0]) / BLOCK_S).astype(np.int64)
         numbers.append(block)
         first = int(block[-1]) + 1
     return np.concatenate(numbers)

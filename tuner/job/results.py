@@ -16,7 +16,13 @@ from tuner.core.numerics import Z95
 from tuner.core.runtime import PROGRAM, versions
 from tuner.core.yaml_document import commented, dump_yaml
 from tuner.design.proposals import LogProposal, Proposals
-from tuner.design.ranking import CLEARANCE, LEVEL, SMALLEST, Arena, rank_next_flights
+from tuner.design.ranking import (
+    CLEARANCE_M,
+    FLIGHT_HEIGHT_M,
+    MIN_RADIUS_M,
+    Arena,
+    rank_next_flights,
+)
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.evaluate.validation import (
     Validation,
@@ -392,9 +398,9 @@ def arena_of(flights: Sequence[Flight]) -> Arena:
     places = np.concatenate([flight.series["position"].values for flight in flights])
     x, y = (2.0 * float(np.nanmax(np.abs(places[:, axis]))) for axis in (0, 1))
     top = float(np.nanmax(places[:, 2]))
-    least = 2.0 * CLEARANCE + 2.0 * SMALLEST
+    least = 2.0 * CLEARANCE_M + 2.0 * MIN_RADIUS_M
     return Arena(
         x=round(max(x + MARGIN, least), 1),
         y=round(max(y + MARGIN, least), 1),
-        z=round(max(top + MARGIN, LEVEL + CLEARANCE), 1),
+        z=round(max(top + MARGIN, FLIGHT_HEIGHT_M + CLEARANCE_M), 1),
     )

@@ -18,7 +18,7 @@ from tuner.core.disk import result_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.core.phrases import clause
 from tuner.core.spans import span
-from tuner.design.next_log import what_to_log
+from tuner.design.next_log import propose_logs
 from tuner.design.proposals import LogProposal
 from tuner.evaluate.comparison import table_of
 from tuner.evaluate.validation import (
@@ -188,7 +188,7 @@ def _fit(
     next_log: tuple[LogProposal, ...] = ()
     if examination is not None and not stops:
         next_log = explanation.part(
-            "what to log", partial(what_to_log, job, fitted, examination.known, vehicle), next_log
+            "what to log", partial(propose_logs, job, fitted, examination.known, vehicle), next_log
         )
     result = written(effective, next_log)
     if options.cross_validate or options.bootstrap is not None:

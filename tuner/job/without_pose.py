@@ -15,7 +15,7 @@ from tuner.evaluate.validation import MAX_RMSE_INCREASE
 from tuner.findings.findings import Code, Finding, Level
 from tuner.ground.bench_json import Combination, combine
 from tuner.ground.measurement import Measurement, value_of
-from tuner.inertial.measurement import agreeing, measure_inertial
+from tuner.inertial.measurement import measure_inertial, widen_to_agree
 from tuner.inertial.prediction import RateErrors, rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, written
@@ -70,7 +70,7 @@ def fit_without_pose(
     left_out = (*left_out, *unusable)
     known = known_of(start)
     alone = combine(measured, known)
-    measurements = agreeing(measured, alone.chi_square, alone.degrees_of_freedom)
+    measurements = widen_to_agree(measured, alone.chi_square, alone.degrees_of_freedom)
     combination = _combined(measurements, known)
     path = Path(used[0].path)
     try:

@@ -11,7 +11,7 @@ from tests.tuner.uncertainty.making import ended
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import errors_of
 from tuner.design import next_log
-from tuner.design.next_log import what_to_log
+from tuner.design.next_log import propose_logs
 from tuner.design.proposals import LogProposal, next_log_in_words
 from tuner.objective.information import information_at
 from tuner.recordings.flight import Series
@@ -60,11 +60,11 @@ def thinned(series, every):
 @pytest.mark.long
 @pytest.mark.slow
 def test_what_is_foreseen_is_what_comes_of_it(full_flight, full_bag, updated, monkeypatch):
-    monkeypatch.setattr(next_log, "WORTH_LOGGING", 1.0)
+    monkeypatch.setattr(next_log, "MAX_WORTHWHILE_SHARE", 1.0)
     command = full_flight.series["command"]
     logged = with_series(full_flight, command=thinned(command, 2), rotor_speed=None)
     job, fitted, known = seen(logged, full_bag, updated)
-    proposals = what_to_log(job, fitted, known, updated)
+    proposals = propose_logs(job, fitted, known, updated)
     added, faster = sorted(proposals, key=lambda proposal: proposal.change)
 
     assert (added.signal, added.change) == ("rotor_speed", "added")
@@ -74,8 +74,8 @@ def test_what_is_foreseen_is_what_comes_of_it(full_flight, full_bag, updated, mo
     assert sentence.startswith("Log the rotor speed, at 100 Hz and good to")
 
     # speeds without noise would say what turns commands into speeds, and leave the rest to itself
-    monkeypatch.setattr(next_log, "TACHOMETER", 1e-6)
-    (exact,) = (p for p in what_to_log(job, fitted, known, updated) if p.change == "added")
+    monkeypatch.setattr(next_log, "TACHOMETER_NOISE", 1e-6)
+    (exact,) = (p for p in propose_logs(job, fitted, known, updated) if p.change == "added")
     rest = [job.space.names.index(name) for name in ("motor_constant", "inertia_xx")]
     alone = errors_of(known[np.ix_(rest, rest)]) / errors_of(known)[rest]
     shares = np.array(list(exact.shrinks.values()))
@@ -98,7 +98,7 @@ def test_a_log_too_slow_to_be_thinned_is_no_error(full_flight, full_bag, updated
     job = replace(job, recordings=(*job.recordings, held_out))
     monkeypatch.setattr(next_log, "job_of", refused)
     fitted = at_truth(job, updated)
-    assert what_to_log(job, fitted, np.eye(len(job.space)), updated) == ()
+    assert propose_logs(job, fitted, np.eye(len(job.space)), updated) == ()
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
@@ -124,7 +124,7 @@ def test_commands_that_could_be_fed_in_would_tell_what_turns_the_vehicle(
     settings = settings_of(updated, full_bag, free=("motor_constant", "inertia_xx", "inertia_yy"))
     job = job_of(settings, recordings_of(settings, [log]))
     assert job.inlets == ("attitude",)
-    (commands,) = what_to_log(job, at_truth(job, updated), np.eye(len(job.space)), updated)
+    (commands,) = propose_logs(job, at_truth(job, updated), np.eye(len(job.space)), updated)
     assert (commands.signal, commands.change) == ("command", "fed")
     assert set(commands.shrinks) == {"inertia_xx", "inertia_yy"}
     assert max(commands.shrinks.values()) < 0.2

@@ -18,7 +18,7 @@ from tuner.design.proposals import (
     Proposals,
     proposals_in_words,
 )
-from tuner.design.ranking import CLEARANCE, Arena, candidates, rank_next_flights
+from tuner.design.ranking import CLEARANCE_M, Arena, candidates, rank_next_flights
 from tuner.objective.normal_equations import Objective
 from tuner.search.progress import Fitted
 from tuner.uncertainty.examination import Examination, examine
@@ -101,7 +101,7 @@ def test_fewer_samples_of_larger_weight_carry_nearly_the_same_information(
     proposals: Proposals,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(proposed, "SAMPLE_RATE", 50.0)
+    monkeypatch.setattr(proposed, "MAX_SAMPLE_RATE_HZ", 50.0)
     coarser = ranked(examination, fitted)
     by_name = {row.name: row for row in coarser.flights}
     for row in proposals.flights:
@@ -122,9 +122,9 @@ def test_candidates_stay_between_the_walls(size: tuple[float, float, float]) -> 
     }
     for flight in flights:
         if flight.name != "yaw_spin":
-            assert flight.radius <= size[0] / 2 - CLEARANCE + 0.01
+            assert flight.radius <= size[0] / 2 - CLEARANCE_M + 0.01
         if flight.name in ("circle", "diagonal"):
-            assert flight.radius <= size[1] / 2 - CLEARANCE + 0.01
+            assert flight.radius <= size[1] / 2 - CLEARANCE_M + 0.01
 
 
 @pytest.mark.parametrize(

@@ -50,8 +50,8 @@ def test_a_hidden_torque_lasts_as_long_as_it_was_made_to(flown):
     early = LAGS <= 0.05
     made = np.exp(-LAGS[early] / LASTS)
     for axis in (0, 1):  # about z it is as small as the gyro's noise
-        np.testing.assert_allclose(observer.left[early, axis], made, atol=0.13)
-    assert not observer.left[-1].any()
+        np.testing.assert_allclose(observer.autocorrelation[early, axis], made, atol=0.13)
+    assert not observer.autocorrelation[-1].any()
 
 
 def test_what_is_known_of_it_predicts_turning_better(flown):

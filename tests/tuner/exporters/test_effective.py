@@ -57,7 +57,7 @@ def test_what_gazebo_lacks_is_named_by_groups_and_taken_away(make_run):
     )
     lost = lost_terms(run, GAZEBO_CLASSIC)
     assert lost == {"quadratic": ("quadratic",), "linear_drag": ("linear_drag_x",)}
-    bare = GAZEBO_CLASSIC.lacking(run.vehicle, ["quadratic", "linear_drag_x"])
+    bare = GAZEBO_CLASSIC.with_built_in(run.vehicle, ["quadratic", "linear_drag_x"])
     assert bare.motor.quadratic == 0.0
     assert set(bare.effects) == {"linear_drag_z", "rotor_drag_ratio_y"}
     assert lost_terms(run.model_copy(update={"vehicle": bare}), GAZEBO_CLASSIC) == {}
@@ -135,7 +135,7 @@ def test_nothing_free_is_nothing_refitted(run):
     }
     result = run.result.model_copy(update={"coefficients": fixed})
     found = find_effective(run.model_copy(update={"result": result}), GAZEBO_CLASSIC, recordings_of)
-    assert found.vehicle == GAZEBO_CLASSIC.lacking(run.vehicle, ["fuselage_drag"])
+    assert found.vehicle == GAZEBO_CLASSIC.with_built_in(run.vehicle, ["fuselage_drag"])
 
 
 def test_the_rmse_over_flights_is_of_distances_and_a_crash_stays_one():

@@ -11,13 +11,13 @@ from tests.tuner.ground import rigs
 from tuner.core.errors import RecordingError
 from tuner.core.shipped import configs_folder
 from tuner.ground.bench_json import combine
-from tuner.ground.bifilar import bifilar
-from tuner.ground.hovers import hover_weights, yaw_spin
+from tuner.ground.bifilar import measure_bifilar
+from tuner.ground.hovers import measure_hover_weights, measure_yaw_spin
 from tuner.ground.measurement import scaled_of
 from tuner.ground.plan import Experiment
-from tuner.ground.propeller import propeller
-from tuner.ground.stands import rpm_curve, stand
-from tuner.ground.step_response import step_response
+from tuner.ground.propeller import measure_propeller
+from tuner.ground.stands import measure_rpm_curve, measure_stand
+from tuner.ground.step_response import measure_step_response
 from tuner.vehicle import read_vehicle, with_values
 
 TRUTH = rigs.TRUTH
@@ -38,7 +38,7 @@ def plan(kind, **keys):
 def swing(random):
     samples, ruler = rigs.swing(random)
     errors = {"mass_error": 0.002 / ruler["mass"]}
-    return bifilar(
+    return measure_bifilar(
         "bifilar x", "x.csv", samples, plan("bifilar", axis="x", **ruler, **errors), QUAD
     )
 
@@ -46,7 +46,7 @@ def swing(random):
 def thrust(random, lever=None):
     samples = rigs.stand(random, slope=4 * TRUTH["motor_constant"], lever=LEVER)
     lever = lever or LEVER * (1 + random.normal(0, 0.005))
-    return stand(
+    return measure_stand(
         "thrust", "t.csv", samples, plan("thrust_stand", rotors=4, lever_ratio=lever), QUAD
     )
 
@@ -55,27 +55,29 @@ def torque(random):
     slope = 2 * TRUTH["moment_constant"] * TRUTH["motor_constant"]
     samples = rigs.stand(random, slope=slope, lever=ARM, noise=0.02)
     arm = ARM * (1 + random.normal(0, 0.005))
-    return stand("torque", "t.csv", samples, plan("torque_stand", rotors=2, lever_arm=arm), QUAD)
+    return measure_stand(
+        "torque", "t.csv", samples, plan("torque_stand", rotors=2, lever_arm=arm), QUAD
+    )
 
 
 def curve(random):
     given = plan("rpm_curve", reference_voltage=16.4)
-    return rpm_curve("rpm", "r.csv", rigs.steps_of_command(random), given)
+    return measure_rpm_curve("rpm", "r.csv", rigs.steps_of_command(random), given)
 
 
 def steps(random):
-    return step_response("steps", "s.csv", rigs.motor_steps(random))
+    return measure_step_response("steps", "s.csv", rigs.motor_steps(random))
 
 
 def hover(random):
     points = [{"mass": mass, "rotor_speed": speed} for mass, speed in rigs.hovers(random)]
-    return hover_weights("hover", plan("hover_weights", points=points), QUAD, Path())
+    return measure_hover_weights("hover", plan("hover_weights", points=points), QUAD, Path())
 
 
 def spin(random):
     names = ("yaw_rate", "rotor_speed_slow", "rotor_speed_fast")
     points = [dict(zip(names, point, strict=True)) for point in rigs.spins(random)]
-    return yaw_spin("spin", plan("yaw_spin", points=points), QUAD, Path())
+    return measure_yaw_spin("spin", plan("yaw_spin", points=points), QUAD, Path())
 
 
 def table(random):
@@ -85,7 +87,7 @@ def table(random):
     power = TRUTH["moment_constant"] * 2 * math.pi * force / diameter * scatter[1]
     numbers = {"thrust_coefficient": force, "power_coefficient": power}
     given = plan("propeller", diameter=diameter, air_density=density, **numbers)
-    return propeller("propeller", given, Path())
+    return measure_propeller("propeller", given, Path())
 
 
 RIGS = (swing, thrust, torque, curve, steps, hover, spin, table)
@@ -120,20 +122,20 @@ def test_a_stuck_tachometer_is_refused():
     samples = rigs.steps_of_command(np.random.default_rng(0))
     stuck = samples | {"rotor_speed": np.full(len(samples["time"]), 500.0)}
     with pytest.raises(RecordingError, match="does not follow the command; check the columns"):
-        rpm_curve("rpm", "r.csv", stuck, plan("rpm_curve"))
+        measure_rpm_curve("rpm", "r.csv", stuck, plan("rpm_curve"))
 
 
 def test_a_command_without_a_speed_is_left_out():
     samples = rigs.steps_of_command(np.random.default_rng(0))
     third = samples["command"] == np.unique(samples["command"])[2]
     gone = samples | {"rotor_speed": np.where(third, np.nan, samples["rotor_speed"])}
-    found = rpm_curve("rpm", "r.csv", gone, plan("rpm_curve", reference_voltage=16.4))
+    found = measure_rpm_curve("rpm", "r.csv", gone, plan("rpm_curve", reference_voltage=16.4))
     assert (np.abs(deviations(found)) < 4).all()
 
 
 def test_a_second_lag_is_named():
     samples = rigs.motor_steps(np.random.default_rng(0), second=0.02)
-    codes = {remark.code for remark in step_response("steps", "s.csv", samples).remarks}
+    codes = {remark.code for remark in measure_step_response("steps", "s.csv", samples).remarks}
     assert "not_first_order" in codes
 
 
@@ -144,7 +146,7 @@ def test_a_speed_that_reacts_before_its_commands_stamp_leaves_the_time_constants
         run = rigs.motor_steps(np.random.default_rng(seed), rate=400.0)
         count = len(run["time"]) - samples_early
         early = {name: run[name][:count] for name in ("time", "command")}
-        found = step_response(
+        found = measure_step_response(
             "steps", "s.csv", early | {"rotor_speed": run["rotor_speed"][samples_early:]}
         )
         off.append(deviations(found))

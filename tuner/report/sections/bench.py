@@ -7,8 +7,8 @@ import numpy as np
 from tuner.ground.bench_json import (
     ExperimentRecord,
     agreement_in_words,
+    is_of_flights,
     numbers_in_words,
-    of_flights,
     remarks_in_words,
 )
 from tuner.ground.measurement import Curve
@@ -29,7 +29,7 @@ def bench(contents: Contents) -> Section | None:
     rows = [
         (e.name, "; ".join(numbers_in_words(e)), " ".join(remarks_in_words(e))) for e in experiments
     ]
-    flown = of_flights(contents.bench)
+    flown = is_of_flights(contents.bench)
     columns = ("flight" if flown else "experiment", "gives", "what its checks noticed")
     table = Table(columns, rows, words=columns)
     charts = [
