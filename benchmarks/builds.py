@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.contest import STRIDE, Contest, rivals, simple
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.config.job import InletName, JobFile
 from tuner.core.errors import InputError
 from tuner.evaluate.prediction import Predictions, predict
@@ -72,7 +72,7 @@ def weighed_mass(path: Path) -> float:
 
 def _predicted(path: Path, mass: float) -> dict[str, list[Predictions]]:
     """Return each predictor's predictions of a flight's second half."""
-    settings = settle(Options([str(path)], vehicle="crazyflie", mass=mass))
+    settings = resolve_settings(Options([str(path)], vehicle="crazyflie", mass=mass))
     settings = replace(settings, job=JobFile(inlet=INLET))
     (recording,), _ = read_recordings(settings)
     whole = recording.flight

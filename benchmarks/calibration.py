@@ -30,7 +30,7 @@ from benchmarks.simulated_recordings import recorded
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from sim_jax.inlet import ReferenceInlet
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
@@ -180,7 +180,9 @@ def ranked_set(kind: Kind, seed: int) -> Ranked:
 def reference_job() -> Job:
     """Return the reference flights' job: their plan, stamps and noise."""
     paths = [str(path) for path in sorted((ROOT / "reference_flights").glob("*.bag"))]
-    settings = settle(Options(paths, config=str(ROOT / "reference_flights" / "tune.yaml")))
+    settings = resolve_settings(
+        Options(paths, config=str(ROOT / "reference_flights" / "tune.yaml"))
+    )
     return job_of(settings, read_recordings(settings)[0])
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks import fast_flights
 from benchmarks.table import Section, figure
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.equation_error.recorded_accelerations import Steps, steps_of
 from tuner.equation_error.regression import convolved, summing
 from tuner.job.run import run
@@ -79,9 +79,9 @@ def _row(seed: int, rate: float, fed: fast_flights.Fed, folder: Path) -> Iterato
             low, high = found.ci95 or (np.nan, np.nan)
             yield f"{found.best / truth:.3f} ± {0.5 * (high - low) / truth:.3f}"
     yield f"{sum(inside)} of {len(inside)}"
-    recordings, _ = read_recordings(settle(options))
+    recordings, _ = read_recordings(resolve_settings(options))
     fitted, held_out = ([r.flight for r in recordings if r.holdout is out] for out in (False, True))
-    vehicle = settle(options).vehicle
+    vehicle = resolve_settings(options).vehicle
     for ahead in AHEAD:
         yield figure(_predicted(result, "predicted_best", ahead))
         yield figure(_regression(fitted, held_out, vehicle, ahead)) if fed == "rotor_speed" else "–"

@@ -27,7 +27,7 @@ from benchmarks.lab_flights import METER, RATE, SECONDS, TRAJECTORIES, VOLTS, La
 from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure, table
 from sim_jax.schedule import Schedule
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
@@ -255,7 +255,7 @@ def job_at(lab: Lab, folder: Path, *, seed: int) -> tuple[Job, tuple[Finding, ..
     """Fly a laboratory; return the job of fitting its flights, and what is said before."""
     paths = write(lab, folder, seed=seed)
     return prepared(
-        settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
+        resolve_settings(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
     )
 
 

@@ -18,10 +18,10 @@ from benchmarks import builds, without_pose
 from benchmarks.contest import STEPS, STRIDE, Contest, rivals, simple
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.core.errors import InputError
 from tuner.evaluate.prediction import Predictions, predict
-from tuner.findings.sentences import PREDICTED
+from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.job.run import run
 from tuner.objective.inlets import INLETS
 from tuner.result import BEST_FIT_FILE, RunResult
@@ -39,7 +39,12 @@ HELD_OUT: Mapping[str, tuple[str, ...]] = {
 
 def measure() -> Section:
     """Fit and predict every set that is there."""
-    head = ["set", "predictor", "steps", *(f"{name} [{unit}]" for name, unit in PREDICTED.items())]
+    head = [
+        "set",
+        "predictor",
+        "steps",
+        *(f"{name} [{unit}]" for name, unit in PREDICTED_UNITS.items()),
+    ]
     rows: list[list[str]] = []
     notes = []
     for folder in sorted(path for path in FLIGHTS.glob("*") if path.is_dir()):
@@ -70,7 +75,7 @@ def _rows(name: str, contest: Contest) -> Iterator[list[str]]:
     for predictor, predictions in contest.predictions.items():
         for steps in STEPS:
             means = summary(predictions, steps / 100.0)
-            yield [name, predictor, str(steps), *(_cell(means[key]) for key in PREDICTED)]
+            yield [name, predictor, str(steps), *(_cell(means[key]) for key in PREDICTED_UNITS)]
 
 
 def summary(predictions: Sequence[Predictions], seconds: float) -> dict[str, float]:
@@ -79,7 +84,7 @@ def summary(predictions: Sequence[Predictions], seconds: float) -> dict[str, flo
     means = [p.mean(seconds) for p in predictions]
     return {
         name: float(np.average([mean[name] for mean in means], weights=counts))
-        for name in PREDICTED
+        for name in PREDICTED_UNITS
     }
 
 
@@ -96,7 +101,7 @@ def contest_of(folder: Path) -> Contest:
         Its recordings cannot be fitted.
     """
     options = options_of(folder)
-    recordings, _ = read_recordings(settle(options))
+    recordings, _ = read_recordings(resolve_settings(options))
     fitted = [recording.flight for recording in recordings if not recording.holdout]
     held_out = [recording for recording in recordings if recording.holdout]
     if not held_out or any(INLETS[recording.inlet].closed_loop for recording in recordings):
@@ -106,7 +111,7 @@ def contest_of(folder: Path) -> Contest:
         out, result = run(options, out=Path(name) / "run")
         seconds = time.perf_counter() - clock
         best = read_vehicle(out / BEST_FIT_FILE)
-    settings = settle(options)
+    settings = resolve_settings(options)
     late = {flight.name: flight.input_late for flight in result.flights}
     controller = controller_of(result)
     known = [(r.flight, r.inlet, late[r.flight.name]) for r in recordings if not r.holdout]

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.contest import STRIDE, Contest, rivals, simple
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.evaluate.prediction import Predictions, predict
@@ -47,7 +47,7 @@ def contest_of(folder: Path) -> Contest:
         Its recordings cannot be fitted.
     """
     paths = [str(path) for path in sorted(folder.glob("log*"))]
-    settings = settle(Options(paths, vehicle="crazyflie"))
+    settings = resolve_settings(Options(paths, vehicle="crazyflie"))
     flights = sorted(read_inertial_flights(settings)[0], key=_flown)
     if len(flights) < 2:
         raise InputError(folder, "it holds fewer than two flights without a pose", "")

@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks import work
 from benchmarks.table import Bar, Section, figure
 from benchmarks.timing import ROOT
+from tuner.config import resolve_settings
 from tuner.core import runtime
 from tuner.engine import Engine, engine_for
 
@@ -81,13 +82,13 @@ def _processes(engine: Engine, workers: int) -> dict[float, dict[str, float]]:
 
 def _cross_validation() -> tuple[dict[str, _Folds], list[str]]:
     """Return engine -> its cross-validation, and every table."""
-    from tuner.config import Options, settle  # noqa: PLC0415 (jax is configured first)
+    from tuner.config import Options  # noqa: PLC0415 (jax is configured first)
     from tuner.search.estimation import search  # noqa: PLC0415
     from tuner.search.job_flights import read_recordings  # noqa: PLC0415
     from tuner.search.problem import job_of  # noqa: PLC0415
     from tuner.uncertainty.refits import CROSS_VALIDATION_FILE, cross_validate  # noqa: PLC0415
 
-    settings = settle(Options([str(path) for path in sorted(FOLDER.glob("*.bag"))]))
+    settings = resolve_settings(Options([str(path) for path in sorted(FOLDER.glob("*.bag"))]))
     job = job_of(settings, read_recordings(settings)[0])
     found, tables = {}, []
     with tempfile.TemporaryDirectory() as name:

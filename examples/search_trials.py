@@ -27,7 +27,7 @@ from tuner.core.runtime import configure
 
 configure()
 
-from tuner.config import Options, Settings, settle  # noqa: E402 (jax is configured first)
+from tuner.config import Options, Settings, resolve_settings  # noqa: E402 (jax is configured first)
 from tuner.engine import Report, engine_for  # noqa: E402
 from tuner.evaluate.validation import validate, vehicle_fitted  # noqa: E402
 from tuner.findings.findings import Code  # noqa: E402
@@ -52,7 +52,7 @@ SPOILT = "diagonal_3mps"
 def settings_of(**options: object) -> Settings:
     """Return the settings of the shipped job, some of them changed."""
     changed = Options([str(path) for path in sorted(FOLDER.glob("*.bag"))], **options)  # type: ignore[arg-type]
-    return settle(changed)
+    return resolve_settings(changed)
 
 
 def truth() -> dict[str, float]:

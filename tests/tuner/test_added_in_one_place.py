@@ -30,7 +30,7 @@ from sim_jax.terms import total
 from tests.memory import BEFORE_A_FIT, give_back
 from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
 from tuner.cli.options import EACH, EVERY
-from tuner.config import JobFile, settle
+from tuner.config import JobFile, resolve_settings
 from tuner.core import shipped
 from tuner.core.errors import ConfigError, ExportError
 from tuner.core.phrases import Worded
@@ -38,7 +38,7 @@ from tuner.core.yaml_section import build, section_of
 from tuner.evaluate.simulation_files import write_flights
 from tuner.exporters.simulators import THIS_PROJECT, registry_entries
 from tuner.exporters.target import Draft, Target, differences
-from tuner.findings.findings import Finding, brief, one_line
+from tuner.findings.findings import Finding, one_line, shorten_finding
 from tuner.options import FILES, Options
 from tuner.recordings.inspection import inspect_recordings
 from tuner.vehicle import (
@@ -113,10 +113,10 @@ def test_an_option_is_one_field_for_the_command_line_python_the_job_file_and_htt
     (tmp_path / "tune.yaml").write_text("search: {starts: 2, seed: 7}\n")
     typed = app(["--flights", str(bag), "--starts", "3"])
     assert typed == MoreOptions.of([bag], starts=3)
-    settled = settle(typed).job.search
+    settled = resolve_settings(typed).job.search
     assert (settled.starts, settled.seed) == (3, 7)
     with pytest.raises(ConfigError, match="command line: starts is 9; it should be at most 8"):
-        settle(MoreOptions.of([bag], starts=9))
+        resolve_settings(MoreOptions.of([bag], starts=9))
     with pytest.raises(ConfigError, match=r"stats: is no option; did you mean 'starts'\?"):
         MoreOptions.of([bag], stats=3)
     of_http = section_of(MoreOptions, leaving=FILES)
@@ -258,7 +258,7 @@ class More(Worded):
 def test_a_finding_is_one_entry_with_its_sentence_and_remedy():
     finding = Finding(More.SAIL_TORN, "warning", "circle", {"seconds": 3.0}, ("main_sail",))
     assert one_line(finding) == "warning: circle: Its main sail tore after 3 s. Mend it."
-    assert brief(finding, 60).startswith("circle: Its main sail tore")
+    assert shorten_finding(finding, 60).startswith("circle: Its main sail tore")
     with pytest.raises(TypeError):
         Worded("SAIL", {"TORN": "torn"})  # no code without its sentence
 

@@ -56,7 +56,7 @@ def nothing_outside(folder: Path):
 def test_a_file_s_name_is_plain_whatever_it_is_made_of(name, suffix):
     made = file_name(name, suffix)
     assert re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]*", made)
-    assert len(made) <= disk.LONGEST_NAME
+    assert len(made) <= disk.MAX_NAME_LETTERS
     assert made.endswith(suffix)
     assert file_name(made) == made or suffix
 

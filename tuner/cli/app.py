@@ -16,7 +16,7 @@ from cyclopts import App, CycloptsError
 from tuner.cli.options import EVERY, TYPED
 from tuner.cli.tune import tune
 from tuner.core.errors import InputError, ServerFaultError, did_you_mean
-from tuner.core.phrases import visible
+from tuner.core.phrases import printable
 
 SUMMARY = "Fit the coefficients of a multirotor simulator to recorded flights."
 
@@ -216,5 +216,5 @@ def _help(arguments: Sequence[str]) -> str:
 
 
 def _say(line: str, status: int) -> int:
-    sys.stderr.write(visible(f"tune: {' '.join(line.split())}") + "\n")
+    sys.stderr.write(printable(f"tune: {' '.join(line.split())}") + "\n")
     return status

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from tuner.cli.options import EACH, TYPED, Quiet, Verbose
 from tuner.core.errors import InputError
-from tuner.core.phrases import visible
+from tuner.core.phrases import printable
 from tuner.options import (
     ExaminationOptions,
     ExportOptions,
@@ -74,7 +74,7 @@ def inspect(
         console().print(render(inspections, words))
     if errors:
         for error in errors[:-1]:
-            sys.stderr.write(visible(f"tune: {error}") + "\n")
+            sys.stderr.write(printable(f"tune: {error}") + "\n")
         raise errors[-1]
 
 

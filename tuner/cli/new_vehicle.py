@@ -79,7 +79,7 @@ def new_vehicle(
     like
         Scale from this known vehicle, and take from it what is not given.
     """
-    from tuner.vehicle.scaling_laws import KNOWN
+    from tuner.vehicle.scaling_laws import KNOWN_AIRFRAMES
     from tuner.vehicle.scaling_laws import new_vehicle as make
 
     if layout != "x":
@@ -97,7 +97,7 @@ def new_vehicle(
             propeller = input("Propeller, diameter x pitch in inch, as 11x4.7: ").strip()
     for option, value in given.items():
         _check(option, value)
-    airframe = _airframe(given, propeller, KNOWN.get(like or ""))
+    airframe = _airframe(given, propeller, KNOWN_AIRFRAMES.get(like or ""))
     estimates = make(airframe, out, like=like)
     if not quiet:
         from tuner.cli.tables import print_estimates

@@ -12,7 +12,7 @@ from typing import Any
 from tuner.core.disk import write_text
 from tuner.core.files import csv_text
 from tuner.core.phrases import listed
-from tuner.core.spans import OF_JAX, Recorder, Row, Span, beside_of, recording, table_of
+from tuner.core.spans import JAX_STAGES, Recorder, Row, Span, beside_of, recording, table_of
 from tuner.report.section import Table
 
 TABLE_FILE = "profile.csv"
@@ -46,7 +46,7 @@ def profiling(wanted: bool, *, quiet: bool) -> Iterator[Callable[[Path], None]]:
             _print(rows, recorder, folder)
 
 
-_COLUMNS = ("seconds", "processor", *OF_JAX.values(), "rest")
+_COLUMNS = ("seconds", "processor", *JAX_STAGES.values(), "rest")
 _HEADER = ("stage", *(f"{name} [s]" for name in _COLUMNS), "programs")
 
 

@@ -56,7 +56,7 @@ DOING = {
 def listening(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
     """Yield a listener that shows a run on the terminal, or nothing; each message if verbose."""
     from tuner.cli.results import WIDTH, estimates_table, folds_table
-    from tuner.findings.findings import brief
+    from tuner.findings.findings import shorten_finding
     from tuner.job.listener import SILENT, Listener
 
     if quiet:
@@ -80,7 +80,7 @@ def listening(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
         search.show(iteration)
 
     def show_doubt(finding: Finding) -> None:
-        say(f"! {brief(finding, WIDTH - 2)}")
+        say(f"! {shorten_finding(finding, WIDTH - 2)}")
 
     shown = Listener(on_iteration=on_iteration, on_doubt=show_doubt, on_stop=say)
     if verbose:

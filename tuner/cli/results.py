@@ -96,11 +96,13 @@ def _origins(result: RunResult) -> list[str]:
 
 
 def _warnings(result: RunResult) -> list[Text]:
-    from tuner.findings.findings import brief, with_alike_together
-    from tuner.report.outcome import by_weight
+    from tuner.findings.findings import merge_alike, shorten_finding
+    from tuner.report.outcome import sort_by_weight
 
-    found = with_alike_together(by_weight(result.findings))
-    lines = [Text(f"! {brief(one, WIDTH - 2)}", "yellow") for one in found[:MOST_WARNINGS]]
+    found = merge_alike(sort_by_weight(result.findings))
+    lines = [
+        Text(f"! {shorten_finding(one, WIDTH - 2)}", "yellow") for one in found[:MOST_WARNINGS]
+    ]
     if len(found) > MOST_WARNINGS:
         more = f"! {len(found) - MOST_WARNINGS} more warnings are in the report."
         lines.append(Text(more, "yellow"))

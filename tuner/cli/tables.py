@@ -11,7 +11,7 @@ from rich.segment import Segment
 from rich.table import Table as DrawnTable
 from rich.text import Text
 
-from tuner.core.phrases import visible
+from tuner.core.phrases import printable
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.report.section import Cell, Table
 
@@ -35,7 +35,7 @@ class _Screen(Console):
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
         for text, style, control in super().render(renderable, options):
-            yield Segment(text if control else visible(text), style, control)
+            yield Segment(text if control else printable(text), style, control)
 
 
 def console(width: int = WIDTH) -> Console:

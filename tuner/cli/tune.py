@@ -43,19 +43,19 @@ def tune(
             from tuner.core.runtime import configure
 
             configure()
-            from tuner.config import settle
+            from tuner.config import resolve_settings
             from tuner.job.run import run
             from tuner.search.job_flights import read_inertial_flights
 
         with span("reading"):
-            bare, left_out = read_inertial_flights(settle(options))
+            bare, left_out = read_inertial_flights(resolve_settings(options))
         told = listening(quiet=quiet, verbose=verbose)
         if bare:
             from tuner.job.without_pose import fit_without_pose
 
             with told as listener:
                 measured = fit_without_pose(
-                    settle(options),
+                    resolve_settings(options),
                     bare,
                     left_out=left_out,
                     out=options.out,

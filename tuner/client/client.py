@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from tuner.config import Settings, settle
+from tuner.config import Settings, resolve_settings
 from tuner.core.disk import inside, result_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.core.shipped import Kind, configs_folder, find_config
@@ -394,7 +394,7 @@ def request_of(options: FitOptions) -> tuple[tuple[Path, ...], dict[str, Any]]:
     InputError
         A path, name or value cannot be used, here or by any server.
     """
-    settled = settle(options)
+    settled = resolve_settings(options)
     names = (field.name for field in fields(FitOptions) if field.name not in FILES)
     request = {name: getattr(options, name) for name in names}
     request["settings"] = _settings(settled)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tuner.config.job import CHANNELS, JobFile, TrajectorySettings, read_job
-from tuner.config.settings import Settings, find_job_file, settle
+from tuner.config.settings import Settings, find_job_file, resolve_settings
 from tuner.options import Options
 
 __all__ = [
@@ -14,5 +14,5 @@ __all__ = [
     "TrajectorySettings",
     "find_job_file",
     "read_job",
-    "settle",
+    "resolve_settings",
 ]

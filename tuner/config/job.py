@@ -10,17 +10,9 @@ from pydantic import AfterValidator, Field, model_validator
 
 from tuner.core.errors import ConfigError, did_you_mean
 from tuner.core.shipped import EXPORT_TARGETS, Kind, find_config
-from tuner.core.yaml_section import (
-    Flag,
-    Number,
-    Positive,
-    Section,
-    Whole,
-    read_model,
-    refuse,
-)
+from tuner.core.yaml_section import Flag, Number, Positive, Section, Whole, read_model, refuse
 from tuner.options import Method
-from tuner.vehicle import COEFFICIENTS, conditions, term_groups
+from tuner.vehicle import COEFFICIENTS, condition_rows, term_groups
 
 #: Recorded signals whose residuals a fit can weigh, in this order everywhere.
 CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command", "acceleration")
@@ -28,10 +20,10 @@ CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command", "acce
 #: Where a recording can be fed into the simulated loop, the upstream places first.
 InletName = Literal["reference", "body_rate", "actuator", "rotor_speed", "attitude"]
 InletChoice = Literal["auto", InletName]
-ErrorOf = Literal["auto", "output", "prediction"]
+ErrorKind = Literal["auto", "output", "prediction"]
 
 
-def _known(word: str, known: tuple[str, ...], kind: str) -> str:
+def _require_known(word: str, known: tuple[str, ...], kind: str) -> str:
     if word not in known:
         raise refuse(f"unknown {kind} '{word}'", did_you_mean(word, known))
     return word
@@ -41,32 +33,32 @@ def _terms() -> tuple[str, ...]:
     """Return the names of groups of terms, of the coefficients in them, and of surroundings."""
     groups = term_groups()
     names = (name for group, names in groups.items() for name in names if name != group)
-    surroundings = (word for name, row in conditions().items() for word in (row.group, name))
+    surroundings = (word for name, row in condition_rows().items() for word in (row.group, name))
     return (*groups, *names, *dict.fromkeys(surroundings))
 
 
 CoefficientName = Annotated[
-    str, AfterValidator(lambda name: _known(name, tuple(COEFFICIENTS), "coefficient"))
+    str, AfterValidator(lambda name: _require_known(name, tuple(COEFFICIENTS), "coefficient"))
 ]
-TermName = Annotated[str, AfterValidator(lambda name: _known(name, _terms(), "term"))]
+TermName = Annotated[str, AfterValidator(lambda name: _require_known(name, _terms(), "term"))]
 FormatName = Annotated[
-    str, AfterValidator(lambda name: _known(name, tuple(EXPORT_TARGETS), "export format"))
+    str, AfterValidator(lambda name: _require_known(name, tuple(EXPORT_TARGETS), "export format"))
 ]
-ChannelName = Annotated[str, AfterValidator(lambda name: _known(name, CHANNELS, "channel"))]
+ChannelName = Annotated[str, AfterValidator(lambda name: _require_known(name, CHANNELS, "channel"))]
 
 
 Weight = Annotated[Number, Interval(ge=1e-6, le=1e6)]
 
 
 class Prior(Section):
-    """What is believed of a coefficient before the flights: mean ± standard deviation, its unit."""
+    """Prior of a coefficient: mean ± standard deviation, in its unit."""
 
     mean: Number
     sd: Positive
 
 
 class CoefficientSettings(Section):
-    """How the search may move one coefficient; None leaves the tuner's own choice.
+    """Bounds, scale and prior of one coefficient; None leaves the default.
 
     Attributes
     ----------
@@ -104,7 +96,7 @@ class CoefficientSettings(Section):
 
 
 class Search(Section):
-    """How the minimum is looked for.
+    """Settings of the search.
 
     Attributes
     ----------
@@ -129,7 +121,7 @@ class Search(Section):
     """
 
     method: Method = "auto"
-    criterion: ErrorOf = "auto"
+    criterion: ErrorKind = "auto"
     seed: Annotated[Whole, Ge(0)] = 0
     starts: Annotated[Whole, Interval(ge=1, le=1024)] = 1
     spread: Annotated[Number, Interval(gt=1, le=10)] = 2.0
@@ -138,7 +130,7 @@ class Search(Section):
     max_iterations: Annotated[Whole, Interval(ge=1, le=100_000)] = 100
 
 
-def _of_a_shape(name: str) -> str:
+def _known_shape(name: str) -> str:
     from sim_jax.trajectory import shapes  # noqa: PLC0415 (loads JAX, which most commands spare)
 
     if name not in shapes():
@@ -146,7 +138,7 @@ def _of_a_shape(name: str) -> str:
     return name
 
 
-TrajectoryName = Annotated[str, AfterValidator(_of_a_shape)]
+TrajectoryName = Annotated[str, AfterValidator(_known_shape)]
 
 
 class TrajectorySettings(Section):
@@ -174,7 +166,7 @@ class TrajectorySettings(Section):
 
 
 class FlightSettings(Section):
-    """What holds for one flight alone; None leaves what holds for all.
+    """Settings of one flight; None leaves those of all.
 
     Attributes
     ----------
@@ -195,7 +187,7 @@ class FlightSettings(Section):
 
 
 class ExportSettings(Section):
-    """What is exported into the result folder beside ``best_fit.yaml``.
+    """Exports into the result folder beside ``best_fit.yaml``.
 
     Attributes
     ----------
@@ -285,15 +277,15 @@ class JobFile(Section):
     def _contradict_nothing(self) -> Self:
         if self.free is not None and self.fixed:
             raise refuse("both 'free' and 'fixed' are given", "keep one of them")
-        _once("free", self.free or ())
-        _once("terms", () if isinstance(self.terms, str) else self.terms)
+        _require_once("free", self.free or ())
+        _require_once("terms", () if isinstance(self.terms, str) else self.terms)
         for term in () if isinstance(self.terms, str) else self.terms:
             for name in term_groups().get(term, (term,)):
                 if name in self.fixed:
                     raise refuse(
                         f"'{name}' is both among terms and fixed", "keep it in one of them"
                     )
-        _once("ties", tuple(name for group in self.ties for name in group))
+        _require_once("ties", tuple(name for group in self.ties for name in group))
         if self.channels and not any(self.channels.get(name, True) for name in CHANNELS):
             raise refuse("every channel is switched off", "leave one on")
         return self
@@ -328,7 +320,7 @@ def read_job(path: str | Path) -> JobFile:
     return job.model_copy(update=paths)
 
 
-def _once(key: str, names: tuple[str, ...]) -> None:
+def _require_once(key: str, names: tuple[str, ...]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise refuse(f"{key} names '{name}' twice", "keep it once")

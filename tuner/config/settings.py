@@ -58,12 +58,12 @@ class Settings:
 
     @property
     def weighed(self) -> bool:
-        """Whether the mass is of the user: an option, or a file that does not ship."""
+        """Whether the user gave the mass: by an option, or a file of their own."""
         origin = self.origin["mass"]
         return not (origin.startswith("default") or str(configs_folder()) in origin)
 
 
-def settle(asked: FlightOptions, *, fits: bool = True) -> Settings:
+def resolve_settings(asked: FlightOptions, *, fits: bool = True) -> Settings:
     """Read what the options and the flights' job file name, and let the command line win.
 
     Parameters
@@ -89,7 +89,7 @@ def settle(asked: FlightOptions, *, fits: bool = True) -> Settings:
 
     holdout, extra = _holdout(options, job, flights)
     flights = (*flights, *extra)
-    _names_are_distinct(flights)
+    _require_distinct_names(flights)
     _check_flight_names(job, job_path, flights)
     if fits and all(flight.stem in holdout for flight in flights):
         raise InputError("--holdout", "holds out all flights", "leave one to fit")
@@ -101,22 +101,24 @@ def settle(asked: FlightOptions, *, fits: bool = True) -> Settings:
     named = options.vehicle
     if named is None and options.bench is not None:
         named = str(Path(options.bench) / "best_fit.yaml")
-    vehicle, origin["vehicle"] = _choose("vehicles", read_vehicle, named, job.vehicle, job_path)
+    vehicle, origin["vehicle"] = _choose_file(
+        "vehicles", read_vehicle, named, job.vehicle, job_path
+    )
     check_rotors(vehicle)
-    controller, origin["controller"] = _choose(
+    controller, origin["controller"] = _choose_file(
         "controllers", read_controller, options.controller, job.controller, job_path
     )
     if job.mass is not None:
         vehicle = with_values(vehicle, {"mass": job.mass})
-    origin["mass"] = _from(
+    origin["mass"] = _origin_of(
         "--mass" if options.mass is not None else None,
         job_path if job.mass is not None else None,
         origin["vehicle"],
     )
-    origin["holdout"] = _from(
+    origin["holdout"] = _origin_of(
         "--holdout" if options.holdout is not None else None, job_path if holdout else None
     )
-    origin["free coefficients"] = _from(
+    origin["free coefficients"] = _origin_of(
         "--fit" if options.fit is not None else "--fix" if options.fix is not None else None,
         job_path if job.free is not None or job.fixed else None,
     )
@@ -146,14 +148,14 @@ def find_job_file(flights: Iterable[Path]) -> Path | None:
 M = TypeVar("M", VehicleFile, ControllerFile)
 
 
-def _choose(
+def _choose_file(
     kind: Kind,
     read: Callable[[Path], M],
     option: str | M | None,
     in_job: Path | None,
     job_path: Path | None,
 ) -> tuple[M, str]:
-    """Return what is named first, and where it comes from."""
+    """Return the first named file, and its origin."""
     if isinstance(option, str):
         path = find_config(kind, option, Path())
         return read(path), f"--{kind.removesuffix('s')} {path}"
@@ -165,7 +167,7 @@ def _choose(
     return read(path), f"default ({path.name})"
 
 
-def _from(option: str | None, job_path: Path | None, otherwise: str = "default") -> str:
+def _origin_of(option: str | None, job_path: Path | None, otherwise: str = "default") -> str:
     return option or (str(job_path) if job_path else otherwise)
 
 
@@ -175,11 +177,11 @@ def _holdout(
     """Return the held-out flights' names and the recordings that are named only as such."""
     names = {flight.stem for flight in flights}
     if options.holdout is None:
-        return tuple(name for name in job.holdout if is_among(name, names)), ()
+        return tuple(name for name in job.holdout if names_recording(name, names)), ()
     holdout: list[str] = []
     extra: list[Path] = []
     for word in options.holdout:
-        if is_among(word, names):
+        if names_recording(word, names):
             holdout.append(word)
         elif meant := sorted(fnmatch.filter(names, word)):  # before files that happen to lie here
             holdout += meant
@@ -221,12 +223,12 @@ def _override(job: JobFile, options: Options, holdout: tuple[str, ...]) -> JobFi
     return job.replace(**changes)
 
 
-def is_among(name: str, recordings: Collection[str]) -> bool:
+def names_recording(name: str, recordings: Collection[str]) -> bool:
     """Return whether a flight is of one of these recordings: the only mission, or ``NAME-2``."""
     return name in recordings or re.sub(r"-\d+$", "", name) in recordings
 
 
-def _names_are_distinct(flights: tuple[Path, ...]) -> None:
+def _require_distinct_names(flights: tuple[Path, ...]) -> None:
     seen: dict[str, Path] = {}
     for flight in flights:
         if flight.stem in seen:
@@ -242,7 +244,7 @@ def _check_flight_names(job: JobFile, job_path: Path | None, flights: tuple[Path
     folders = {flight.parent for flight in flights} | ({job_path.parent} if job_path else set())
     known = {file.stem for folder in folders for file in folder.glob("*")} | set(given)
     for name in (*job.holdout, *job.flights):
-        if not is_among(name, known):
+        if not names_recording(name, known):
             raise ConfigError(
                 job_path or "flights",
                 f"names a flight '{name}' that does not exist",

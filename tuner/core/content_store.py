@@ -48,7 +48,7 @@ class ContentStore:
 
     @property
     def is_folder(self) -> bool:
-        """Whether it is a folder of this machine."""
+        """Whether it is a local folder."""
         return isinstance(self._files, LocalFileSystem)
 
     def path(self, digest: str) -> str:
@@ -122,7 +122,7 @@ class ContentStore:
         return content
 
     def free_bytes(self) -> int | None:
-        """Return what is left on the disk; None where the store does not say."""
+        """Return the free bytes on the disk; None if unknown."""
         return shutil.disk_usage(self._root).free if self.is_folder else None
 
     def clear(self) -> None:

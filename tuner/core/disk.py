@@ -22,7 +22,7 @@ from pathlib import Path
 
 from tuner.core.errors import InputError, OutputError, RecordingError
 
-LONGEST_NAME = 100
+MAX_NAME_LETTERS = 100
 """Letters of a file's name that is made of another name, its suffix included."""
 _PLAIN = re.compile(r"\w(?:[\w.-]*[\w-])?", re.ASCII)
 
@@ -34,7 +34,7 @@ def file_name(name: str, suffix: str = "") -> str:
     plain name is kept. Another is made plain and gets some digits of its digest, so that two names
     do not come to one file.
     """
-    most = LONGEST_NAME - len(suffix)
+    most = MAX_NAME_LETTERS - len(suffix)
     if len(name) <= most and _PLAIN.fullmatch(name):
         return name + suffix
     digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
@@ -117,7 +117,7 @@ def check_folder(path: Path) -> None:
         A file is in the way, or the system refuses.
     """
     with _refusals(path):
-        if _stands(path) and not path.is_dir():
+        if _is_regular_file(path) and not path.is_dir():
             raise OSError(errno.EEXIST, "")
         _check_writable(path)
 
@@ -131,7 +131,7 @@ def check_file(path: Path) -> None:
         It is a folder, or the system refuses.
     """
     with _refusals(path):
-        if _stands(path) and path.is_dir():
+        if _is_regular_file(path) and path.is_dir():
             raise OSError(errno.EISDIR, "")
         _check_writable(path.parent)
 
@@ -139,14 +139,14 @@ def check_file(path: Path) -> None:
 def _check_writable(folder: Path) -> None:
     """Raise what the system would say to something new in a folder that may not exist yet."""
     whole = folder.absolute()
-    nearest = next(above for above in (whole, *whole.parents) if _stands(above))
+    nearest = next(above for above in (whole, *whole.parents) if _is_regular_file(above))
     if not nearest.is_dir():
         raise OSError(errno.ENOTDIR, "")
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise OSError(errno.EACCES, "")
 
 
-def _stands(path: Path) -> bool:
+def _is_regular_file(path: Path) -> bool:
     """Return whether something has this path; a refusal to look is raised as it is."""
     try:
         str(path.absolute()).encode()
@@ -194,7 +194,7 @@ def exists(path: Path) -> bool:
         The system refuses to look: the path is too long, or a folder above may not be read.
     """
     try:
-        return _stands(path)
+        return _is_regular_file(path)
     except OSError as error:
         raise InputError(
             path, f"cannot be read ({error.strerror})", "check the path and its rights"
@@ -263,7 +263,7 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
             raise InputError(path, "does not exist", "check the path")
         for match in matches:
             if exists(match) and match.is_dir() and not (match / "metadata.yaml").exists():
-                within = f"{match}/*{_commonest_suffix(match)}"
+                within = f"{match}/*{_most_common_suffix(match)}"
                 raise InputError(match, "is a folder", f"give the recordings in it: '{within}'")
             recordings.setdefault(match.resolve(), match)
     if not recordings:
@@ -271,7 +271,7 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
     return tuple(recordings.values())
 
 
-def _commonest_suffix(folder: Path) -> str:
+def _most_common_suffix(folder: Path) -> str:
     """Return the suffix of most files of a folder that may be recordings."""
     others = {".md", ".txt", ".yaml", ".yml", ".json", ".pdf"}
     suffixes = Counter(path.suffix for path in folder.glob("*.*") if path.suffix not in others)

@@ -52,7 +52,7 @@ class ExportError(InputError):
 
 
 class EngineError(InputError):
-    """What computes elsewhere is gone, or cannot go on."""
+    """A remote or local engine is gone, or cannot go on."""
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -18,14 +18,14 @@ from pydantic_core import from_json
 
 from tuner.core.disk import write_text
 from tuner.core.errors import ConfigError, InputError
-from tuner.core.phrases import visible
+from tuner.core.phrases import printable
 from tuner.core.validation import config_error
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MAX_BYTES = 50_000_000
-"""Of a JSON file of a result folder."""
+"""The limit of a JSON file in a result folder."""
 MAX_ARRAYS = 1 << 28
 """Bytes of all arrays of a file together, unpacked."""
 
@@ -43,7 +43,7 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def _cell(value: object) -> object:
     if isinstance(value, str):
-        shown = visible(value)
+        shown = printable(value)
         return f"'{shown}" if shown.lstrip().startswith(("=", "+", "-", "@")) else shown
     return repr(value) if isinstance(value, float) else value
 

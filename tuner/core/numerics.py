@@ -18,20 +18,20 @@ Array = NDArray[np.float64]
 Z95 = 1.959963984540054
 """Standard deviations of a normal distribution that a 95 % interval reaches to either side: its
 quantile at 0.975. (`scipy.special` takes a third of the time in which `tune inspect` answers.)"""
-ROBUST = 1.4826
+MAD_TO_SD = 1.4826
 """Standard deviations of a normal distribution in its median absolute deviation."""
 ROUNDING = 1e-12
 """Share of the largest eigenvalue, at unit diagonal, below which information is rounding error."""
-UNKNOWN = 1e-24
+MIN_EIGENVALUE_SHARE = 1e-24
 """Likewise, what a direction that nothing is known of counts as known to: its variance is larger
 than any other, and what rounding errors mix of it into other coefficients is not seen in theirs."""
-SEEN = 1e-6
+MIN_KNOWN_SHARE = 1e-6
 """Share of a coefficient in unknown directions from which it is unknown."""
 
 
 def robust_sd(values: ArrayLike) -> Array:
     """Return a robust standard deviation about zero: that of the median absolute value."""
-    return np.asarray(ROBUST * np.median(np.abs(values)))
+    return np.asarray(MAD_TO_SD * np.median(np.abs(values)))
 
 
 def huber_weights(error: Array, limit: float) -> Array:
@@ -151,14 +151,14 @@ class Inverse:
         values, vectors = symmetric_eigen(matrix * scale)
         along = np.einsum("pk,pq,qk->k", vectors, prior * scale, vectors, optimize=True)
         largest = max(float(values.max(initial=0.0)), 1.0)
-        rounded, nothing = values < ROUNDING * largest, UNKNOWN * largest
+        rounded, nothing = values < ROUNDING * largest, MIN_EIGENVALUE_SHARE * largest
         values = np.where(rounded, np.maximum(along, nothing), values)
         return Inverse(unit, values, vectors, rounded, rounded & (along <= nothing))
 
     @property
     def known(self) -> NDArray[np.bool_]:
         """(K,) whether flights and prior determine it, all but rounding errors of it."""
-        return np.asarray((self.vectors[:, self.unknown] ** 2).sum(axis=1) < SEEN)
+        return np.asarray((self.vectors[:, self.unknown] ** 2).sum(axis=1) < MIN_KNOWN_SHARE)
 
     @property
     def matrix(self) -> Array:

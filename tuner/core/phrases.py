@@ -28,7 +28,7 @@ _UNPRINTED = ((0x7F, 0xA0), (0x202A, 0x202F), (0x2066, 0x206A), (0xD800, 0xE000)
 _PICTURES |= {code: 0xFFFD for bounds in _UNPRINTED for code in range(*bounds)}
 
 
-def visible(text: str) -> str:
+def printable(text: str) -> str:
     """Return a text, which a recording or a name may have chosen, as a terminal may show it."""
     return text.translate(_PICTURES)
 

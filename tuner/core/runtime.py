@@ -21,7 +21,7 @@ from importlib.metadata import PackageNotFoundError, version
 from tuner.core.disk import cache_folder
 
 PROGRAM = "multirotor-tune"
-LIBRARIES = ("jax", "jaxlib", "equinox", "numpy", "rosbags")
+LIBRARY_NAMES = ("jax", "jaxlib", "equinox", "numpy", "rosbags")
 
 
 def installed(distribution: str = PROGRAM) -> str:
@@ -35,14 +35,14 @@ def installed(distribution: str = PROGRAM) -> str:
 def versions() -> dict[str, str]:
     """Return the versions of Python, of this program and of the libraries that it computes with."""
     return {"python": platform.python_version()} | {
-        name: installed(name) for name in (PROGRAM, *LIBRARIES)
+        name: installed(name) for name in (PROGRAM, *LIBRARY_NAMES)
     }
 
 
 logger = logging.getLogger(__name__)
 
-COMPILED = "/jax/core/compile/backend_compile_duration"
-"""What `jax.monitoring` calls the end of compiling, or of reading compiled code from the cache."""
+COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
+"""The event of `jax.monitoring` at the end of compiling, or of reading compiled code."""
 
 #: Releases of jaxlib (major.minor) known to accept the flags below: an unknown one is fatal.
 _RELEASES_KNOWN = ("0.10",)
@@ -59,18 +59,18 @@ that jax traces is hundreds of thousands of objects that stay, which Python's ow
 again and again."""
 
 
-_KEPT_MEMORY = 2**28
+_MAX_KEPT_BYTES = 2**28
 """bytes that arrays have left and that stay for the next ones. Every simulation fills arrays anew;
 given back and fetched again, their memory takes the system a third of a sweep's time."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _LARGEST = -1, -3, 2**25
-"""Of glibc's mallopt, and the largest threshold that it takes."""
+"""Options of glibc's mallopt, and its largest threshold."""
 
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""How many threads linear algebra has, by library."""
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Variables with the number of threads of linear algebra, by library."""
 
 
 def cores() -> int:
-    """Return how many processor cores this process may use."""
+    """Return the number of processor cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
@@ -80,7 +80,9 @@ def cores() -> int:
 def set_environment() -> None:
     """Set what jax and NumPy read from the environment when they are imported."""
     os.environ.setdefault("NPROC", "1")
-    for name in THREADS:  # matrices are small: more threads spin for longer than they compute
+    for (
+        name
+    ) in THREAD_VARIABLES:  # matrices are small: more threads spin for longer than they compute
         os.environ.setdefault(name, "1")
     # Loading its own compiled code, XLA complains of pseudo-features that no processor reports.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -103,7 +105,7 @@ def keep_memory() -> None:
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGEST)
-        mallopt(_M_TRIM_THRESHOLD, _KEPT_MEMORY)
+        mallopt(_M_TRIM_THRESHOLD, _MAX_KEPT_BYTES)
 
 
 def configure(*, keep_compiled: bool = True) -> None:

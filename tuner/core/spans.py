@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
-from tuner.core.runtime import COMPILED, set_environment
+from tuner.core.runtime import COMPILE_EVENT, set_environment
 
 TRACING = "tracing"
 LOWERING = "lowering"
@@ -21,17 +21,17 @@ LOADING = "loading compiled code"
 BUILDING = "building kernels"
 FALLBACK = "/lanes/fallback"
 """Event of a program that runs through XLA, for what it has no rule for."""
-OF_JAX = {
+JAX_STAGES = {
     "/jax/core/compile/jaxpr_trace_duration": TRACING,
     "/jax/core/compile/jaxpr_to_mlir_module_duration": LOWERING,
-    COMPILED: COMPILING,
+    COMPILE_EVENT: COMPILING,
     "/jax/compilation_cache/cache_retrieval_time_sec": LOADING,
     "/lanes/build_duration": BUILDING,
 }
 """Event of `jax.monitoring` -> what it is called here."""
 START = "start of Python"
-ELSEWHERE = "elsewhere"
-"""What the main thread does outside every stage."""
+OUTSIDE = "elsewhere"
+"""Time of the main thread outside all stages."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Span:
     Attributes
     ----------
     name
-        Of the stage, or one of `OF_JAX`.
+        Of the stage, or one of `JAX_STAGES`.
     begin, end
         s since the process began.
     detail
@@ -61,8 +61,8 @@ class Span:
 
     @property
     def is_stage(self) -> bool:
-        """Whether it is a stage of this process, rather than what jax does in one."""
-        return self.name not in OF_JAX.values() and not self.beside
+        """Whether it is a stage of this process, rather than work of jax in one."""
+        return self.name not in JAX_STAGES.values() and not self.beside
 
 
 @dataclass
@@ -73,7 +73,7 @@ class Recorder:
     fallbacks: list[str] = field(default_factory=list)
     """Programs that run through XLA, and what they have no rule for."""
     thread: int = field(default_factory=threading.get_ident)
-    """Whose stages they are."""
+    """The program of the stages."""
     began: float = field(default_factory=lambda: time.perf_counter() - time.process_time())
     """The process's begin on `time.perf_counter`: until now it has done nothing but compute."""
 
@@ -82,13 +82,13 @@ class Recorder:
         return time.perf_counter() - self.began
 
     def add_duration(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        """Add what jax reports at its end, if it is one of `OF_JAX`."""
+        """Add what jax reports at its end, if it is one of `JAX_STAGES`."""
         if event == FALLBACK:
             self.fallbacks.append(str(kwargs.get("fun_name", "")))
-        if event in OF_JAX:
+        if event in JAX_STAGES:
             end, detail = self.now(), str(kwargs.get("fun_name", ""))
             beside = threading.get_ident() != self.thread
-            self.spans.append(Span(OF_JAX[event], end - duration_secs, end, detail, beside))
+            self.spans.append(Span(JAX_STAGES[event], end - duration_secs, end, detail, beside))
 
 
 _RECORDER: ContextVar[Recorder | None] = ContextVar("_RECORDER", default=None)
@@ -157,7 +157,7 @@ class Row:
     processor
         Processor seconds of all threads.
     jax
-        One of `OF_JAX` -> how many of the seconds it took.
+        One of `JAX_STAGES` -> how many of the seconds it took.
     programs
         How many compiled programs were asked for.
     """
@@ -165,7 +165,7 @@ class Row:
     stage: str
     seconds: float = 0.0
     processor: float = 0.0
-    jax: dict[str, float] = field(default_factory=lambda: dict.fromkeys(OF_JAX.values(), 0.0))
+    jax: dict[str, float] = field(default_factory=lambda: dict.fromkeys(JAX_STAGES.values(), 0.0))
     programs: int = 0
 
     @property
@@ -180,8 +180,8 @@ def table_of(spans: Sequence[Span], seconds: float, processor: float) -> tuple[R
     Every instant counts for the innermost span that holds it, so that the rows' seconds, and
     processor seconds, sum up to those of the process, ``seconds`` and ``processor``.
     """
-    whole = Span(ELSEWHERE, 0.0, seconds, processor=processor)
-    rows = {ELSEWHERE: Row(ELSEWHERE)}
+    whole = Span(OUTSIDE, 0.0, seconds, processor=processor)
+    rows = {OUTSIDE: Row(OUTSIDE)}
     open_: list[tuple[Span, Row]] = []
     for each in [
         whole,
@@ -199,7 +199,7 @@ def table_of(spans: Sequence[Span], seconds: float, processor: float) -> tuple[R
             if not one.is_stage:
                 stage.jax[one.name] += sign * spent
         open_.append((each, row))
-    elsewhere = rows.pop(ELSEWHERE)
+    elsewhere = rows.pop(OUTSIDE)
     return (*rows.values(), elsewhere)
 
 

@@ -38,7 +38,7 @@ def config_error(
     return ConfigError(path, line + what, remedy + more)
 
 
-_EXPECTED: Mapping[str, str] = {
+_EXPECTATIONS: Mapping[str, str] = {
     "bool_type": "it should be true or false",
     "dict_type": "it should be a mapping of keys to values",
     "finite_number": "it should be a finite number",
@@ -66,7 +66,7 @@ _EXPECTED: Mapping[str, str] = {
     "union_tag_not_found": "it should have a key {discriminator}",
 }
 """Type of a complaint -> what the value should have been, by the complaint's context."""
-_ALIKE: Mapping[str, str] = {
+_SAME_KINDS: Mapping[str, str] = {
     "bool_parsing": "bool_type",
     "enum": "literal_error",
     "float_parsing": "float_type",
@@ -78,7 +78,7 @@ _ALIKE: Mapping[str, str] = {
     "mapping_type": "dict_type",
     "model_attributes_type": "model_type",
 }
-FORMS: Mapping[str, str] = {
+PATTERN_PHRASES: Mapping[str, str] = {
     "^[0-9a-f]{64}$": "it should be a recording's id: 64 digits 0-9 and a-f, as uploaded",
     "^[!-~]+$": "it should be printable ASCII without blanks",
     r"^[0-9]+(\.[0-9]+)? ?[KMGT]i?B$": "it should be a size, as 4 GiB",
@@ -88,7 +88,7 @@ FORMS: Mapping[str, str] = {
 
 
 def first_complaint(details: Sequence[ErrorDetails]) -> tuple[str, str]:
-    """Return what is wrong first, and what to do about it.
+    """Return the first error, and its remedy.
 
     Where a key takes values of several kinds, each kind complains: what goes deepest into the value
     has understood it best, and what goes equally deep is told as one.
@@ -106,7 +106,7 @@ def first_complaint(details: Sequence[ErrorDetails]) -> tuple[str, str]:
 
 
 def complaint(detail: ErrorDetails) -> tuple[str, str]:
-    """Return what one of pydantic's complaints says is wrong, and what to do about it."""
+    """Return a pydantic complaint in plain words, and its remedy."""
     place = _keys(detail["loc"])
     key = dotted(place) or "the file"
     context = detail.get("ctx", {})
@@ -124,16 +124,16 @@ def complaint(detail: ErrorDetails) -> tuple[str, str]:
 
 
 def expected(kind: str, context: Mapping[str, Any]) -> str:
-    """Return what a value should have been, by the type and the context of a complaint."""
+    """Return the expected value, by the type and the context of a complaint."""
     if kind == "value_error":
         return str(context["error"])
     if kind == "string_pattern_mismatch":
-        return FORMS.get(context["pattern"], OF_ANOTHER_FORM)
-    words = _EXPECTED.get(_ALIKE.get(kind, kind))
-    return OF_ANOTHER_FORM if words is None else words.format_map(context)
+        return PATTERN_PHRASES.get(context["pattern"], OTHER_FORM)
+    words = _EXPECTATIONS.get(_SAME_KINDS.get(kind, kind))
+    return OTHER_FORM if words is None else words.format_map(context)
 
 
-OF_ANOTHER_FORM = "it should be of another form; see the reference of its key"
+OTHER_FORM = "it should be of another form; see the reference of its key"
 
 
 _KIND = re.compile(
@@ -142,7 +142,7 @@ _KIND = re.compile(
     r"VehicleFile|ControllerFile|TopicMap|\[key\]",
     re.DOTALL,
 )
-"""What pydantic puts into a place beside the keys: the kind of value that complains."""
+"""Parts of pydantic's locations that are no keys: kinds of values."""
 
 
 def _keys(place: Place) -> Place:

@@ -21,7 +21,7 @@ MAX_NODES = 100_000
 
 @dataclass(frozen=True)
 class Document:
-    """What a YAML file holds.
+    """The content of a YAML file.
 
     Attributes
     ----------

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from sim_jax.state import AIRBORNE
-from tuner.config import Settings, settle
+from tuner.config import Settings, resolve_settings
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array
@@ -400,7 +400,7 @@ def compare(
     """
     for path in out:
         check_table_file(path)
-    settings, logged = with_logged_parameters(settle(options, fits=False))
+    settings, logged = with_logged_parameters(resolve_settings(options, fits=False))
     read = {flight.resolve() for flight in settings.flights}
     for path in out:
         if path.resolve() in read:

@@ -21,7 +21,7 @@ from sim_jax.state import AIRBORNE
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
 from tuner.evaluate.torque_observer import TorqueObserver
-from tuner.findings.sentences import PREDICTED
+from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import Segments, pieces_of, window_segments
@@ -49,8 +49,8 @@ class Predictions:
     ahead
         (S,) s after that at which they are compared.
     errors
-        Quantity of `PREDICTED` -> (S, n): Euclidean distance from the recorded one, for an attitude
-        the angle of the rotation between both. Quantities that are inputs are left out.
+        Quantity of `PREDICTED_UNITS` -> (S, n): Euclidean distance from the recorded one, for an
+        attitude the angle of the rotation between both. Quantities that are inputs are left out.
     """
 
     begins: Array
@@ -61,7 +61,7 @@ class Predictions:
         """Return each quantity's mean error so many s ahead; NaN if it is not predicted."""
         step = self._step(seconds)
         means = {name: float(np.nanmean(errors[step])) for name, errors in self.errors.items()}
-        return dict.fromkeys(PREDICTED, np.nan) | means
+        return dict.fromkeys(PREDICTED_UNITS, np.nan) | means
 
     def worse_than(self, other: Predictions, seconds: float) -> tuple[str, ...]:
         """Return the quantities that another predicts significantly better so many s ahead.
@@ -197,7 +197,7 @@ def errors_of(
 ) -> dict[str, Array]:
     """Return quantity -> (S, n) distances of reached states (S, n, k) from recorded ones."""
     errors = {}
-    for name in PREDICTED:
+    for name in PREDICTED_UNITS:
         there = getattr(recorded, name).reshape(*shape, -1)
         if name == "attitude":
             along = np.abs(np.sum(reached[name] * there, axis=-1))
@@ -238,7 +238,9 @@ def _simulated(
                 "body_rate": motion[..., 6:9],
             }
         )
-    return {name: np.concatenate([part[name] for part in parts], axis=1) for name in PREDICTED}
+    return {
+        name: np.concatenate([part[name] for part in parts], axis=1) for name in PREDICTED_UNITS
+    }
 
 
 def _select(segments: Segments, chosen: NDArray[np.intp]) -> Segments:
@@ -258,7 +260,7 @@ def hold_state(
     shape = (len(ahead), len(begins))
     reached = {
         name: np.broadcast_to(getattr(start, name), (*shape, getattr(start, name).shape[-1]))
-        for name in PREDICTED
+        for name in PREDICTED_UNITS
     }
     if recorded is None:
         recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())

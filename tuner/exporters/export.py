@@ -27,7 +27,7 @@ from tuner.exporters.target import (
     write,
 )
 from tuner.options import ExportOptions
-from tuner.report.result_texts import what_is_exported, what_is_lost
+from tuner.report.result_texts import exported_numbers, lost_groups
 from tuner.result import (
     EXPORTS,
     OF_A_RUN,
@@ -101,11 +101,11 @@ def export(
     check_every_coefficient(physical.vehicle, target)
     line = provenance(run, today, options.accept)
     if effective is not None:
-        line = f"{what_is_exported(effective, target.simulator.title)}; {line}"
+        line = f"{exported_numbers(effective, target.simulator.title)}; {line}"
         decided = (
-            f"these are {what_is_exported(effective, target.simulator.title)}",
+            f"these are {exported_numbers(effective, target.simulator.title)}",
             *decided,
-            *what_is_lost(effective, target.simulator.entry, target.simulator.deviations),
+            *lost_groups(effective, target.simulator.entry, target.simulator.deviations),
         )
     draft = target.draft(vehicle, line, target.simulator, into)
     if into is not None and copies is not None and out is None:

@@ -1,1 +1,1 @@
-"""What a user should know before believing a number: codes with numbers, and their sentences."""
+"""Findings of a run: codes with numbers, and their sentences and remedies."""

@@ -1,4 +1,4 @@
-"""What a user should know before believing a number: each finding with its sentence and remedy."""
+"""Findings that qualify a result: codes with numbers, each with its sentence and remedy."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from tuner.core.phrases import Worded, as_sentence, listed, percent, shorten
 from tuner.findings import sentences
 from tuner.vehicle.motor_orders import order_in_words
 
-LARGEST = 1e300
-"""What stands for a number that is not finite, which JSON does not have."""
+MAX_FINITE = 1e300
+"""Replaces infinite numbers, which JSON lacks."""
 
 Level = Literal["failure", "warning", "info"]
 Text = str | Callable[[Any], str]
-"""With the finding's numbers in braces, ``names``, ``first`` and ``last`` for its names in words,
-``coefficients`` and ``given`` for them as they stand, ``subject`` for its subject; or what makes a
-sentence of a finding."""
+"""A text with the finding's numbers in braces, ``names``, ``first`` and ``last`` for its names in
+words, ``coefficients`` and ``given`` for its raw names, ``subject`` for its subject; or a function
+that returns the sentence."""
 
 GIVE_VEHICLE = (
     "Give --vehicle and --mass; tune new-vehicle writes a starting file from mass, size and "
@@ -27,14 +27,14 @@ GIVE_VEHICLE = (
 )
 
 NUMBER = re.compile(r"[-+]?[0-9.]*[0-9](?:e[-+]?[0-9]+)?")
-LEAST_SAID = 55
-"""Letters of what was noticed that stay in a short line."""
-CLAUSE = re.compile(r"[;.] | \(|, (?=and|as|at|or|if)|: (?!false|true)(?=[a-z0-9]+ )")
-"""Where the first clause of a sentence ends; not before the value of a setting."""
+MIN_TEXT_LETTERS = 55
+"""A short line keeps so many letters of the sentence."""
+CLAUSE_END = re.compile(r"[;.] | \(|, (?=and|as|at|or|if)|: (?!false|true)(?=[a-z0-9]+ )")
+"""The end of a sentence's first clause; never before the value of a setting."""
 
 
 class Code(Worded):
-    """What was noticed; the comment after each names its numbers and its names."""
+    """Codes of findings; the comment after each lists its numbers and names."""
 
     RECORDING = (
         "recording",  # count and numbers, names: code, topic and names of the `Note`
@@ -116,7 +116,7 @@ class Code(Worded):
     )
     LIFTS_OTHERWISE = (
         "lifts_otherwise",  # more (share); names: the signal, battery?
-        sentences.lifts_otherwise,
+        sentences.different_thrust,
         "Fit flights of one vehicle and payload, each kind by itself.",
     )
     SPARSE_INPUT = (
@@ -322,27 +322,27 @@ class Code(Worded):
     )
     HOLDING_BETTER = (
         "holding_better",  # soonest, seconds, QUANTITY, QUANTITY_held; names: QUANTITYs
-        sentences.holding_better,
+        sentences.worse_than_hold,
         "Predict less far ahead, or with more recorded.",
     )
     DISTURBANCES_FOLLOWED = (
         "disturbances_followed",  # gust, thrust (shares), both _seconds
-        sentences.disturbances_followed,
+        sentences.estimated_disturbances,
         "",
     )
     FLIGHT_NOT_FLOWN = (
         "flight_not_flown",  # rmse, others (m), seconds; beyond, beyond_recorded (shares)?
-        sentences.flight_not_flown,
-        sentences.flight_not_flown_remedy,
+        sentences.flight_not_followed,
+        sentences.flight_not_followed_remedy,
     )
     LAW_LACKING = (
         "law_lacking",  # share; names: axis, what it goes with, coefficients it moves
-        sentences.law_lacking,
-        sentences.law_remedy,
+        sentences.missing_law,
+        sentences.missing_law_remedy,
     )
     CONTROLLER_ANSWERS = (
         "controller_answers",  # AXIS, AXIS_error; names: P, I or late, the AXES
-        sentences.controller_answers,
+        sentences.controller_gains_differ,
         "Compare the controller file with the autopilot's parameters, as they are now.",
     )
     ROTOR_SPEEDS_LATE = (
@@ -357,8 +357,8 @@ class Code(Worded):
     )
     TERM_SHOWS = (
         "term_shows",  # NAME, NAME_error; names: NAMEs; the subject is their group
-        sentences.term_shows,
-        sentences.term_remedy,
+        sentences.significant_term,
+        sentences.significant_term_remedy,
     )
     INPUT_LATE = (
         "input_late",  # seconds
@@ -513,18 +513,18 @@ class Code(Worded):
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that a user should know before believing a number.
+    """A remark that qualifies a result.
 
     Attributes
     ----------
     code
-        What was noticed.
+        Its kind.
     level
         ``failure`` stops a run unless forced, ``warning`` does not, ``info`` explains.
     subject
         The flight, coefficient or part concerned.
     numbers, names
-        What `Code` lists beside the code.
+        As `Code` lists them beside the code.
     """
 
     code: Code
@@ -534,20 +534,20 @@ class Finding:
     names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Replace what JSON has no number for."""
+        """Replace infinite numbers."""
         if not all(math.isfinite(number) for number in self.numbers.values()):
-            finite = {n: v if math.isfinite(v) else LARGEST for n, v in self.numbers.items()}
+            finite = {n: v if math.isfinite(v) else MAX_FINITE for n, v in self.numbers.items()}
             object.__setattr__(self, "numbers", finite)
 
 
 def sentence(finding: Finding) -> str:
-    """Return what was noticed, as a sentence."""
-    return _worded(finding.code.text, finding)
+    """Return the sentence of a finding."""
+    return _in_words(finding.code.text, finding)
 
 
 def remedy(finding: Finding) -> str:
-    """Return what to do about it, as a sentence; empty if there is nothing to do."""
-    return _worded(finding.code.remedy, finding)
+    """Return the remedy of a finding, as a sentence; empty without one."""
+    return _in_words(finding.code.remedy, finding)
 
 
 def one_line(finding: Finding) -> str:
@@ -555,14 +555,11 @@ def one_line(finding: Finding) -> str:
     return f"{finding.level}: {finding.subject}: {sentence(finding)} {remedy(finding)}".rstrip()
 
 
-def with_alike_together(findings: Iterable[Finding]) -> list[Finding]:
-    """Return findings with those that say the same of several subjects, but for numbers, as one.
-
-    Its numbers are those of the first.
-    """
+def merge_alike(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings, with those that differ only in subject and numbers merged into the first."""
     alike: dict[tuple[object, ...], list[Finding]] = {}
     for finding in findings:
-        said = NUMBER.sub("", CLAUSE.split(sentence(finding))[0])
+        said = NUMBER.sub("", CLAUSE_END.split(sentence(finding))[0])
         alike.setdefault((finding.code, finding.level, said), []).append(finding)
     return [
         replace(same[0], subject=", ".join(dict.fromkeys(one.subject for one in same)))
@@ -570,27 +567,27 @@ def with_alike_together(findings: Iterable[Finding]) -> list[Finding]:
     ]
 
 
-def brief(finding: Finding, width: int) -> str:
-    """Return a finding in so many characters: its subject, what was noticed, what to do.
+def shorten_finding(finding: Finding, width: int) -> str:
+    """Return subject, sentence and remedy of a finding in so many characters.
 
-    What was noticed is cut to no less than `LEAST_SAID` letters, then what to do.
+    The sentence is cut to no less than `MIN_TEXT_LETTERS` letters, then the remedy.
     """
     first, *others = finding.subject.split(", ")
     subject = shorten(f"{first} and {len(others)} more" if others else first, 30)
-    what, to_do = CLAUSE.split(sentence(finding))[0].removesuffix("."), remedy(finding)
+    what, to_do = CLAUSE_END.split(sentence(finding))[0].removesuffix("."), remedy(finding)
     if len(f"{subject}: {what}. {to_do}") > width and to_do:
-        to_do = f"{CLAUSE.split(to_do)[0].removesuffix('.')}."
+        to_do = f"{CLAUSE_END.split(to_do)[0].removesuffix('.')}."
     left = width - len(f"{subject}: . {to_do}")
-    cut = shorten(what, max(left, LEAST_SAID))
+    cut = shorten(what, max(left, MIN_TEXT_LETTERS))
     end = "" if cut.endswith("…") else "."
     return shorten(f"{subject}: {cut}{end} {to_do}".rstrip(), width)
 
 
-def _worded(text: Text, finding: Finding) -> str:
-    return text.format(**_values(finding)) if isinstance(text, str) else text(finding)
+def _in_words(text: Text, finding: Finding) -> str:
+    return text.format(**_placeholders(finding)) if isinstance(text, str) else text(finding)
 
 
-def _values(finding: Finding) -> dict[str, object]:
+def _placeholders(finding: Finding) -> dict[str, object]:
     names, numbers = [name.replace("_", " ") for name in finding.names], finding.numbers
     values: dict[str, object] = {"subject": finding.subject, **numbers}
     if names:

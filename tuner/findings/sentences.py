@@ -1,7 +1,4 @@
-"""Sentences of findings that take more than a text with the finding's numbers in it.
-
-Each is named after its code in `tuner.findings.findings.Code`.
-"""
+"""Sentences of findings that need more than a text with numbers in braces."""
 
 from __future__ import annotations
 
@@ -10,33 +7,26 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from tuner.core.phrases import as_sentence, listed, percent
-from tuner.recordings.notes import (
-    Cause,
-    Damage,
-    Note,
-    NoteCode,
-    damage_sentence,
-    note_in_words,
-)
+from tuner.recordings.notes import Cause, Damage, Note, NoteCode, damage_sentence, note_in_words
 
 if TYPE_CHECKING:
     from tuner.findings.findings import Finding
 
 Numbers = Mapping[str, float]
 
-WITHOUT_SUBJECT = {"cannot", "claims", "extends", "has", "holds", "is", "keeps", "lacks"}
-"""Words with which an error begins that says something of the file which it names."""
+VERBS_OF_FILES = {"cannot", "claims", "extends", "has", "holds", "is", "keeps", "lacks"}
+"""An error that begins with one of these has a file as its subject."""
 
 
-PREDICTED: Mapping[str, str] = {
+PREDICTED_UNITS: Mapping[str, str] = {
     "position": "m",
     "velocity": "m/s",
     "attitude": "rad",
     "body_rate": "rad/s",
 }
-"""What predictions are compared by, with its unit."""
+"""Predicted quantity -> its unit."""
 
-GOES_WITH: Mapping[str, str] = {
+FEATURE_PHRASES: Mapping[str, str] = {
     "airspeed": "the airspeed along it",
     "airspeed_squared": "the square of the airspeed along it",
     "airspeed_across": "the airspeed across it",
@@ -44,8 +34,8 @@ GOES_WITH: Mapping[str, str] = {
     "rate_squared": "the square of the body rate about it",
     "other_rates": "the product of the other two body rates",
 }
-"""What a force or moment may go with, as of `tuner.equation_error.omitted_laws`."""
-TERMS_LIKE: Mapping[tuple[str, str], tuple[str, ...]] = {
+"""Regressor of `tuner.equation_error.omitted_laws` -> its phrase."""
+TERMS_OF_LAW: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("force", "airspeed"): ("rotor_drag_ratio", "linear_drag", "thrust_inflow"),
     ("force", "airspeed_squared"): ("fuselage_drag",),
     ("moment", "airspeed_across"): ("flapping_moment", "center_of_mass"),
@@ -53,11 +43,11 @@ TERMS_LIKE: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("moment", "rate"): ("angular_drag", "thrust_inflow"),
     ("moment", "other_rates"): ("center_of_mass",),
 }
-"""Kind of push and what it goes with -> groups of terms that have it."""
+"""Force or moment, and its regressor -> groups of terms with that law."""
 
 
 def recording(finding: Finding) -> str:
-    """Return what was found or changed while the recording was read."""
+    """Return the sentence of a note on a recording."""
     code, topic, *names = finding.names
     numbers = dict(finding.numbers)
     count = int(numbers.pop("count"))
@@ -66,22 +56,22 @@ def recording(finding: Finding) -> str:
 
 
 def left_out(finding: Finding) -> str:
-    """Return why a flight takes no part: of a clause without a subject the flight is that."""
+    """Return why a flight is left out; it is the subject of a clause without one."""
     what = finding.names[0]
-    it = "it " if what.split()[0] in WITHOUT_SUBJECT else ""
+    it = "it " if what.split()[0] in VERBS_OF_FILES else ""
     return as_sentence(f"{it}{what}; the flight is left out")
 
 
 def salvaged(finding: Finding) -> str:
-    """Return how the recording is broken, and what was salvaged."""
+    """Return a sentence on the damage of a recording."""
     cause, subject = finding.names
     numbers: Mapping[str, Any] = finding.numbers
     damage = damage_sentence(Damage(Cause(cause), subject, **numbers))
     return f"It is broken: {damage}; what was salvaged is used."
 
 
-def lifts_otherwise(finding: Finding) -> str:
-    """Return what may be another one in these flights, and how much more or less rotors lift."""
+def different_thrust(finding: Finding) -> str:
+    """Return possible causes of another thrust in these flights, and its ratio."""
     signal, *others = finding.names
     more = finding.numbers["more"]
     return (
@@ -92,7 +82,7 @@ def lifts_otherwise(finding: Finding) -> str:
 
 
 def ground_conflict(finding: Finding) -> str:
-    """Return what ground and flights say, and with which mass flights would say the same."""
+    """Return the values from ground and flights, and the mass for which they agree."""
     numbers, (unit,) = finding.numbers, finding.names
     apart = f"{numbers['deviation']:+.1f} standard errors apart, model error included."
     ground, flights = (f"{numbers[name]:.5g} {unit}" for name in ("ground", "flights"))
@@ -105,14 +95,14 @@ def ground_conflict(finding: Finding) -> str:
 
 
 def ground_remedy(finding: Finding) -> str:
-    """Return what may be wrong."""
+    """Return the remedy of a conflict of ground and flights."""
     if "mass" in finding.numbers:
         return "Weigh the vehicle again; else look for what is wrong with the rig, or the model."
     return "Find out which is wrong, the rig or the model."
 
 
 def inlet_chosen(finding: Finding) -> str:
-    """Return why a flight enters further down the loop than it was recorded for."""
+    """Return why a flight has an inlet further down the loop than recorded."""
     inlet, signal, *order = finding.names
     numbers = finding.numbers
     read = " in the order in which it is read" if order else ""
@@ -130,13 +120,13 @@ def inlet_chosen(finding: Finding) -> str:
 
 
 def inlet_remedy(finding: Finding) -> str:
-    """Return what to log; nothing where the motors' order is the cause, which has its own line."""
+    """Return the signal to log; empty if the motors' order, with its own finding, is the cause."""
     _, signal, *order = finding.names
     return "" if order else f"Log the {signal.replace('_', ' ')} as often as its loop runs."
 
 
 def setpoints_scaled(finding: Finding) -> str:
-    """Return by what factor set-points differ, and the law that would explain it."""
+    """Return the factor by which set-points differ, and the law that would explain it."""
     axis, law = finding.names
     so = f", as those of the {law} law would be" if law else ""
     factor = f"{finding.numbers['gain']:.1f}"
@@ -144,7 +134,7 @@ def setpoints_scaled(finding: Finding) -> str:
 
 
 def setpoints_remedy(finding: Finding) -> str:
-    """Return what to do about set-points that differ by a factor."""
+    """Return the remedy of set-points that differ by a factor."""
     _, law = finding.names
     if law:
         return f"Set attitude.law: {law} in the controller file."
@@ -160,20 +150,20 @@ def setpoints_foreign(finding: Finding) -> str:
     )
 
 
-def holding_better(finding: Finding) -> str:
-    """Return what is predicted worse than by holding it as it was recorded."""
+def worse_than_hold(finding: Finding) -> str:
+    """Return the quantities that a constant state predicts better."""
     numbers, names = finding.numbers, finding.names
     lost = listed(
         [
             f"{name.replace('_', ' ')} by {numbers[name]:.3g} {unit} instead of "
             f"{numbers[f'{name}_held']:.3g} {unit}"
-            for name, unit in PREDICTED.items()
+            for name, unit in PREDICTED_UNITS.items()
             if name in names
         ]
     )
     some = listed([name.replace("_", " ") for name in names])
-    what = "state" if set(names) == set(PREDICTED) else some
-    it = "it" if len(names) in (1, len(PREDICTED)) else "them"
+    what = "state" if set(names) == set(PREDICTED_UNITS) else some
+    it = "it" if len(names) in (1, len(PREDICTED_UNITS)) else "them"
     ahead = " to ".join(dict.fromkeys(f"{numbers[end]:g}" for end in ("soonest", "seconds")))
     return (
         f"Holding its {what} predicts {it} better {ahead} s ahead: the fitted coefficients then "
@@ -181,8 +171,8 @@ def holding_better(finding: Finding) -> str:
     )
 
 
-def disturbances_followed(finding: Finding) -> str:
-    """Return how strong the estimated disturbances are, and their correlation times."""
+def estimated_disturbances(finding: Finding) -> str:
+    """Return standard deviations and correlation times of the estimated disturbances."""
     numbers = finding.numbers
     return (
         "The residuals hold more than measurement noise, as in gusts: an extended Kalman filter "
@@ -193,8 +183,8 @@ def disturbances_followed(finding: Finding) -> str:
     )
 
 
-def flight_not_flown(finding: Finding) -> str:
-    """Return from when on the loop does not follow a flight, and whether it is at its limit."""
+def flight_not_followed(finding: Finding) -> str:
+    """Return the time at which the loop leaves a flight, and whether it is at its limit."""
     numbers = finding.numbers
     limit = ""
     if "beyond" in numbers:
@@ -210,8 +200,8 @@ def flight_not_flown(finding: Finding) -> str:
     )
 
 
-def flight_not_flown_remedy(finding: Finding) -> str:
-    """Return what to look at where the loop does not follow a flight."""
+def flight_not_followed_remedy(finding: Finding) -> str:
+    """Return what to check if the loop does not follow a flight."""
     if "beyond" in finding.numbers:
         return (
             "Check position.max_feedback_acceleration in the controller file; at this speed a few "
@@ -220,8 +210,8 @@ def flight_not_flown_remedy(finding: Finding) -> str:
     return "Look at what changes there: wind, damage, a reference or a controller that is another."
 
 
-def law_lacking(finding: Finding) -> str:
-    """Return which law the model lacks, and whose intervals hold what it may have moved."""
+def missing_law(finding: Finding) -> str:
+    """Return the law that the model lacks, and the coefficients whose intervals include it."""
     axis, feature, *moved = finding.names
     what, along = axis.split("_")
     share = finding.numbers["share"]
@@ -231,7 +221,7 @@ def law_lacking(finding: Finding) -> str:
     else:
         goes = "against" if share < 0.0 else "with"
         kind = "force along" if what == "force" else "moment about"
-        with_what = GOES_WITH[feature]
+        with_what = FEATURE_PHRASES[feature]
         if feature == "airspeed_across" and axis == "force_z":
             with_what = "the square of the airspeed across it"
         law = f"there is a {kind} body {along} that goes {goes} {with_what}"
@@ -241,17 +231,17 @@ def law_lacking(finding: Finding) -> str:
     )
 
 
-def law_remedy(finding: Finding) -> str:
-    """Return which terms there are of that kind."""
+def missing_law_remedy(finding: Finding) -> str:
+    """Return the terms with that law."""
     axis, feature, *_ = finding.names
-    terms = TERMS_LIKE.get((axis[:-2], feature))
+    terms = TERMS_OF_LAW.get((axis[:-2], feature))
     if terms is None:
         return "No term has that law: judge the fit by the held-out flights."
     return f"Of that kind are {listed(terms)}: name what the vehicle has under terms in the job."
 
 
-def controller_answers(finding: Finding) -> str:
-    """Return which gain the rate controller's answers have, and whose intervals hold that."""
+def controller_gains_differ(finding: Finding) -> str:
+    """Return the rate controller's gain by its recorded commands, on each axis."""
     part, *axes = finding.names
     numbers = finding.numbers
     if part == "late":
@@ -263,7 +253,7 @@ def controller_answers(finding: Finding) -> str:
         ]
         than = "than the controller file's filters and D let it"
     else:
-        parts = [f"{axis} reacts as if its {part} were {_more(numbers, axis)}" for axis in axes]
+        parts = [f"{axis} reacts as if its {part} were {_excess(numbers, axis)}" for axis in axes]
         than = "than in the controller file"
     return as_sentence(
         f"{listed(parts)} {than}, by the recorded commands; intervals hold what that moves"
@@ -271,7 +261,7 @@ def controller_answers(finding: Finding) -> str:
 
 
 def rotor_speeds_late(finding: Finding) -> str:
-    """Return by how much rotor speeds and turning disagree in time."""
+    """Return the delay between rotor speeds and angular acceleration."""
     seconds = finding.numbers["seconds"]
     after = "after" if seconds > 0.0 else "before"
     return (
@@ -282,7 +272,7 @@ def rotor_speeds_late(finding: Finding) -> str:
 
 
 def rotor_changed(finding: Finding) -> str:
-    """Return which rotor changed within a flight, when, and by how much."""
+    """Return rotor, time and size of a change of thrust within a flight."""
     loss, (place,) = finding.numbers["loss"], finding.names
     change = f"{100.0 * abs(loss):.0f} % {'less' if loss > 0.0 else 'more'}"
     seconds = finding.numbers["seconds"]
@@ -292,14 +282,14 @@ def rotor_changed(finding: Finding) -> str:
     )
 
 
-def term_shows(finding: Finding) -> str:
-    """Return what a term that was found says of the vehicle, its autopilot or its files."""
-    return _SHOWS[finding.subject][0](finding.numbers)
+def significant_term(finding: Finding) -> str:
+    """Return what a significant term shows of the vehicle, its autopilot or its files."""
+    return _TERM_SENTENCES[finding.subject][0](finding.numbers)
 
 
-def term_remedy(finding: Finding) -> str:
-    """Return what to do about it."""
-    return _SHOWS[finding.subject][1]
+def significant_term_remedy(finding: Finding) -> str:
+    """Return the remedy of a significant term."""
+    return _TERM_SENTENCES[finding.subject][1]
 
 
 def _thrust_exponent(numbers: Numbers) -> str:
@@ -323,7 +313,7 @@ def _motor_lag(numbers: Numbers) -> str:
 def _rate_gain(numbers: Numbers) -> str:
     axes = {"rate_gain_roll_pitch": "roll and pitch react", "rate_gain_yaw": "yaw reacts"}
     parts = [
-        f"{reacts} as if the rate controller's P, I and D were {_more(numbers, name)}"
+        f"{reacts} as if the rate controller's P, I and D were {_excess(numbers, name)}"
         for name, reacts in axes.items()
         if name in numbers
     ]
@@ -342,7 +332,9 @@ def _autopilot_tilt(numbers: Numbers) -> str:
 
 def _gyro_scale(numbers: Numbers) -> str:
     axes = {"gyro_scale_x": "roll", "gyro_scale_y": "pitch", "gyro_scale_z": "yaw"}
-    parts = [f"in {axis} {_more(numbers, name)}" for name, axis in axes.items() if name in numbers]
+    parts = [
+        f"in {axis} {_excess(numbers, name)}" for name, axis in axes.items() if name in numbers
+    ]
     return f"The gyro's readings are {listed(parts)} than how the recorded attitude turns."
 
 
@@ -360,14 +352,14 @@ def _tachometer_lag(numbers: Numbers) -> str:
     )
 
 
-def _more(numbers: Numbers, name: str) -> str:
-    """Return by how much a factor differs from one, in percent with its standard error."""
+def _excess(numbers: Numbers, name: str) -> str:
+    """Return the difference of a factor from one, in percent with its standard error."""
     more = 100.0 * (numbers[name] - 1.0)
     error = 100.0 * numbers[f"{name}_error"]
     return f"{abs(more):.2g} ± {error:.1g} % {'higher' if more > 0.0 else 'lower'}"
 
 
-_SHOWS: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
+_TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
     "thrust_exponent": (
         _thrust_exponent,
         "A simulator without such a term has the right thrust at the hover alone.",
@@ -387,11 +379,11 @@ _SHOWS: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
     "gyro_scale": (_gyro_scale, "Calibrate the gyro, or compare it with another."),
     "tachometer_lag": (_tachometer_lag, "Log both unfiltered, by one clock."),
 }
-"""Group of terms -> what it says, and what to do."""
+"""Group of terms -> its sentence, and the remedy."""
 
 
 def flight_unmatched(finding: Finding) -> str:
-    """Return by how much each channel of a flight is missed."""
+    """Return the residuals of each channel of a flight over the noise."""
     multiples = ", ".join(
         f"{channel.replace('_', ' ')} {value:.1f}" for channel, value in finding.numbers.items()
     )

@@ -25,7 +25,7 @@ from tuner.ground.rig_data import read_columns, read_swing, recording_path
 from tuner.ground.stands import measure_rpm_curve, measure_stand
 from tuner.ground.step_response import measure_step_response
 from tuner.vehicle import VehicleFile
-from tuner.vehicle.vehicle import ARM, size_of
+from tuner.vehicle.vehicle import REFERENCE_ARM, size_of
 
 
 def names_of(experiments: Sequence[Experiment]) -> tuple[str, ...]:
@@ -62,7 +62,7 @@ def measure(  # noqa: PLR0911 (one return a kind)
             return measure_yaw_spin(name, experiment, vehicle, folder)
         case Propeller():
             return measure_propeller(name, experiment, folder)
-    path, arm = recording_path(folder, experiment.recording), ARM * size_of(vehicle).arm
+    path, arm = recording_path(folder, experiment.recording), REFERENCE_ARM * size_of(vehicle).arm
     match experiment:
         case Bifilar(axis=axis):
             return measure_bifilar(name, str(path), read_swing(path, axis), experiment, vehicle)

@@ -17,7 +17,7 @@ from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.ground.plan import RpmCurve, ThrustStand, TorqueStand
 from tuner.ground.rig_data import mean_and_error, usable_plateaus, widen
 from tuner.vehicle import VehicleFile
-from tuner.vehicle.vehicle import ARM, size_of
+from tuner.vehicle.vehicle import REFERENCE_ARM, size_of
 
 MIN_LEVEL_S = 1.0
 """A shorter level of the rotor speed is a transient."""
@@ -129,7 +129,7 @@ def measure_stand(
         what = f"gives {thrust:.3g} N of thrust at {top:.0f} rad/s to a vehicle of {vehicle.mass:g}"
         raise RecordingError(path, f"{what} kg", "check the force (N) and the lever ratio")
     twists = (
-        TORQUE_RANGE[0] < thrust / (weight * ARM * size_of(vehicle).arm) < TORQUE_RANGE[1]
+        TORQUE_RANGE[0] < thrust / (weight * REFERENCE_ARM * size_of(vehicle).arm) < TORQUE_RANGE[1]
     )  # of torque, N m
     if row == TORQUE and not twists:
         what = f"gives {thrust:.3g} N m of torque at {top:.0f} rad/s to a vehicle of"

@@ -15,7 +15,7 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array, robust_sd, scaled_solve
 from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.ground.rig_data import OUTLIER_SIGMAS, student_factor
-from tuner.vehicle.vehicle import longest
+from tuner.vehicle.vehicle import max_latency
 
 LAG_RANGE_S = (0.001, 1.0)
 """Of motors with a propeller."""
@@ -126,7 +126,7 @@ def _check_lags(path: str, up: float, down: float, latency: float) -> None:
         raise RecordingError(
             path, f"{what}{LAG_RANGE_S[0]:g} to {LAG_RANGE_S[1]:g} s", "check the time (s)"
         )
-    if latency > (most := longest("actuator_latency")):
+    if latency > (most := max_latency("actuator_latency")):
         what = f"shows each command {latency:.2g} s late, motors up to {most:g} s"
         raise RecordingError(path, what, "stamp command and rotor speed by one clock")
 

@@ -41,7 +41,7 @@ from tuner.vehicle import (
     with_values,
     write_vehicle,
 )
-from tuner.vehicle.vehicle import size_of, sized
+from tuner.vehicle.vehicle import scaled_to_size, size_of
 
 RELINEARISATIONS = 3
 """Times that yaw spins are linearised at the motor constant that all experiments give."""
@@ -259,7 +259,7 @@ def _coefficients(
 
 def least_noticed(name: str, vehicle: VehicleFile) -> float:
     """Return the size of a coefficient that is no logarithm below which nobody notices it."""
-    return sized(COEFFICIENTS[name], size_of(vehicle)).step
+    return scaled_to_size(COEFFICIENTS[name], size_of(vehicle)).step
 
 
 def _judged(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tuner.config import Options, Settings, settle
+from tuner.config import Options, Settings, resolve_settings
 from tuner.core.errors import InputError
 from tuner.core.phrases import listed
 from tuner.findings.findings import Code, sentence
@@ -64,7 +64,7 @@ def verdict_of(
     """
     path = Path(inspection.path)
     options = Options([str(path)], topics=topics, namespace=namespace, vehicle=vehicle)
-    decided = _decided(path, settle(options, fits=False))
+    decided = _decided(path, resolve_settings(options, fits=False))
     parameters = parameters_of(path)
     logging: tuple[LoggingAdvice, ...] = ()
     if inspection.format == "ulog" and inspection.duration > 0:

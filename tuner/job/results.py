@@ -68,7 +68,7 @@ from tuner.uncertainty.verdict import (
 )
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, write_vehicle
 from tuner.vehicle.selection_table import SelectionRow
-from tuner.vehicle.vehicle import sized
+from tuner.vehicle.vehicle import scaled_to_size
 
 METRICS_FILE = "metrics.csv"
 CONTROLLER_FILE = "controller.yaml"
@@ -172,7 +172,7 @@ def _coefficients(
     for name, value in initial_of(job).items():
         initial, regressed = began.get(name, value), None
         if name in errors:
-            bounded = sized(COEFFICIENTS[name], job.space.size).limits(initial)
+            bounded = scaled_to_size(COEFFICIENTS[name], job.space.size).limits(initial)
             regressed = _regressed(name, initial, best.get(name, value), errors[name], bounded)
         if name not in best:
             coefficients[name] = regressed or CoefficientResult.judged(

@@ -13,7 +13,7 @@ from functools import partial
 from math import nan
 from pathlib import Path
 
-from tuner.config import Options, Settings, settle
+from tuner.config import Options, Settings, resolve_settings
 from tuner.core.disk import result_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.core.phrases import clause
@@ -33,7 +33,7 @@ from tuner.evaluate.validation import (
 from tuner.exporters.effective import Effective, find_effective
 from tuner.exporters.export import export_formats_of_job
 from tuner.exporters.simulators import GAZEBO_CLASSIC
-from tuner.findings.findings import Finding, remedy, sentence, with_alike_together
+from tuner.findings.findings import Finding, merge_alike, remedy, sentence
 from tuner.job.accelerations import with_accelerations
 from tuner.job.check import check_information, check_recordings
 from tuner.job.listener import SILENT, Listener
@@ -45,7 +45,7 @@ from tuner.job.results import (
     write_next_flight,
 )
 from tuner.report import render, write_search, write_traces
-from tuner.report.outcome import OTHER_INPUTS
+from tuner.report.outcome import WRONG_INPUT_CODES
 from tuner.report.result_texts import export_sentence
 from tuner.result import BEST_FIT_FILE, OF_A_RUN, Run, RunResult, forget, place_for
 from tuner.search.estimation import OnProgress
@@ -103,7 +103,7 @@ def run(
     OutputError
         The result folder cannot be written to; a search goes on from there with ``resume``.
     """
-    settings, logged = with_logged_parameters(settle(options))
+    settings, logged = with_logged_parameters(resolve_settings(options))
     listener.on_settings(settings)
     _check_place(options, settings, place_for(out, resume=resume))
     job, findings = prepared(settings)
@@ -384,8 +384,8 @@ def _check(
     Where what was given is not what flew, the search may take long to fail.
     """
     explanation.tell(findings)
-    other = (one for one in findings if one.level == "warning" and one.code in OTHER_INPUTS)
-    for finding in with_alike_together(other):
+    other = (one for one in findings if one.level == "warning" and one.code in WRONG_INPUT_CODES)
+    for finding in merge_alike(other):
         listener.on_doubt(finding)
     failure = next((finding for finding in findings if finding.level == "failure"), None)
     if failure is not None and not force:

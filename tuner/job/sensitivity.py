@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.config import Settings, settle
+from tuner.config import Settings, resolve_settings
 from tuner.core.disk import exists, result_folder
 from tuner.core.errors import InputError, did_you_mean
 from tuner.core.runtime import versions
@@ -122,7 +122,7 @@ def examine_vehicle(
     InputError
         The input cannot be used; nothing was written.
     """
-    settings, logged = with_logged_parameters(settle(asked, fits=False))
+    settings, logged = with_logged_parameters(resolve_settings(asked, fits=False))
     room = None if arena is None else Arena.of(arena)
     check_names(asked.profile or (), "--profile")
     if exists(place_for(asked.out) / RunResult.FILE):

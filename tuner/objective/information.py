@@ -242,7 +242,7 @@ def begun(space: Space, vector: ArrayLike, names: Collection[str]) -> Array:
     if not moved:
         return np.asarray(vector)
     for name, at in tuple(moved.items()):
-        other = COEFFICIENTS[name].acts_as
+        other = COEFFICIENTS[name].equivalent_to
         if other in values:
             moved[other] = max(values[other] - at, LEFT * values[other])
     there = space.vector_of({**values, **moved})

@@ -19,7 +19,7 @@ from tuner.vehicle import ControllerFile, VehicleFile, check_value, initial_valu
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.joint_prior import JointPrior
 from tuner.vehicle.registry import COEFFICIENTS
-from tuner.vehicle.vehicle import Size, size_of, sized
+from tuner.vehicle.vehicle import Size, scaled_to_size, size_of
 
 AS_TABLED = Size()
 LEAST_SLOPE = 1e-150
@@ -268,7 +268,7 @@ def parameter_of(
 ) -> Parameter:
     """Return the coordinate of a coefficient and of those tied to it, as a job has it."""
     name = names[0]
-    row, start = sized(COEFFICIENTS[name], size), values[name]
+    row, start = scaled_to_size(COEFFICIENTS[name], size), values[name]
     given = job.coefficients.get(name, CoefficientSettings())
     scale = given.scale or row.scale
     bounded = given.lower is not None and given.upper is not None

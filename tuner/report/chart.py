@@ -1,4 +1,4 @@
-"""What a figure shows, apart from how it is drawn: by Plot on the page, else by matplotlib."""
+"""The content of figures, drawn by Plot on the page and by matplotlib elsewhere."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 GREY = "#8a8a8a"
 
-SMALLEST = 1e-3
+MIN_DRAWN = 1e-3
 """mm or degrees below which an error is drawn as this on a logarithmic axis."""
 
 Scale = Literal["linear", "log"]
@@ -24,7 +24,7 @@ Dash = Literal["solid", "dot", "dash"]
 
 @dataclass(frozen=True)
 class Look:
-    """How a line looks; colour alone never distinguishes two."""
+    """The style of a line; colour alone never distinguishes two."""
 
     colour: str
     dash: Dash = "solid"
@@ -132,7 +132,7 @@ class Chart:
 
     @property
     def is_worth_drawing(self) -> bool:
-        """Whether a panel of it has more than a point."""
+        """Whether a panel has more than one point."""
         return any(sum(map(_size, panel.marks)) > 1 for panel in self.panels)
 
 

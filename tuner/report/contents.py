@@ -1,4 +1,4 @@
-"""What a result folder holds for the page, and the files of it that only a page reads."""
+"""The contents of a result folder for the page, and the files that only the page reads."""
 
 from __future__ import annotations
 
@@ -104,9 +104,9 @@ def _about_run(run: Run) -> About:
 
 
 TRACES_FILE = "traces.npz"
-POINTS = 1200
+MAX_POINTS = 1200
 """Points of a curve: as many as a wide screen has pixels."""
-FORCE_POINTS = 400
+MAX_FORCE_POINTS = 400
 """Points of a force's curve, of which a flight has dozens."""
 
 
@@ -161,15 +161,15 @@ def write_traces(folder: Path, simulations: Mapping[str, Mapping[str, FlightErro
         for name, errors in flights.items():
             flight = file_name(name)
             for signal, of_signal in (("position", errors.position), ("attitude", errors.attitude)):
-                arrays[f"{flight}/{signal}_time"] = _thinned(of_signal.time)
-                arrays[f"{flight}/{signal}"] = _thinned(of_signal.recorded)
-                arrays[f"{flight}/{signal}_{suffix}"] = _thinned(of_signal.simulated)
+                arrays[f"{flight}/{signal}_time"] = _thin(of_signal.time)
+                arrays[f"{flight}/{signal}"] = _thin(of_signal.recorded)
+                arrays[f"{flight}/{signal}_{suffix}"] = _thin(of_signal.simulated)
     for name, errors in last.items():
         flight = file_name(name)
         if errors.forces is not None:
-            arrays[f"{flight}/acting_time"] = _thinned(errors.forces.time, FORCE_POINTS)
+            arrays[f"{flight}/acting_time"] = _thin(errors.forces.time, MAX_FORCE_POINTS)
             for term, acted in errors.forces.of_term.items():
-                arrays[f"{flight}/acting_{term}"] = _thinned(acted, FORCE_POINTS)
+                arrays[f"{flight}/acting_{term}"] = _thin(acted, MAX_FORCE_POINTS)
     with whole_file(folder / TRACES_FILE) as unfinished, unfinished.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
@@ -186,6 +186,6 @@ def read_traces(folder: Path) -> dict[str, dict[str, Array]]:
     return traces
 
 
-def _thinned(values: Array, points: int = POINTS) -> Array:
+def _thin(values: Array, points: int = MAX_POINTS) -> Array:
     step = max(1, int(np.ceil(len(values) / points)))
     return values[::step]

@@ -1,4 +1,4 @@
-"""Whether a fit can be used, for what, and why: one answer for terminal, page and service."""
+"""The usability of a fit, its uses and the reasons, for terminal, page and service."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from tuner.uncertainty.records import Knowledge
 from tuner.uncertainty.verdict import Verdict
 from tuner.uncertainty.verdict_texts import verdict_in_words
 
-NAMES = 90
-"""Letters within which flights are named in a sentence."""
-AT_NOISE = 1.5
-"""Times the noise up to which what remains of a flight is called noise."""
-UNCHANGED = 0.8
-"""Share of what it was above which an error is called unchanged."""
+MAX_NAMES_LETTERS = 90
+"""The names of flights in a sentence take at most so many letters."""
+MAX_NOISE_RATIO = 1.5
+"""A flight whose RMSE is at most so many times the noise is matched."""
+MIN_UNCHANGED_RATIO = 0.8
+"""An RMSE above this share of the initial one is unchanged."""
 Errors = tuple[float | None, float | None, float | None]
-"""Before and after a fit, and of the noise."""
-NOT_FLOWN = frozenset(
+"""RMSE before and after a fit, and of the noise."""
+WRONG_VEHICLE_CODES = frozenset(
     {
         Code.VEHICLE_NOT_GIVEN,
         Code.WRONG_VEHICLE,
@@ -39,19 +39,19 @@ NOT_FLOWN = frozenset(
         Code.SETPOINTS_SCALED,
     }
 )
-"""Warnings of vehicles and controllers that did not fly, on which a simulation may fail."""
-OTHER_INPUTS = NOT_FLOWN | {
+"""Warnings of vehicles and controllers other than the flown ones; simulations may fail."""
+WRONG_INPUT_CODES = WRONG_VEHICLE_CODES | {
     Code.MASS_NOT_GIVEN,
     Code.SAME_RECORDING,
     Code.LIFTS_OTHERWISE,
     Code.DSHOT_OR_PULSES,
 }
-"""Warnings that what was given is not what flew: all numbers follow from that."""
-CONFLICTS = OTHER_INPUTS | {Code.GROUND_CONFLICT, Code.BENCH_CONFLICT}
-"""Warnings that inputs or measurements contradict what flew: the next step is to settle them."""
-CAUSES = OTHER_INPUTS | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS, Code.INLET_CHOSEN}
-"""Warnings that say why others arise."""
-DOUBTS = CONFLICTS | frozenset(
+"""Warnings of inputs other than the flown ones: all numbers depend on them."""
+CONFLICT_CODES = WRONG_INPUT_CODES | {Code.GROUND_CONFLICT, Code.BENCH_CONFLICT}
+"""Warnings of inputs or measurements that contradict the flights, to be resolved next."""
+CAUSE_CODES = WRONG_INPUT_CODES | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS, Code.INLET_CHOSEN}
+"""Warnings that cause others."""
+DOUBT_CODES = CONFLICT_CODES | frozenset(
     {
         Code.MODEL_UNMATCHED,
         Code.FLIGHT_UNMATCHED,
@@ -70,33 +70,33 @@ DOUBTS = CONFLICTS | frozenset(
         Code.RATE_WORSE,
     }
 )
-"""Warnings that put the numbers themselves in doubt."""
+"""Warnings that cast doubt on the numbers."""
 
 
 class Usability(StrEnum):
-    """Whether a fit can be used."""
+    """The usability of a fit."""
 
     USABLE = "usable"
     WITH_CARE = "usable with care"
     UNUSABLE = "not usable"
 
 
-LOOKS = {Usability.USABLE: "well", Usability.WITH_CARE: "weak", Usability.UNUSABLE: "not"}
+STYLE_OF = {Usability.USABLE: "well", Usability.WITH_CARE: "weak", Usability.UNUSABLE: "not"}
 
 
 @dataclass(frozen=True)
 class FlightOutcome:
-    """How closely a flight is met.
+    """The errors of a flight.
 
     Attributes
     ----------
     position, attitude
-        RMSE before, after, and that of the measurement noise alone: distance in m, the three angles
-        together in degrees; None for a crash or what is not simulated.
+        RMSE before, after, and of the noise: distance in m, norm of the three angles in degrees;
+        None for a crash or a signal that is not simulated.
     word
-        ``matched`` to the noise, ``better``, ``unchanged``, ``worse``, or it ``crashes``.
+        ``matched`` (to the noise), ``better``, ``unchanged``, ``worse`` or ``crashes``.
     horizon
-        s after which each simulation begins anew at the recorded state; None where it never does.
+        s after which each simulation restarts at the recorded state; None if it never does.
     """
 
     name: str
@@ -109,18 +109,18 @@ class FlightOutcome:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a fit came to.
+    """The outcome of a fit.
 
     Attributes
     ----------
     what
-        What was fitted to what, as a sentence.
+        A sentence on the coefficients and flights of the fit.
     uses, reasons
-        For what, and why so, in sentences.
+        Sentences on its uses, and the reasons.
     flights
-        How closely each is met, held-out ones first.
+        Their errors, held-out ones first.
     checks
-        Those that speak for or against it: held-out ones, else all.
+        Those that validate it: held-out ones, else all.
     """
 
     usability: Usability
@@ -132,25 +132,25 @@ class Outcome:
 
     @property
     def look(self) -> str:
-        """Class of the page's style."""
-        return LOOKS[self.usability]
+        """The CSS class on the page."""
+        return STYLE_OF[self.usability]
 
 
 def outcome(
     result: RunResult, bench: BenchRecord | None = None, exports: Sequence[ExportRecord] = ()
 ) -> Outcome:
-    """Return whether a fit can be used, for what, and why; with care where no export passed."""
+    """Return the outcome of a fit; it is usable with care if no export passed."""
     flights = sorted(
         (_flight_outcome(flight, result) for flight in result.flights),
         key=lambda flight: not flight.held_out,
     )
     checks = [flight for flight in flights if flight.held_out] or flights
     usability = _usability(result, checks, flights)
-    if usability is Usability.USABLE and _why_refused(exports):
+    if usability is Usability.USABLE and _refusal(exports):
         usability = Usability.WITH_CARE
     return Outcome(
         usability,
-        _what(result) if bench is None else bench_in_words(bench),
+        _fit_summary(result) if bench is None else bench_in_words(bench),
         _uses(result, usability),
         _reasons(result, checks),
         tuple(flights),
@@ -158,37 +158,38 @@ def outcome(
     )
 
 
-def by_weight(findings: Sequence[Finding]) -> list[Finding]:
-    """Return failures and warnings: why a fit fails first, causes, then what doubts the numbers."""
+def sort_by_weight(findings: Sequence[Finding]) -> list[Finding]:
+    """Return failures and warnings: causes of failure first, then causes, then doubts."""
     found = [finding for finding in findings if finding.level != "info"]
     refuted = any(finding.code is Code.FLIGHTS_REFUTE for finding in found)
 
     def weight(finding: Finding) -> tuple[bool, ...]:
-        kinds = (finding.code not in codes for codes in (CAUSES, DOUBTS))
-        return not (refuted and finding.code in NOT_FLOWN), finding.level != "failure", *kinds
+        kinds = (finding.code not in codes for codes in (CAUSE_CODES, DOUBT_CODES))
+        cause = refuted and finding.code in WRONG_VEHICLE_CODES
+        return not cause, finding.level != "failure", *kinds
 
     return sorted(found, key=weight)
 
 
 def warnings_of(findings: Sequence[Finding]) -> list[Cell]:
-    """Return the same with the remedy of each."""
-    found = by_weight(findings)
+    """Return failures and warnings as cells with their remedies."""
+    found = sort_by_weight(findings)
     return [Cell(sentence(f), small=remedy(f), look=f.level, link=f.subject) for f in found]
 
 
 def next_step(
     result: RunResult, found: Outcome, folder: Path, exports: Sequence[ExportRecord] = ()
 ) -> tuple[str, str]:
-    """Return what to do next with a fit: in words, and the command.
+    """Return the next step after a fit: in words, and the command.
 
     Parameters
     ----------
     exports
-        What was asked for; where all were refused, why comes first.
+        The requested ones; if all were refused, the reason comes first.
     """
     name = shlex.quote(str(folder))
     unusable = found.usability is Usability.UNUSABLE
-    doubted = [f for f in by_weight(result.findings) if unusable or f.code in CONFLICTS]
+    doubted = [f for f in sort_by_weight(result.findings) if unusable or f.code in CONFLICT_CODES]
     remedies = [words for finding in doubted if (words := remedy(finding))]
     if unusable or remedies:
         return remedies[0] if remedies else "Look at its flights.", f"tune report {name} --open"
@@ -203,30 +204,31 @@ def next_step(
         return words, f"tune ... --holdout {shlex.quote(flight)}"
     if not found.flights:
         return "Fit flights from it.", f"tune --flights FLIGHT... --bench {name}"
-    if why := _why_refused(exports):
+    if why := _refusal(exports):
         return as_sentence(why), f"tune report {name} --open"
     return "Put it into your model.", f"tune export {name} --format sdf --into model.sdf"
 
 
-def _why_refused(exports: Sequence[ExportRecord]) -> str:
-    """Return why all exports were refused; empty where one was written, or none asked for."""
+def _refusal(exports: Sequence[ExportRecord]) -> str:
+    """Return why all exports were refused; empty if one was written, or none requested."""
     refused = [one.refused for one in exports]
     return refused[0].partition(": ")[2].partition("; ")[0] if all(refused) and refused else ""
 
 
-def of_examination(knowledge: Knowledge) -> str:
-    """Return what an examination without a fit came to, as a sentence."""
+def examination_in_words(knowledge: Knowledge) -> str:
+    """Return a sentence on the verdicts of an examination without a fit."""
     known = knowledge.coefficients.values()
     verdicts = [coefficient.verdict for coefficient in known if coefficient.fitted]
     flights = len(knowledge.flights)
     return (
         f"{len(verdicts)} coefficient{'s were' if len(verdicts) != 1 else ' was'} examined on "
-        f"{flights} flight{'s' if flights != 1 else ''}, nothing fitted: {counted(verdicts)}."
+        f"{flights} flight{'s' if flights != 1 else ''}, nothing fitted: "
+        f"{verdict_counts(verdicts)}."
     )
 
 
 def flights_table(flights: Sequence[FlightOutcome]) -> Table:
-    """Return how closely flights are met, beside the noise."""
+    """Return the table of flights' RMSE and noise."""
     looks = {"matched": "well", "better": "well", "unchanged": "weak"}
     rows: list[tuple[Cell | str, ...]] = [
         (
@@ -247,17 +249,17 @@ def flights_table(flights: Sequence[FlightOutcome]) -> Table:
     return Table(columns, rows, words=("flight", "verdict"))
 
 
-def counted(verdicts: Sequence[Verdict]) -> str:
-    """Return how many coefficients have each verdict, as a clause."""
+def verdict_counts(verdicts: Sequence[Verdict]) -> str:
+    """Return a clause with the number of coefficients of each verdict."""
     counts = Counter(verdict_in_words(verdict) for verdict in verdicts)
     if len(counts) == 1 and len(verdicts) > 1:
-        return f"all {len(verdicts)} are {_of_many(next(iter(counts)))}"
+        return f"all {len(verdicts)} are {_plural(next(iter(counts)))}"
     return listed(
-        [f"1 is {one}" if n == 1 else f"{n} are {_of_many(one)}" for one, n in counts.items()]
+        [f"1 is {one}" if n == 1 else f"{n} are {_plural(one)}" for one, n in counts.items()]
     )
 
 
-def _of_many(words: str) -> str:
+def _plural(words: str) -> str:
     return words.replace("at its initial value", "at their initial values")
 
 
@@ -277,24 +279,20 @@ def _flight_outcome(flight: FlightResult, result: RunResult) -> FlightOutcome:
     return FlightOutcome(flight.name, held_out, position, attitude, word, flight.horizon)
 
 
-def _word(
-    position: Errors,
-    attitude: Errors,
-    codes: set[Code],
-) -> str:
+def _word(position: Errors, attitude: Errors, codes: set[Code]) -> str:
     before, after, _ = position
     if after is None:
         return "crashes"
     if Code.FLIGHT_WORSE in codes:
         return "worse"
     pairs = [(end, noise) for _, end, noise in (position, attitude) if end is not None and noise]
-    if pairs and all(end <= AT_NOISE * noise for end, noise in pairs):
+    if pairs and all(end <= MAX_NOISE_RATIO * noise for end, noise in pairs):
         return "matched"
-    return "better" if before is None or after < UNCHANGED * before else "unchanged"
+    return "better" if before is None or after < MIN_UNCHANGED_RATIO * before else "unchanged"
 
 
 def _errors(flight: FlightResult, result: RunResult, signal: str) -> Errors:
-    """Return how far a signal is missed before and after, and its noise as the fit estimated it."""
+    """Return a signal's RMSE before and after, and its noise as estimated by the fit."""
     noise = result.settings.get("noise")
     of_axis = noise.get(signal) if isinstance(noise, dict) else None
     unit = math.sqrt(3.0) * (math.degrees(1.0) if signal == "attitude" else 1.0)
@@ -316,12 +314,12 @@ def _usability(
         bool(flights) and not any(one.held_out for one in flights),
         not result.search.converged,
         bool(fitted) and (all if flights else any)(row.identifiable is False for row in fitted),
-        any(f.level == "warning" and f.code in DOUBTS for f in result.findings),
+        any(f.level == "warning" and f.code in DOUBT_CODES for f in result.findings),
     )
     return Usability.WITH_CARE if any(unsure) else Usability.USABLE
 
 
-def _what(result: RunResult) -> str:
+def _fit_summary(result: RunResult) -> str:
     fitted, held = (
         sum(flight.split == split for flight in result.flights) for split in ("fit", "holdout")
     )
@@ -336,12 +334,12 @@ def _what(result: RunResult) -> str:
 
 
 def _uses(result: RunResult, usability: Usability) -> tuple[str, ...]:
-    """Return for what a fit can be used, and for what it cannot, in sentences."""
+    """Return sentences on the uses of a fit, and on excluded ones."""
     if usability is Usability.UNUSABLE:
         return ("Do not use these numbers: see the warnings for what to do first.",)
     sentences = []
     fitted = [flight.name for flight in result.flights if flight.split == "fit"]
-    like = f"Simulating flights like the fitted ones ({listed_within(fitted, NAMES)})"
+    like = f"Simulating flights like the fitted ones ({listed_within(fitted, MAX_NAMES_LETTERS)})"
     if result.effective is not None:
         sentences.append(f"{like}: {simulator_lacks(result.effective)}")
     elif result.flights:

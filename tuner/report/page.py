@@ -18,9 +18,9 @@ from tuner.core.disk import write_text
 from tuner.design.proposals import proposals_in_words
 from tuner.report.contents import Contents, read_contents
 from tuner.report.outcome import (
+    examination_in_words,
     flights_table,
     next_step,
-    of_examination,
     outcome,
     warnings_of,
 )
@@ -84,7 +84,7 @@ def render(folder: str | Path, *, plots: bool = False) -> Path:
     Parameters
     ----------
     folder
-        Of a run, or of an examination without one.
+        The result folder of a run, or of an examination alone.
     plots
         Also write its figures into ``plots/``, as SVG.
 
@@ -125,26 +125,26 @@ def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
         next=next_step(run.result, found, contents.folder, contents.exports)
         if run and found
         else None,
-        said=_said(contents),
+        said=_examination_sentences(contents),
         warnings=warnings_of(contents.about.findings),
         exports=contents.exports,
         sections=sections,
         policy=_policy(script, library),
         style=Markup(_source(environment, "page.css")),
         script=Markup(script),
-        figures=Markup(_packed(figures)),
-        library=Markup(_packed(library)),
+        figures=Markup(_compressed(figures)),
+        library=Markup(_compressed(library)),
     )
 
 
-def _said(contents: Contents) -> list[str]:
-    """Return what an examination without a fit came to, in sentences."""
-    said = [] if contents.knowledge is None else [of_examination(contents.knowledge)]
+def _examination_sentences(contents: Contents) -> list[str]:
+    """Return sentences on an examination without a fit."""
+    said = [] if contents.knowledge is None else [examination_in_words(contents.knowledge)]
     return said + (proposals_in_words(contents.proposals)[:2] if contents.proposals else [])
 
 
 def _policy(*scripts: str) -> str:
-    """Return the content-security policy that the page carries and works under.
+    """Return the content-security policy of the page.
 
     It runs its own two scripts, known by their hashes, evaluates no text and opens no connection.
     The plotting library sets style attributes; a figure is saved by way of a blob.
@@ -162,6 +162,6 @@ def _source(environment: Environment, name: str) -> str:
     return environment.loader.get_source(environment, name)[0]
 
 
-def _packed(text: str) -> str:
-    """Compress text, and write it so that it cannot end the element that it stands in."""
+def _compressed(text: str) -> str:
+    """Return compressed text in Base64, which cannot end its element."""
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()

@@ -15,9 +15,9 @@ from tuner.core.errors import InputError
 from tuner.report.chart import (
     FITTED,
     GREY,
+    MIN_DRAWN,
     PALETTE,
     RECORDED,
-    SMALLEST,
     Bars,
     Chart,
     Heat,
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from tuner.evaluate.rmse import FlightErrors
 
 
-MOST = 8
+MAX_COLUMNS = 8
 """Flights that a figure compares: more panels cannot be read."""
 
 
@@ -66,14 +66,16 @@ def flight_figure(flight: Simulation, title: str) -> Chart:
 def comparison_figure(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Chart:
     """Return the position error over time of each vehicle, a panel a flight."""
     looks = [Look(colour) for colour in PALETTE] + [Look(GREY, dash="dash")]
-    flights = list(dict.fromkeys(name for errors in flown.values() for name in errors))[:MOST]
+    flights = list(dict.fromkeys(name for errors in flown.values() for name in errors))[
+        :MAX_COLUMNS
+    ]
     panels = []
     for name in flights:
         lines = []
         for number, (vehicle, errors) in enumerate(flown.items()):
             position = errors[name].position
             error = 1e3 * np.linalg.norm(position.simulated - position.recorded, axis=1)
-            shown = rounded(np.maximum(error, SMALLEST), 4)
+            shown = rounded(np.maximum(error, MIN_DRAWN), 4)
             time = rounded(position.time, 3)
             lines.append(Line(vehicle, time, shown, looks[min(number, len(looks) - 1)]))
         panels.append(Panel(lines, y_title=f"{name} [mm]", y_scale="log"))
@@ -83,13 +85,13 @@ def comparison_figure(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Chart:
 
 PLOTS = "plots"
 SUFFIXES = (".png", ".svg", ".pdf")
-"""Of files that hold a figure."""
+"""Of files with a figure."""
 WIDTH = 6.3
 """Inches: the text width of a page with usual margins."""
 LEGEND_COLUMNS = 5
 PIXELS = 96.0
 """An inch of the page on a screen."""
-ALIKE = 1.001
+MAX_SCALE_RATIO = 1.001
 """Numbers that differ by less than so many times are one, for a logarithmic axis."""
 DASHES = {"solid": "-", "dot": ":", "dash": "--"}
 SETTINGS: dict[Any, Any] = {
@@ -130,7 +132,7 @@ def write_figure(chart: Chart, path: Path) -> None:
 
     mpl.use("Agg", force=False)
     with mpl.rc_context(SETTINGS), whole_file(path) as unfinished:
-        unfinished.write_bytes(_drawn(chart, path.suffix[1:]))
+        unfinished.write_bytes(_figure_of(chart, path.suffix[1:]))
 
 
 def plot_file(folder: Path, chart: Chart) -> Path:
@@ -138,7 +140,7 @@ def plot_file(folder: Path, chart: Chart) -> Path:
     return inside(folder, f"{PLOTS}/{file_name(chart.key, '.svg')}")
 
 
-def _drawn(chart: Chart, kind: str) -> bytes:
+def _figure_of(chart: Chart, kind: str) -> bytes:
     from matplotlib import pyplot as plt  # noqa: PLC0415
 
     count = len(chart.panels)
@@ -212,7 +214,7 @@ def _draw(panel: Panel, place: Axes) -> None:
             _label_decades(place.yaxis)
         if panel.x_scale == "log" and place.dataLim.x1 > 0:
             least, largest = place.dataLim.minposx, place.dataLim.x1
-            if largest < ALIKE * least:  # but for rounding errors, which leave no axis
+            if largest < MAX_SCALE_RATIO * least:  # but for rounding errors, which leave no axis
                 place.set_xlim(0.5 * least, 2.0 * largest)
             place.set_xscale("log")
             _label_decades(place.xaxis)

@@ -1,4 +1,4 @@
-"""A run's result as sentences: how it ended, its terms, its second answer, refits, exports."""
+"""Sentences on a run's result: its ending, terms, effective coefficients, refits, exports."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from tuner.uncertainty.records import Calibration
 from tuner.vehicle import REGISTRY, Coefficient, NotCarried, Written
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
-NEARLY = 0.01
-"""Share of the loss from which a term that is left out is worth naming."""
-APART = 2.0
-"""Times the standard error of a fit beyond which that of refits is called larger."""
+MIN_NEARLY_KEPT_GAIN = 0.01
+"""A rejected term with a larger gain, as a share of the loss, is mentioned."""
+MIN_REFIT_ERROR_RATIO = 2.0
+"""An error of refits above so many standard errors of the fit is called larger."""
 
 
 def refits_in_words(result: RunResult) -> tuple[str, ...]:
-    """Return sentences on the errors by refits, none where there are none.
+    """Return sentences on the errors by refits, if there are any.
 
-    An estimate of a standard deviation from n values is known to one part in the square root of
-    2 (n - 1), if they are normal.
+    The relative error of a standard deviation of n normal values is 1 / sqrt(2 (n - 1)).
     """
     fitted = result.coefficients
     flights = sum(flight.split == "fit" for flight in result.flights)
@@ -40,7 +39,7 @@ def refits_in_words(result: RunResult) -> tuple[str, ...]:
         for name, found in fitted.items()
         if found.std_error is not None
         and max(found.jackknife_error or 0.0, found.bootstrap_error or 0.0)
-        > APART * found.std_error
+        > MIN_REFIT_ERROR_RATIO * found.std_error
     ]
     if not beyond:
         agree = "The flights disagree about no coefficient by more than twice what the fit quotes."
@@ -60,7 +59,7 @@ def ending_sentence(ending: Ending) -> str:
 
 
 def calibration_in_words(calibration: Calibration) -> str:
-    """Return how many of the 95 % intervals held the truth, for each kind of flight."""
+    """Return a sentence on the coverage of the 95 % intervals, for each kind of flight."""
     shares = [f"{100 * kind.coverage['95']:.0f} % ({kind.flights})" for kind in calibration.kinds]
     sets = sorted({kind.sets for kind in calibration.kinds})
     many = f"{sets[0]}" if len(sets) == 1 else f"{sets[0]} to {sets[-1]}"
@@ -78,7 +77,7 @@ def export_sentence(kind: str, outcome: Path | InputError) -> str:
 
 
 def effective_in_words(effective: EffectiveResult) -> str:
-    """Return what the second answer is and how it flies, in sentences."""
+    """Return sentences on the effective coefficients and their RMSE."""
     lost = listed([term.group for term in effective.lost])
     text = (
         f"Gazebo cannot fly {lost}. With its effective coefficients it misses the flights by "
@@ -92,7 +91,7 @@ def effective_in_words(effective: EffectiveResult) -> str:
 
 
 def simulator_lacks(effective: EffectiveResult) -> str:
-    """Return as a sentence what Gazebo lacks, and how it flies all the same."""
+    """Return a sentence on the terms that Gazebo lacks, and its RMSE."""
     return (
         f"Gazebo lacks {listed([term.group for term in effective.lost])}, and with effective "
         f"coefficients misses them by {rmse_in_words(effective.rmse_effective)}."
@@ -100,7 +99,7 @@ def simulator_lacks(effective: EffectiveResult) -> str:
 
 
 def rmse_in_words(rmse: PoseRmse) -> str:
-    """Return an RMSE with units of a readable size; of an attitude that is followed, nothing."""
+    """Return an RMSE with readable units, without that of an attitude as input."""
     if rmse.position is None:
         return "a crash"
     if rmse.attitude is None:
@@ -115,8 +114,8 @@ def metres(value: float) -> str:
     return f"{100 * value:.2g} cm" if value >= 0.01 else f"{1000 * value:.2g} mm"
 
 
-def what_is_exported(effective: EffectiveResult, simulator: str) -> str:
-    """Return, as a clause, what the numbers of an export for a simulator are."""
+def exported_numbers(effective: EffectiveResult, simulator: str) -> str:
+    """Return a clause on the effective coefficients of an export."""
     lost = listed([term.group for term in effective.lost])
     return (
         f"effective coefficients, not physical ones: {simulator} lacks {lost}, and misses the "
@@ -125,14 +124,14 @@ def what_is_exported(effective: EffectiveResult, simulator: str) -> str:
     )
 
 
-def what_is_lost(
+def lost_groups(
     effective: EffectiveResult,
     entry: Callable[[Coefficient], Written | NotCarried | None],
     deviations: Sequence[str],
 ) -> tuple[str, ...]:
-    """Return a clause on each group that is lost: why a target lacks it, and what it is worth.
+    """Return a clause on each missing group: the reason, and the RMSE without it.
 
-    ``deviations`` are what the simulator computes otherwise than any coefficient says.
+    ``deviations`` are the simulator's differences that have no coefficient.
     """
     clauses = []
     for term in effective.lost:
@@ -181,7 +180,7 @@ def reason_in_words(row: SelectionRow) -> str:
 
 def nearly_kept(row: SelectionRow) -> bool:
     """Return whether a group that was left out gained a percent or more in the fit."""
-    return not row.kept and (row.gain_fit or 0.0) >= NEARLY
+    return not row.kept and (row.gain_fit or 0.0) >= MIN_NEARLY_KEPT_GAIN
 
 
 def gain_in_words(gain: float | None) -> str:

@@ -30,7 +30,7 @@ from tuner.recordings.loader import InertialFlight, load_flights, read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import parameters_of
 from tuner.search.inlet_choice import SIGNAL_OF_INLET, choose_inlet
-from tuner.vehicle.controller import PLACES, with_parameters
+from tuner.vehicle.controller import PARAMETER_OF, with_parameters
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def with_logged_parameters(settings: Settings) -> tuple[Settings, tuple[Finding,
         return settings, ()
     first, *others = logs.values()
     controller, changes = with_parameters(settings.controller, first)
-    known = [name for name in PLACES.values() if name in first]
+    known = [name for name in PARAMETER_OF.values() if name in first]
     unlike = [name for name in known if any(other.get(name) != first[name] for other in others)]
     findings = []
     if changes:

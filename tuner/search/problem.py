@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim_jax.state import AIRBORNE, Limits
 from tuner.config import CHANNELS, JobFile, Settings
-from tuner.config.job import ErrorOf, InletName
+from tuner.config.job import ErrorKind, InletName
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.equation_error.estimate import Estimate
 from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
@@ -22,7 +22,7 @@ from tuner.objective.segments import Segments, on_time, segments_of, window_segm
 from tuner.objective.space import Space, space_of
 from tuner.recordings.flight import Flight
 from tuner.search.job_flights import Recording
-from tuner.vehicle import conditions
+from tuner.vehicle import condition_rows
 from tuner.vehicle.model import model_of, schedule_of
 
 #: Channels of a yaw spin that is not held level: nothing holds its position, so that a gust or a
@@ -207,7 +207,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     return Job(settings, recordings, noise, space, windows)
 
 
-def _free_starts(criterion: ErrorOf, inlets: Sequence[InletName]) -> bool:
+def _free_starts(criterion: ErrorKind, inlets: Sequence[InletName]) -> bool:
     """Return whether windows have free initial states, rather than recorded ones.
 
     Raises
@@ -236,7 +236,7 @@ def _conditions(job: JobFile, channels: Collection[str]) -> tuple[str, ...]:
     named = set() if isinstance(job.terms, str) else set(job.terms)
     if "acceleration" in channels:
         named.add("accelerometer")
-    return tuple(name for name, row in conditions().items() if named & {name, row.group})
+    return tuple(name for name, row in condition_rows().items() if named & {name, row.group})
 
 
 def _weights(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tuner.core.errors import RecordingError
-from tuner.core.runtime import THREADS
+from tuner.core.runtime import THREAD_VARIABLES
 from tuner.service.settings import Limits, limit_process, size_in_words
 
 SMALLER = "split the recording, or leave topics out that are not needed (images, point clouds)"
@@ -36,7 +36,7 @@ def inspect(file: Path, limits: Limits) -> dict[str, Any]:
         int(limits.inspection_seconds) + 1,
     )
     command = [sys.executable, "-m", "tuner.service.inspection", str(file), *map(str, numbers)]
-    single = dict.fromkeys(THREADS, "1")
+    single = dict.fromkeys(THREAD_VARIABLES, "1")
     try:
         done = subprocess.run(
             command,

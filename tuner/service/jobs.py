@@ -31,7 +31,7 @@ from tuner.service.tables import (
     RecordingRow,
     State,
 )
-from tuner.vehicle.registry import at_mass
+from tuner.vehicle.registry import mass_factor
 
 PAGE = 50
 """Jobs of one page."""
@@ -352,7 +352,7 @@ def history(database: Database, vehicle: str) -> History:
         if row.coefficient == "mass" and row.identifiable is None:
             continue  # not fitted
         job = by_number[row.job]
-        factor, ci95 = at_mass(row.coefficient, masses.get(row.job), mass), None
+        factor, ci95 = mass_factor(row.coefficient, masses.get(row.job), mass), None
         if row.lower is not None and row.upper is not None:
             ci95 = (factor * row.lower, factor * row.upper)
         point = Point(

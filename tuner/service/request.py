@@ -10,9 +10,9 @@ from typing import Annotated, Any, TypeVar
 from annotated_types import Len
 from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
-from tuner.config import settle
+from tuner.config import resolve_settings
 from tuner.config.job import JobFile
-from tuner.config.settings import JOB_FILE, is_among
+from tuner.config.settings import JOB_FILE, names_recording
 from tuner.core.disk import inside
 from tuner.core.errors import ConfigError, InputError, did_you_mean
 from tuner.core.shipped import Kind, configs_folder
@@ -172,7 +172,7 @@ def checked(
             place.touch()
         asked.lay_out(folder)
         try:
-            settled = settle(asked.options(folder, flights))
+            settled = resolve_settings(asked.options(folder, flights))
         except InputError as error:
             raise type(error)(
                 *(_without(folder, text) for text in (error.where, error.what, error.remedy))
@@ -191,7 +191,7 @@ def _holdout(names: Sequence[str] | None, flights: Sequence[str]) -> tuple[str, 
     chosen = []
     for name in names:
         meant = (name, *stems([last_part(name), recording_name(name)]))
-        stem = next((s for s in meant if is_among(s, known)), None)
+        stem = next((s for s in meant if names_recording(s, known)), None)
         if stem is None:
             raise InputError("holdout", f"there is no flight '{name}'", did_you_mean(name, known))
         chosen.append(stem)

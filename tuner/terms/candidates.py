@@ -17,7 +17,7 @@ from tuner.search.findings import findings_at
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, loop_of, with_loop
 from tuner.terms.score import ACCEPTED
-from tuner.vehicle import COEFFICIENTS, conditions, term_groups, values_of
+from tuner.vehicle import COEFFICIENTS, condition_rows, term_groups, values_of
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 PRIOR_PRESENCE = 0.5
@@ -73,12 +73,12 @@ def names_of(groups: Groups) -> tuple[str, ...]:
 
 def coefficients_of(groups: Groups) -> tuple[str, ...]:
     """Return the coefficients of some groups."""
-    return tuple(name for name in names_of(groups) if name not in conditions())
+    return tuple(name for name in names_of(groups) if name not in condition_rows())
 
 
 def conditions_of(groups: Groups) -> tuple[str, ...]:
     """Return the per-flight conditions of some groups."""
-    return tuple(name for name in names_of(groups) if name in conditions())
+    return tuple(name for name in names_of(groups) if name in condition_rows())
 
 
 def groups_named(terms: Sequence[str], space: Space) -> Groups:
@@ -88,7 +88,7 @@ def groups_named(terms: Sequence[str], space: Space) -> Groups:
     """
     groups = term_groups()
     named: dict[str, tuple[str, ...]] = {}
-    taken = {*space.free, *conditions()}
+    taken = {*space.free, *condition_rows()}
     for term in terms:
         members = groups.get(term, (term,) if term in COEFFICIENTS else ())
         names = tuple(name for name in members if name not in taken)
@@ -100,7 +100,7 @@ def groups_named(terms: Sequence[str], space: Space) -> Groups:
 
 def is_lumped(group: str) -> bool:
     """Return whether a group lumps effects that other terms describe one by one."""
-    return any(COEFFICIENTS[name].stands_in for name in term_groups().get(group, ()))
+    return any(COEFFICIENTS[name].is_aggregate for name in term_groups().get(group, ()))
 
 
 def prior_presence_of(names: Collection[str]) -> float:
@@ -108,7 +108,7 @@ def prior_presence_of(names: Collection[str]) -> float:
     rows = [COEFFICIENTS[name] for name in names if name in COEFFICIENTS]
     if any(row.expected for row in rows):
         return 1.0
-    return PRIOR_PRESENCE_OF_LUMPED if any(row.stands_in for row in rows) else PRIOR_PRESENCE
+    return PRIOR_PRESENCE_OF_LUMPED if any(row.is_aggregate for row in rows) else PRIOR_PRESENCE
 
 
 def reads_recording(group: str) -> bool:

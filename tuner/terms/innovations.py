@@ -37,7 +37,7 @@ from tuner.terms.linearisation import (
 from tuner.terms.model_averaging import NEGLIGIBLE_SIZE, Evidence, selection_shifts
 from tuner.terms.score import ACCEPTED, backward_elimination, score
 from tuner.uncertainty.model_error import ModelErrors
-from tuner.vehicle import COEFFICIENTS, conditions
+from tuner.vehicle import COEFFICIENTS, condition_rows
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 Array = NDArray[np.float64]
@@ -237,7 +237,7 @@ class LinearisedInnovations:
             for row in self.selected.rows
             if row.reason in (ACCEPTED if row.kept else REJECTED_BY_LEAST_SQUARES)
             and not hidden(row.names).any()
-            and not set(row.names) & set(conditions())
+            and not set(row.names) & set(condition_rows())
             and all(COEFFICIENTS[name].begin is None for name in row.names)
         }
 
@@ -260,7 +260,7 @@ class LinearisedInnovations:
 
 def groups_left_out(selected: Selected) -> Groups:
     """Return the groups left out but per-flight conditions: a filter estimates steady wind too."""
-    return {names[0]: names for names in selected.left_out if not {*conditions()} & {*names}}
+    return {names[0]: names for names in selected.left_out if not {*condition_rows()} & {*names}}
 
 
 def _row_after(row: SelectionRow, *, kept: bool) -> SelectionRow:

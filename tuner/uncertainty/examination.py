@@ -28,7 +28,7 @@ from tuner.uncertainty.records import CoefficientKnowledge, Knowledge, Residual
 from tuner.uncertainty.sensitivity import LocalSensitivity, local_sensitivity
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
-from tuner.vehicle.vehicle import Size, sized
+from tuner.vehicle.vehicle import Size, scaled_to_size
 
 
 @dataclass(frozen=True)
@@ -356,7 +356,7 @@ def _acts(name: str, value: float) -> bool:
 
 
 def _parameter(name: str, value: float, size: Size) -> Parameter:
-    row = sized(COEFFICIENTS[name], size)
+    row = scaled_to_size(COEFFICIENTS[name], size)
     lower, upper = row.limits(value)
     return Parameter(
         name=name,

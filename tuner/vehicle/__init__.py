@@ -7,7 +7,7 @@ from tuner.vehicle.controller import ControllerFile, read_controller
 from tuner.vehicle.registry import (
     COEFFICIENTS,
     REGISTRY,
-    conditions,
+    condition_rows,
     of_scope,
     recording_offsets,
     scale_group,
@@ -40,7 +40,7 @@ __all__ = [
     "check_names",
     "check_rotors",
     "check_value",
-    "conditions",
+    "condition_rows",
     "initial_values",
     "of_scope",
     "read_controller",

@@ -29,7 +29,7 @@ class Written:
     tag
         The name of the tag or parameter in the target's file.
     parent
-        The kind of element that the tag stands in, where a target has several.
+        The kind of parent element, if a target has several.
     """
 
     tag: str
@@ -43,10 +43,9 @@ class NotCarried:
     Attributes
     ----------
     reason
-        What the user reads when the coefficient is not at the value that the target has built in.
+        The message for a coefficient that is not at the target's built-in value.
     built_in
-        The value with which the target flies; None where the target simulates nothing of the kind,
-        so that the coefficient stays with the set-up.
+        The value in the target's simulation; None for coefficients of the set-up.
     """
 
     reason: str
@@ -68,14 +67,14 @@ class Coefficient:
     source
         The equation, table, paper or file that defines it.
     scope
-        What has one value of it: the ``vehicle``, its ``setup``, each ``flight``, or each
+        Whether it has one value for the ``vehicle``, its ``setup``, each ``flight``, or each
         ``window`` of a flight.
     place
         Section and key in the vehicle file, for the scopes ``vehicle`` and ``setup``. The sections
         are those of `tuner.vehicle.vehicle`; a coefficient in ``effects`` needs no other entry.
     part
-        The part of the loop in which alone it acts, if any: where recorded signals take its place,
-        a simulation says nothing of the coefficient.
+        The part of the loop in which it acts: with a recorded signal as input below that part, the
+        coefficient has no effect.
     scale
         Whether the search moves the logarithm or the number.
     bounds
@@ -88,42 +87,42 @@ class Coefficient:
     free
         Whether it is fitted unless the job fixes it.
     mass_exponent
-        The power of a common factor on all masses with which it must go so that every motion stays
-        the same: 1 for masses, inertias and what forces are proportional to.
+        The power of a common factor on all masses that leaves every motion the same: 1 for masses,
+        inertias and constants of forces.
     length_exponent
-        The power of a common factor on all lengths, with times as the root of it, with which what
-        is usual for it goes; only read where the search moves the number.
+        The power of a common factor on all lengths (times scale as its root) with which its usual
+        size scales; only for ``linear``.
     hold_rank
-        Of coefficients that trade off against each other, the one of the lowest rank is held: what
-        is weighed or set rather than flown. None comes after all ranks.
+        Of coefficients that are confounded, the one of the lowest rank is held: weighed or set ones
+        before those that flights show. None comes last.
     neutral
         The value at which its term vanishes.
     group
-        Of an effect: what a selection of terms adds together; empty for one that follows from the
-        others of its kind and is never chosen by itself.
-    stands_in
-        Of an effect: whether it describes as a whole what other terms do one by one.
+        Of an effect: the group that a selection of terms adds together; empty for one that follows
+        from others.
+    is_aggregate
+        Of an effect: whether it is the sum of other terms' effects.
     expected
-        Of an effect: whether every vehicle has it, if often in a size that flights do not tell.
+        Of an effect: whether every vehicle has it, though flights may not show it.
     begin
-        Where a search begins that adds it: for one that at its neutral value does what another
-        does. From there to the neutral value reaches the secant by which it is judged.
-    acts_as
-        That other, which begins lower by as much.
+        The start of a search that adds it, if it equals another coefficient at its neutral value.
+        It is judged by the secant from there to the neutral value.
+    equivalent_to
+        That other coefficient, which starts lower by as much.
     reads
-        Of an effect: the recorded signal that its law reads beside the simulated state, if any.
+        Of an effect: the recorded signal that its law needs, if any.
     exported_as
-        Export target -> where the coefficient stands in it, or why it does not.
+        Export target -> its place there, or why it has none.
     informed_by
         The rule of `tuner.recordings.inspector` that decides whether a recording can show it.
     plausible
         Values outside this range are reported as improbable.
     fallback
-        Section and key of the controller file that hold where the vehicle file gives no value.
+        Section and key of the controller file for the default value.
     leaf
-        Where it lives in a `tuner.vehicle.model.Model`, if not where `leaf_path` derives it.
+        Its path in a `tuner.vehicle.model.Model`, if `leaf_path` cannot derive it.
     count
-        How many numbers it stands for, for the scope ``window``.
+        Its count of numbers, for the scope ``window``.
     """
 
     name: str
@@ -143,10 +142,10 @@ class Coefficient:
     hold_rank: int | None = None
     neutral: float | None = None
     group: str = ""
-    stands_in: bool = False
+    is_aggregate: bool = False
     expected: bool = False
     begin: float | None = None
-    acts_as: str = ""
+    equivalent_to: str = ""
     reads: str = ""
     exported_as: Mapping[str, Written | NotCarried] = field(default_factory=dict)
     informed_by: str | None = None
@@ -163,12 +162,12 @@ class Coefficient:
 
     @property
     def is_effect(self) -> bool:
-        """Whether it belongs to a term that a vehicle file may leave out."""
+        """Whether it belongs to an optional term."""
         return self.place[0] == EFFECTS
 
     @property
     def is_optional(self) -> bool:
-        """Whether nobody misses it at its neutral value: it is neither there nor fitted then."""
+        """Whether it may be absent: it is not fitted by default and has a neutral value."""
         return self.neutral is not None and not self.free
 
     def limits(self, initial: float) -> tuple[float, float]:
@@ -195,13 +194,13 @@ class Parameter:
     prior_mean, prior_sd
         In the scaled coordinate (logarithm or number).
     prior_given
-        Whether the user gave the prior, or it is the weak default that only steadies the search.
+        Whether the user gave the prior, rather than the weak default.
     unit_step
         The change of the scaled coordinate that is one in the search's coordinate, mid-range.
     usual
-        Of a linear coefficient, how large it usually is for such a vehicle; zero for others.
+        Of a linear coefficient, its usual size for such a vehicle; zero for others.
     moved
-        Set where the start lay on or outside a bound and was moved: the value that it had.
+        The original start, if it lay on or outside a bound and was moved.
     """
 
     name: str

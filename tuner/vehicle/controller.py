@@ -218,12 +218,12 @@ def read_controller(path: str | Path) -> ControllerFile:
     return read_model(ControllerFile, path)
 
 
-FASTEST = 1000.0
-"""Hz of a simulated rate loop, at most: a quicker one turns a vehicle alike."""
+MAX_RATE_HZ = 1000.0
+"""Of a simulated rate loop: a faster one has the same effect."""
 AXES = {"roll": "MC_ROLLRATE", "pitch": "MC_PITCHRATE", "yaw": "MC_YAWRATE"}
 GAINS = {"p": "P", "i": "I", "d": "D", "ff": "FF", "k": "K"}
-#: Place in a controller file -> parameter.
-PLACES: Mapping[tuple[str, ...], str] = {
+#: Path in a controller file -> PX4 parameter.
+PARAMETER_OF: Mapping[tuple[str, ...], str] = {
     **{
         ("rate", axis, gain): f"{prefix}_{letter}"
         for axis, prefix in AXES.items()
@@ -236,13 +236,13 @@ PLACES: Mapping[tuple[str, ...], str] = {
     ("mixer", "airmode"): "MC_AIRMODE",
     ("mixer", "thrust_factor"): "THR_MDL_FAC",
 }
-#: Digits to which a parameter, a 32-bit number, is its file's.
-DIGITS = 6
+#: Digits of a parameter, a 32-bit number.
+PARAMETER_DIGITS = 6
 
 
 @dataclass(frozen=True)
 class Change:
-    """A setting that a log's parameters have otherwise than a controller file.
+    """A setting that differs between a log's parameters and a controller file.
 
     Attributes
     ----------
@@ -269,27 +269,27 @@ class Change:
 def with_parameters(
     controller: ControllerFile, parameters: Mapping[str, float]
 ) -> tuple[ControllerFile, tuple[Change, ...]]:
-    """Return a controller file with the rate loop, filters and mixer that a log's parameters tell.
+    """Return a controller file with the rate loop, filters and mixer of a log's parameters.
 
     Parameters
     ----------
     controller
-        With what no parameter tells.
+        Gives the other settings.
 
     Returns
     -------
     tuple
-        The controller, and what has changed; as it was where the parameters make no sense together.
+        The controller, and its changes; unchanged if the parameters are not valid together.
     """
     data: dict[str, Any] = controller.model_dump()
     changes = []
-    for place, parameter in PLACES.items():
+    for place, parameter in PARAMETER_OF.items():
         if parameter not in parameters:
             continue
         section = data
         for key in place[:-1]:
             section = section[key]
-        before, after = section[place[-1]], _told(place, parameters[parameter])
+        before, after = section[place[-1]], _setting_of(place, parameters[parameter])
         if before != after:
             section[place[-1]] = after
             changes.append(Change(".".join(place), parameter, before, after))
@@ -300,9 +300,9 @@ def with_parameters(
         return controller, ()
 
 
-def _told(place: tuple[str, ...], value: float) -> float | None:
+def _setting_of(place: tuple[str, ...], value: float) -> float | None:
     if place[0] == "filters":
-        return round(value, DIGITS) if value > 0 else None
+        return round(value, PARAMETER_DIGITS) if value > 0 else None
     if place == ("rate", "rate"):
-        return min(value, FASTEST) if value > 0 else 400.0
-    return int(value) if place == ("mixer", "airmode") else round(value, DIGITS)
+        return min(value, MAX_RATE_HZ) if value > 0 else 400.0
+    return int(value) if place == ("mixer", "airmode") else round(value, PARAMETER_DIGITS)

@@ -1,4 +1,4 @@
-"""What ground measurements say of several coefficients together, as residuals of a search."""
+"""A joint prior of several coefficients from ground measurements, as residuals of a search."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from tuner.vehicle.registry import COEFFICIENTS
 if TYPE_CHECKING:
     from tuner.vehicle.coefficient import Parameter
 
-UNKNOWN = 1e-12
-"""Share of the best-known direction's information below which a direction is not measured."""
+MIN_INFORMATION_SHARE = 1e-12
+"""A direction with less information, relative to the best-known one, is not measured."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class JointPrior:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return A (N, K) and b (N,): half of ``|A x + b|²`` is the prior's loss.
 
-        x are the parameters' K scaled coordinates. A fixed coefficient stays at its value, which
-        the prior then says something about the others with.
+        x are the parameters' K scaled coordinates; the prior is conditional on the values of fixed
+        coefficients.
 
         Raises
         ------
@@ -69,6 +69,6 @@ class JointPrior:
                 offset[place] += (math.log(value) if log else value) if known else self.mean[place]
         unit = unit_diagonal(self.information)
         values, vectors = symmetric_eigen(self.information * np.outer(unit, unit))
-        values = np.where(values > UNKNOWN * values.max(), values, 0.0)
+        values = np.where(values > MIN_INFORMATION_SHARE * values.max(), values, 0.0)
         root = np.sqrt(values)[:, None] * vectors.T / unit
         return root @ design, root @ offset

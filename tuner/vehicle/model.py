@@ -22,11 +22,11 @@ from sim_jax.numeric import Scalar
 from sim_jax.schedule import Schedule
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 from tuner.vehicle import COEFFICIENTS, Coefficient, ControllerFile, VehicleFile, initial_values
-from tuner.vehicle.vehicle import check_filter, longest, size_of
+from tuner.vehicle.vehicle import check_filter, max_latency, size_of
 
-RADIUS = 0.13
-"""m of the rotors of a vehicle of the registry's size; those of others are in proportion."""
-LAWS = ("reaction_torque", "thrust_law")
+REFERENCE_ROTOR_RADIUS = 0.13
+"""m, for a vehicle of the registry's size; that of others scales with the arm."""
+NON_NUMERIC_KEYS = ("reaction_torque", "thrust_law")
 """Keys of the vehicle file's aerodynamics that are no number."""
 
 
@@ -40,10 +40,7 @@ class Model(eqx.Module):
 
 
 def coefficients_in(model: Model) -> dict[str, Scalar]:
-    """Return every coefficient that a model has; one that is left out, as a filter may be, is not.
-
-    The order is always the same.
-    """
+    """Return name -> coefficients of a model, without absent ones, always in one order."""
     leaves = {name: _leaf(model, coefficient) for name, coefficient in COEFFICIENTS.items()}
     return {name: value for name, value in leaves.items() if value is not None}
 
@@ -86,9 +83,9 @@ def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
 
 
 def with_terms_computed(model: Model, names: Collection[str]) -> Model:
-    """Return the model with some terms in it, at their neutral values where it leaves them out.
+    """Return the model with absent terms added at their neutral values.
 
-    Nothing flies otherwise, and models with and without these terms share their programs.
+    Its flights stay the same; models with and without these terms share their programs.
     """
     given = coefficients_in(model)
     neutral = {name: jnp.asarray(COEFFICIENTS[name].neutral) for name in names if name not in given}
@@ -96,10 +93,7 @@ def with_terms_computed(model: Model, names: Collection[str]) -> Model:
 
 
 def vehicle_of(file: VehicleFile) -> Vehicle:
-    """Return the simulator's vehicle, float64 where that is switched on.
-
-    A term at its neutral value is left out: it costs nothing.
-    """
+    """Return the simulator's vehicle, without terms at their neutral values."""
     aerodynamics = file.aerodynamics
     return Vehicle(
         body=Body(
@@ -111,7 +105,7 @@ def vehicle_of(file: VehicleFile) -> Vehicle:
         ),
         motor=Motor(**{key: jnp.asarray(value) for key, value in file.motor}),
         aerodynamics=Aerodynamics(
-            **{k: jnp.asarray(v) for k, v in aerodynamics if k not in LAWS},
+            **{k: jnp.asarray(v) for k, v in aerodynamics if k not in NON_NUMERIC_KEYS},
             reaction_torque=aerodynamics.reaction_torque,
             thrust_law=aerodynamics.thrust_law,
         ),
@@ -123,7 +117,7 @@ def vehicle_of(file: VehicleFile) -> Vehicle:
             for name, value in file.effects.items()
             if value != COEFFICIENTS[name].neutral
         },
-        rotor_radius=jnp.asarray(RADIUS * size_of(file).arm),
+        rotor_radius=jnp.asarray(REFERENCE_ROTOR_RADIUS * size_of(file).arm),
     )
 
 
@@ -203,8 +197,8 @@ def schedule_of(file: ControllerFile, *, log_rate: int | None = None) -> Schedul
         log_rate=physics if log_rate is None else log_rate,
         integrator=file.physics.integrator,
         pose_rate=file.sensing.pose_rate,
-        longest_estimate_latency=longest("estimate_latency"),
-        longest_actuator_latency=longest("actuator_latency"),
+        longest_estimate_latency=max_latency("estimate_latency"),
+        longest_actuator_latency=max_latency("actuator_latency"),
     )
 
 

@@ -1,4 +1,4 @@
-"""The orders in which flight stacks number the motors of a quad X, as PX4's rotors see them."""
+"""Numberings of the motors of a quad X in flight stacks, relative to PX4's."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOTOR_ORDERS: Mapping[str, tuple[int, int, int, int]] = {
 }
 
 
-def _each_once(order: str | tuple[int, ...]) -> str | tuple[int, ...]:
+def _is_permutation(order: str | tuple[int, ...]) -> str | tuple[int, ...]:
     if not isinstance(order, str) and sorted(order) != [1, 2, 3, 4]:
         raise refuse(
             f"motor_order is {list(order)}",
@@ -30,7 +30,7 @@ def _each_once(order: str | tuple[int, ...]) -> str | tuple[int, ...]:
 
 MotorOrder = Annotated[
     Literal["px4", "ardupilot", "betaflight", "crazyflie"] | tuple[int, int, int, int],
-    AfterValidator(_each_once),
+    AfterValidator(_is_permutation),
 ]
 """A stack's name, or the recorded motor, from 1, of each rotor in PX4's order."""
 

@@ -231,19 +231,19 @@ REGISTRY: Mapping[str, Coefficient] = ChainMap(
 
 
 def of_scope(scope: Scope) -> dict[str, Coefficient]:
-    """Return name -> row of the coefficients of which each flight, window, ... has one."""
+    """Return name -> row of the coefficients of a scope."""
     return {name: row for name, row in REGISTRY.items() if row.scope == scope}
 
 
 def scale_group() -> tuple[str, ...]:
-    """Return the coefficients that go with the mass: by one common factor, every motion stays."""
+    """Return the coefficients whose common factor leaves every motion the same."""
     return tuple(name for name, row in COEFFICIENTS.items() if row.mass_exponent == 1)
 
 
-def at_mass(name: str, mass: float | None, wanted: float | None) -> float:
-    """Return the factor that brings a coefficient found with one mass to another, kg.
+def mass_factor(name: str, mass: float | None, wanted: float | None) -> float:
+    """Return the factor that converts a coefficient found with one mass, kg, to another.
 
-    1 where a mass is not known, and for the mass itself.
+    It is 1 for an unknown mass, and for the mass itself.
     """
     exponent = 0 if name == "mass" or name not in REGISTRY else REGISTRY[name].mass_exponent
     return float((wanted / mass) ** exponent) if mass and wanted else 1.0
@@ -258,11 +258,11 @@ def term_groups() -> dict[str, tuple[str, ...]]:
     return groups
 
 
-def conditions() -> dict[str, Coefficient]:
-    """Return name -> row of what may surround a flight: it enters the simulation of that flight."""
+def condition_rows() -> dict[str, Coefficient]:
+    """Return name -> row of per-flight conditions (wind, battery), inputs of a simulation."""
     return {name: row for name, row in of_scope("flight").items() if row.group}
 
 
 def recording_offsets() -> dict[str, Coefficient]:
-    """Return name -> row of what a recording may get wrong by a constant."""
+    """Return name -> row of constant errors of a recording."""
     return {name: row for name, row in of_scope("flight").items() if not row.group}

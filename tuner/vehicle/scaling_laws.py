@@ -1,8 +1,8 @@
-"""A starting vehicle from what anyone can read off it: scaling laws, their sources, their errors.
+"""Scaling laws that give a starting vehicle from mass, size and propellers, with their errors.
 
-The laws are crude, and say by how much: each coefficient comes with the standard deviation of its
-logarithm. They hold for quadrotors from a palm's size to a metre. The command `tune new-vehicle`
-writes them as a vehicle file, and a job file with priors as wide.
+The laws are crude: each coefficient comes with the standard deviation of its logarithm. They hold
+for quadrotors from a palm's size to a metre. The command `tune new-vehicle` writes a vehicle file,
+and a job file with priors of these widths.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from tuner.vehicle import (
     write_vehicle,
 )
 
-AIR = 1.225
+AIR_DENSITY = 1.225
 """kg/m³."""
 INCH = 0.0254
 """m."""
 HOVER_THROTTLE = 0.5
-"""Command in hover where neither a log nor kV says it: what vehicles are designed for."""
-IDLE = 0.15
+"""The default command in hover, for which vehicles are designed."""
+IDLE_SPEED_RATIO = 0.15
 """Rotor speed at zero command over the speed gained from there to full command."""
-CELL = 3.7
+CELL_VOLTAGE = 3.7
 """V of a cell under load."""
 
 
 @dataclass(frozen=True)
 class Airframe:
-    """What can be read off a quadrotor.
+    """Visible properties of a quadrotor.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Airframe:
     diameter, pitch
         Of the propeller, m.
     cells
-        In series; one is taken for a vehicle with brushed, coreless motors. None if not known.
+        In series; a single one means brushed, coreless motors. None if not known.
     motor_kv
         rad/s per V, unloaded; None if not known.
     hover_throttle
@@ -79,11 +79,11 @@ class Estimate:
     source: str
 
 
-KNOWN: Mapping[str, Airframe] = {
+KNOWN_AIRFRAMES: Mapping[str, Airframe] = {
     "hovergames": Airframe(2.243, 0.5, 11 * INCH, 4.7 * INCH, 4, 920 * math.pi / 30, 0.54, 0.06),
     "crazyflie": Airframe(0.030, 0.092, 1.85 * INCH, 1.0 * INCH, 1, 14000 * math.pi / 30, 0.86),
 }
-"""Vehicles whose coefficients are known, by the name of their shipped file."""
+"""Shipped vehicle -> its airframe."""
 
 
 def coefficients_of(airframe: Airframe) -> dict[str, Estimate]:
@@ -92,7 +92,7 @@ def coefficients_of(airframe: Airframe) -> dict[str, Estimate]:
     ratio = airframe.pitch / airframe.diameter
     thrust = 0.05 + 0.14 * ratio
     power = 0.0135 + 0.115 * ratio
-    motor_constant = thrust * AIR * airframe.diameter**4 / (2 * math.pi) ** 2
+    motor_constant = thrust * AIR_DENSITY * airframe.diameter**4 / (2 * math.pi) ** 2
     moment_constant = power * airframe.diameter / (2 * math.pi * thrust)
     scaling, scaling_error, scaling_source = _input_scaling(airframe, motor_constant)
     gyration = airframe.mass * arm**2
@@ -105,7 +105,9 @@ def coefficients_of(airframe: Airframe) -> dict[str, Estimate]:
         "inertia_yy": Estimate(0.19 * gyration, 0.4, f"0.19 m r²: {mass_law}"),
         "inertia_zz": Estimate(0.33 * gyration, 0.4, f"0.33 m r²: {mass_law}"),
         "input_scaling": Estimate(scaling, scaling_error, scaling_source),
-        "zero_position_armed": Estimate(IDLE * scaling, 0.6, f"{IDLE:g} of input_scaling, idling"),
+        "zero_position_armed": Estimate(
+            IDLE_SPEED_RATIO * scaling, 0.6, f"{IDLE_SPEED_RATIO:g} of input_scaling, idling"
+        ),
         "time_constant_up": Estimate(0.025, 0.7, lag),
         "time_constant_down": Estimate(0.035, 0.7, lag),
         "motor_constant": Estimate(
@@ -122,17 +124,19 @@ def coefficients_of(airframe: Airframe) -> dict[str, Estimate]:
     }  # fmt: skip
 
 
-def anchored(airframe: Airframe, like: str, known: Mapping[str, float]) -> dict[str, Estimate]:
+def scaled_to_known(
+    airframe: Airframe, like: str, known: Mapping[str, float]
+) -> dict[str, Estimate]:
     """Return the laws' estimates, scaled so that they hold for a vehicle whose values are known.
 
     Parameters
     ----------
     like
-        One of `KNOWN`, similar to it.
+        One of `KNOWN_AIRFRAMES`, similar to it.
     known
         Coefficient -> value of that one.
     """
-    there = coefficients_of(KNOWN[like])
+    there = coefficients_of(KNOWN_AIRFRAMES[like])
     return {
         name: Estimate(
             estimate.value * known[name] / there[name].value,
@@ -148,19 +152,19 @@ def _input_scaling(airframe: Airframe, motor_constant: float) -> tuple[float, fl
     hover = math.sqrt(airframe.mass * GRAVITY / (4 * motor_constant))
     if airframe.hover_throttle is None and airframe.motor_kv and airframe.cells:
         loaded = 0.45 if airframe.cells == 1 else 0.75
-        top = loaded * airframe.motor_kv * CELL * airframe.cells
-        source = f"{loaded:g} of the unloaded speed at {CELL:g} V a cell, from kV and cells"
-        return top / (1 + IDLE), 0.35, source
+        top = loaded * airframe.motor_kv * CELL_VOLTAGE * airframe.cells
+        source = f"{loaded:g} of the unloaded speed at {CELL_VOLTAGE:g} V a cell, from kV and cells"
+        return top / (1 + IDLE_SPEED_RATIO), 0.35, source
     throttle = airframe.hover_throttle or HOVER_THROTTLE
     error = 0.25 if airframe.hover_throttle else 0.4
     source = f"weight and motor_constant give the hover's speed at a command of {throttle:g}"
-    return hover / (throttle + IDLE), error, source
+    return hover / (throttle + IDLE_SPEED_RATIO), error, source
 
 
 SPINS = ("ccw", "ccw", "cw", "cw")
 """Of the quad X in PX4's order: front right, rear left, front left, rear right."""
 SIDES = ((1, -1), (-1, 1), (1, 1), (-1, -1))
-HEADROOM = 2.5
+MAX_SPEED_HEADROOM = 2.5
 """Largest rotor speed over that of full command, which is known to a factor of two: a fit has to
 reach what its vehicle flew at, and no command exceeds one."""
 HEADER = """By scaling laws from what can be read off the vehicle: where a fit starts, not measured.
@@ -176,7 +180,7 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
     out
         The vehicle file; the job file has the same name and ends in ``.job.yaml``.
     like
-        A shipped vehicle of `tuner.vehicle.scaling_laws.KNOWN` that the laws are to meet.
+        A shipped vehicle of `tuner.vehicle.scaling_laws.KNOWN_AIRFRAMES` that the laws are to meet.
 
     Raises
     ------
@@ -192,7 +196,7 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
     else:
         name = {"hovergames": "hovergames_updated"}.get(like, like)
         known = read_vehicle(configs_folder() / "vehicles" / f"{name}.yaml")
-        estimates = anchored(airframe, like, values_of(known))
+        estimates = scaled_to_known(airframe, like, values_of(known))
     vehicle = _vehicle(template, airframe, estimates, out.stem)
     write_vehicle(vehicle, out, header=HEADER.format(priors=job.name))
     text = dump_yaml(_job(out, airframe, estimates))
@@ -209,7 +213,7 @@ def _vehicle(
         for (x, y), spin in zip(SIDES, SPINS, strict=True)
     ]
     full = estimates["input_scaling"].value + estimates["zero_position_armed"].value
-    motor = template.motor.replace(max_rotor_velocity=_rounded(HEADROOM * full))
+    motor = template.motor.replace(max_rotor_velocity=_rounded(MAX_SPEED_HEADROOM * full))
     source = {"made_by": f"{PROGRAM} {installed()}", "method": "by scaling laws, not measured"}
     source |= {name: estimate.source for name, estimate in estimates.items()}
     vehicle = template.replace(

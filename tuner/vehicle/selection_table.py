@@ -22,7 +22,7 @@ class SelectionCode(StrEnum):
     PREDICTS_SECTIONS = "predicts_sections"
     """Kept: sections of the flights are, where one flight alone shows it."""
     SIGNIFICANT = "significant"
-    """Kept: chance does not explain what it is worth, and nothing left out contradicts it."""
+    """Kept: it is significant, and no data left out contradict it."""
     PREDICTS_SAMPLES = "predicts_samples"
     """Kept: once disturbances are estimated, each sample is predicted better with it."""
     ASKED_FOR = "asked_for"
@@ -32,13 +32,13 @@ class SelectionCode(StrEnum):
     HOVERS_TILTED = "hovers_tilted"
     """Kept: every recording shows a hover that is not level, so the markers sit at an angle."""
     NOT_SIGNIFICANT = "not_significant"
-    """It lowers the loss by no more than residuals that are correlated in time let any term."""
+    """It lowers the loss by no more than chance, with correlated residuals."""
     IMMATERIAL = "immaterial"
     """It lowers the loss by less than simulators that agree differ."""
     NOT_PREDICTED = "not_predicted"
-    """What was left out of the fit is not predicted better by more than the scatter."""
+    """Data left out of the fit are not predicted significantly better."""
     NO_INFORMATION = "no_information"
-    """The flights do not tell it from the coefficients that are in the model."""
+    """It is confounded with the coefficients in the model."""
     WORSE_AFTER_REFIT = "worse_after_refit"
     """Refitted with it, the flights left out are not predicted better."""
     REFUTED = "refuted"
@@ -51,12 +51,11 @@ class SelectionRow(Part):
     Attributes
     ----------
     group, names
-        What it is called, and its coefficients.
+        Its name, and its coefficients.
     gain_fit
         Share by which it lowers the loss of the fitted flights.
     gain_holdout
-        Share by which it lowers the loss of what is left out of a fit to the rest; None where it
-        was not asked.
+        Share by which it lowers the loss of data left out of a fit; None if not computed.
     scatter
         Standard deviation of ``gain_holdout`` over stretches of the flights.
     kept

@@ -60,7 +60,7 @@ _ROWS = (
             step=0.1,
             mass_exponent=1,
             length_exponent=-0.5,
-            stands_in=True,
+            is_aggregate=True,
             exported_as={"px4": Written("SIH_KDV")},
         )
         for axis, direction in _AXES.items()
@@ -159,7 +159,7 @@ _ROWS = (
             step=0.005,
             mass_exponent=1,
             length_exponent=1.0,
-            stands_in=True,
+            is_aggregate=True,
         )
         for axis, direction in _AXES.items()
     ),
@@ -203,7 +203,7 @@ _ROWS = (
         prior_sd=0.003,
         step=0.002,
         begin=0.004,
-        acts_as="actuator_latency",
+        equivalent_to="actuator_latency",
     ),
     _effect(
         "flapping_moment_coefficient",
@@ -242,7 +242,7 @@ _ROWS = (
             step=0.5 * usual,
             mass_exponent=1,
             length_exponent=1.5,
-            stands_in=True,
+            is_aggregate=True,
             exported_as={"px4": Written("SIH_KDW")},
         )
         for axis, usual, source in (
@@ -273,7 +273,7 @@ _ROWS = (
 )
 
 
-def _completed(row: Coefficient) -> Coefficient:
+def _with_defaults(row: Coefficient) -> Coefficient:
     """Return a row with its place, and what Gazebo and PX4 say where it says nothing of them.
 
     A number searched itself has its bounds about its neutral value.
@@ -290,4 +290,4 @@ def _completed(row: Coefficient) -> Coefficient:
     return replace(row, place=(EFFECTS, row.name), bounds=bounds, exported_as=held)
 
 
-EFFECT_ROWS = tuple(map(_completed, _ROWS))
+EFFECT_ROWS = tuple(map(_with_defaults, _ROWS))

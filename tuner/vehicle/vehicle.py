@@ -32,8 +32,8 @@ from tuner.vehicle.controller import ControllerFile
 from tuner.vehicle.motor_orders import MotorOrder
 from tuner.vehicle.registry import COEFFICIENTS
 
-MASS, ARM = 2.079, 0.25
-"""kg, and m from the middle to a rotor, of the vehicle that the registry's numbers are made for."""
+REFERENCE_MASS, REFERENCE_ARM = 2.079, 0.25
+"""kg, and m from the centre to a rotor, of the vehicle for which the registry's numbers hold."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +45,15 @@ class Size:
 
 
 def size_of(vehicle: VehicleFile) -> Size:
-    """Return how large a vehicle is."""
+    """Return the size of a vehicle."""
     arm = float(np.mean([np.hypot(*rotor.position[:2]) for rotor in vehicle.rotors]))
-    return Size(vehicle.mass / MASS, arm / ARM)
+    return Size(vehicle.mass / REFERENCE_MASS, arm / REFERENCE_ARM)
 
 
-def sized(row: Coefficient, size: Size) -> Coefficient:
-    """Return a coefficient's row with bounds, prior and step as they are for a vehicle's size.
+def scaled_to_size(row: Coefficient, size: Size) -> Coefficient:
+    """Return a coefficient's row with bounds, prior and step scaled to a vehicle's size.
 
-    Logarithms need none: their limits are factors.
+    Logarithmic ones stay: their limits are factors.
     """
     if row.scale == "log":
         return row
@@ -171,7 +171,7 @@ class Aerodynamics(Section):
     thrust_law: Literal["linear"] | None = None
 
 
-def longest(latency: str) -> float:
+def max_latency(latency: str) -> float:
     """Return the s that the simulation's delay line reaches back, as far as a latency's bound."""
     bounds = COEFFICIENTS[latency].bounds
     assert isinstance(bounds, tuple)
@@ -191,8 +191,8 @@ class Setup(Section):
         Hz of the gyro's low-pass filter; None where the controller file's holds.
     """
 
-    estimate_latency: Annotated[NonNegative, Le(longest("estimate_latency"))] = 0.0
-    actuator_latency: Annotated[NonNegative, Le(longest("actuator_latency"))] = 0.0
+    estimate_latency: Annotated[NonNegative, Le(max_latency("estimate_latency"))] = 0.0
+    actuator_latency: Annotated[NonNegative, Le(max_latency("actuator_latency"))] = 0.0
     gyro_cutoff: Positive | None = None
 
 
@@ -210,7 +210,7 @@ class Battery(Section):
     reference_voltage: Positive | None = None
 
 
-def _of_the_registry(effects: dict[str, float]) -> dict[str, float]:
+def _known_effects(effects: dict[str, float]) -> dict[str, float]:
     known = [name for name, coefficient in COEFFICIENTS.items() if coefficient.is_effect]
     for name in effects:
         if name not in known:
@@ -253,7 +253,7 @@ class VehicleFile(Section):
     aerodynamics: Aerodynamics
     setup: Setup = Setup()
     battery: Battery = Battery()
-    effects: Annotated[dict[str, Number], AfterValidator(_of_the_registry)] = Field(
+    effects: Annotated[dict[str, Number], AfterValidator(_known_effects)] = Field(
         default_factory=dict
     )
     source: dict[str, JsonValue] = Field(default_factory=dict)

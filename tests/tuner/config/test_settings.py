@@ -3,7 +3,7 @@ import shutil
 
 import pytest
 
-from tuner.config import Options, find_job_file, settle
+from tuner.config import Options, find_job_file, resolve_settings
 from tuner.core.disk import find_flights
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder, find_config
@@ -23,7 +23,7 @@ def lab(tmp_path):
 
 
 def test_the_job_file_beside_the_flights_is_used(lab):
-    s = settle(Options([f"{lab}/*.bag"]))
+    s = resolve_settings(Options([f"{lab}/*.bag"]))
     assert [flight.name for flight in s.flights] == ["a.bag", "b.bag", "c.bag"]
     assert s.job_path == lab / "tune.yaml"
     assert s.vehicle.mass == 2.5
@@ -37,7 +37,7 @@ def test_the_job_file_beside_the_flights_is_used(lab):
 
 
 def test_the_command_line_wins_and_the_origin_says_so(lab):
-    s = settle(
+    s = resolve_settings(
         Options(
             [f"{lab}/*.bag"],
             holdout=["a"],
@@ -64,14 +64,14 @@ def test_the_command_line_wins_and_the_origin_says_so(lab):
 def test_another_job_file_can_be_named(lab, tmp_path_factory):
     other = tmp_path_factory.mktemp("other") / "mine.yaml"
     other.write_text("mass: 9\n")
-    s = settle(Options([f"{lab}/*.bag"], config=str(other)))
+    s = resolve_settings(Options([f"{lab}/*.bag"], config=str(other)))
     assert s.vehicle.mass == 9
     assert s.job.holdout == ()
 
 
 def test_without_a_job_file_the_defaults_hold(lab):
     (lab / "tune.yaml").unlink()
-    s = settle(Options([f"{lab}/a.bag"]))
+    s = resolve_settings(Options([f"{lab}/a.bag"]))
     assert s.job_path is None
     assert s.vehicle.mass == 2.079
     assert s.origin["mass"] == "default (hovergames.yaml)"
@@ -80,7 +80,7 @@ def test_without_a_job_file_the_defaults_hold(lab):
 
 def test_a_mass_that_ships_is_not_the_users(lab):
     def weighed(**given):
-        return settle(Options([f"{lab}/a.bag"], **given)).weighed
+        return resolve_settings(Options([f"{lab}/a.bag"], **given)).weighed
 
     (lab / "tune.yaml").unlink()
     assert not weighed()
@@ -92,31 +92,33 @@ def test_a_mass_that_ships_is_not_the_users(lab):
 
 
 def test_fixing_takes_away_from_what_is_free(lab):
-    assert settle(Options([f"{lab}/*.bag"], fix=["gyro_cutoff"])).job.fixed == (
+    assert resolve_settings(Options([f"{lab}/*.bag"], fix=["gyro_cutoff"])).job.fixed == (
         "mass",
         "gyro_cutoff",
     )
     (lab / "tune.yaml").write_text("free: [motor_constant, inertia_xx]\n")
-    assert settle(Options([f"{lab}/*.bag"], fix=["inertia_xx"])).job.free == ("motor_constant",)
+    assert resolve_settings(Options([f"{lab}/*.bag"], fix=["inertia_xx"])).job.free == (
+        "motor_constant",
+    )
 
 
 def test_a_flight_held_out_by_path_joins_the_others(lab):
-    s = settle(Options([f"{lab}/a.bag"], holdout=[f"{lab}/b.bag"]))
+    s = resolve_settings(Options([f"{lab}/a.bag"], holdout=[f"{lab}/b.bag"]))
     assert [flight.stem for flight in s.flights] == ["a", "b"]
     assert s.job.holdout == ("b",)
-    both = settle(Options([f"{lab}/a.bag", f"{lab}/b.bag"], holdout=[f"{lab}/b.bag"]))
+    both = resolve_settings(Options([f"{lab}/a.bag", f"{lab}/b.bag"], holdout=[f"{lab}/b.bag"]))
     assert [flight.stem for flight in both.flights] == ["a", "b"]
 
 
 def test_settings_for_flights_not_given_today_are_no_error(lab):
-    assert settle(Options([f"{lab}/a.bag"])).job.holdout == ()
+    assert resolve_settings(Options([f"{lab}/a.bag"])).job.holdout == ()
 
 
 def test_vehicle_and_flights_of_the_job_file_count_from_its_folder(lab, monkeypatch):
     shutil.copy(configs_folder() / "vehicles" / "hovergames_updated.yaml", lab / "mine.yaml")
     (lab / "tune.yaml").write_text("vehicle: mine.yaml\n")
     monkeypatch.chdir("/")
-    assert settle(Options([f"{lab}/a.bag"])).vehicle.name == "hovergames_updated"
+    assert resolve_settings(Options([f"{lab}/a.bag"])).vehicle.name == "hovergames_updated"
 
 
 @pytest.mark.parametrize(
@@ -148,7 +150,7 @@ def test_what_cannot_be_used_is_refused_in_one_line(lab, change, expected):
         for key, value in given.items()
     }
     with pytest.raises(InputError) as error:
-        settle(Options(**given))
+        resolve_settings(Options(**given))
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -156,24 +158,24 @@ def test_what_cannot_be_used_is_refused_in_one_line(lab, change, expected):
 def test_a_misspelt_flight_in_the_job_file_is_named(lab):
     (lab / "tune.yaml").write_text("flights: {aa: {weight: 2}}\n")
     with pytest.raises(ConfigError, match="'aa' that does not exist; did you mean 'a'"):
-        settle(Options([f"{lab}/*.bag"]))
+        resolve_settings(Options([f"{lab}/*.bag"]))
     (lab / "tune.yaml").write_text("holdout: [cc]\n")
     with pytest.raises(ConfigError, match="'cc' that does not exist"):
-        settle(Options([f"{lab}/*.bag"]))
+        resolve_settings(Options([f"{lab}/*.bag"]))
 
 
 def test_a_second_mission_can_be_meant(lab):
     (lab / "tune.yaml").write_text("holdout: [c-2]\nflights: {a-3: {weight: 2}}\n")
-    assert settle(Options([f"{lab}/*.bag"])).job.holdout == ("c-2",)
-    assert settle(Options([f"{lab}/a.bag"])).job.holdout == ()
-    assert settle(Options([f"{lab}/*.bag"], holdout=["b-2"])).job.holdout == ("b-2",)
+    assert resolve_settings(Options([f"{lab}/*.bag"])).job.holdout == ("c-2",)
+    assert resolve_settings(Options([f"{lab}/a.bag"])).job.holdout == ()
+    assert resolve_settings(Options([f"{lab}/*.bag"], holdout=["b-2"])).job.holdout == ("b-2",)
 
 
 def test_two_recordings_of_one_name_are_refused(lab):
     (lab / "more").mkdir()
     (lab / "more" / "a.bag").touch()
     with pytest.raises(InputError, match="same name"):
-        settle(Options([f"{lab}/a.bag", f"{lab}/more/a.bag"]))
+        resolve_settings(Options([f"{lab}/a.bag", f"{lab}/more/a.bag"]))
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.csv", "log10"])
@@ -208,7 +210,7 @@ def test_a_vehicle_of_six_rotors_is_refused_before_anything_is_read(lab):
     vehicle = read_vehicle(find_config("vehicles", "hovergames", lab))
     six = vehicle.model_copy(update={"rotors": (*vehicle.rotors, *vehicle.rotors[:2])})
     with pytest.raises(ConfigError, match="has 6 rotors, and only four are simulated and read"):
-        settle(Options([str(lab / "a.bag")], vehicle=six))
+        resolve_settings(Options([str(lab / "a.bag")], vehicle=six))
 
 
 def test_a_pattern_of_flights_to_hold_out_means_the_flights_before_files_that_lie_here(
@@ -217,6 +219,6 @@ def test_a_pattern_of_flights_to_hold_out_means_the_flights_before_files_that_li
     monkeypatch.chdir(lab)
     for name in ("b_notes.txt", "c_notes.txt"):
         (lab / name).touch()
-    settled = settle(Options(["*.bag"], holdout=["[bc]*"]))
+    settled = resolve_settings(Options(["*.bag"], holdout=["[bc]*"]))
     assert settled.job.holdout == ("b", "c")
     assert [flight.name for flight in settled.flights] == ["a.bag", "b.bag", "c.bag"]

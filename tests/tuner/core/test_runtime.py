@@ -120,7 +120,7 @@ def test_the_command_keeps_algebra_on_one_thread_before_numpy_is_there() -> None
         "import sys, os; from tuner.cli import main; print('numpy' in sys.modules); "
         "main(['--version']); print(os.environ['OPENBLAS_NUM_THREADS'])"
     )
-    clean = {k: v for k, v in os.environ.items() if k not in runtime.THREADS}
+    clean = {k: v for k, v in os.environ.items() if k not in runtime.THREAD_VARIABLES}
     done = subprocess.run(
         [sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=True
     )

@@ -16,8 +16,8 @@ from tuner.core.spans import (
     _RECORDER,
     BUILDING,
     COMPILING,
-    ELSEWHERE,
     LOADING,
+    OUTSIDE,
     TRACING,
     Span,
     recording,
@@ -45,7 +45,7 @@ def test_every_instant_counts_for_the_innermost_stage_that_holds_it():
         Span("figures", 5.5, 8.5, beside=True),
     ]
     rows = {row.stage: row for row in table_of(spans, 10.0, 12.0)}
-    assert [*rows] == ["search", "page", "figures", ELSEWHERE]
+    assert [*rows] == ["search", "page", "figures", OUTSIDE]
     assert [row.seconds for row in rows.values()] == [4.5, 2.0, 2.0, 1.5]
     assert [row.processor for row in rows.values()] == [8.0, 1.0, 2.0, 1.0]
     assert rows["search"].jax[TRACING] == 2.0

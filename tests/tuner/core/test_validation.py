@@ -14,7 +14,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 import tuner
 from tuner.config.job import JobFile
 from tuner.core.errors import ConfigError
-from tuner.core.validation import FORMS, OF_ANOTHER_FORM, complaint, expected
+from tuner.core.validation import OTHER_FORM, PATTERN_PHRASES, complaint, expected
 from tuner.core.yaml_section import Section, build
 from tuner.engine.cluster_file import JobQueue
 from tuner.ground.plan import BenchFile
@@ -85,7 +85,7 @@ def test_every_complaint_of_a_model_is_in_our_words(model):
     for detail in complaints(model):
         what, remedy = complaint(detail)
         assert not RAW.search(remedy.split("'")[0]), (detail["type"], remedy)
-        assert remedy != OF_ANOTHER_FORM, detail
+        assert remedy != OTHER_FORM, detail
         assert not re.search(
             r"\.?(literal|tuple|dict|function-\w+|constrained-\w+)\[", what.split(" is ")[0]
         )
@@ -104,11 +104,11 @@ def test_every_pattern_has_words():
                 yield from patterns(value)
 
     schemas = [TypeAdapter(model).json_schema(mode="validation") for model in models()]
-    assert {pattern for schema in schemas for pattern in patterns(schema)} <= set(FORMS)
+    assert {pattern for schema in schemas for pattern in patterns(schema)} <= set(PATTERN_PHRASES)
 
 
 def test_what_is_unknown_is_never_told_in_raw_words():
-    assert expected("some_new_type", {}) == OF_ANOTHER_FORM
+    assert expected("some_new_type", {}) == OTHER_FORM
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_a_key_of_several_kinds_says_all_of_them(given, words):
         ("greater_than", {"gt": 0}, "it should be more than 0"),
         ("literal_error", {"expected": "'ccw' or 'cw'"}, "it should be 'ccw' or 'cw'"),
         ("too_short", {"min_length": 1}, "it should have at least 1 entries"),
-        ("string_pattern_mismatch", {"pattern": "^[!-~]+$"}, FORMS["^[!-~]+$"]),
+        ("string_pattern_mismatch", {"pattern": "^[!-~]+$"}, PATTERN_PHRASES["^[!-~]+$"]),
         ("value_error", {"error": ValueError("it is odd")}, "it is odd"),
     ],
 )

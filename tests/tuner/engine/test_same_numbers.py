@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.engine import tasks
-from tuner.config import Options, TrajectorySettings, settle
+from tuner.config import Options, TrajectorySettings, resolve_settings
 from tuner.engine import using
 from tuner.evaluate import closed_loop as simulation
 from tuner.evaluate.closed_loop import simulate
@@ -44,7 +44,7 @@ def two_flights(bag, tmp_path_factory):
         f"free: [{', '.join(FREE)}]\nterms: none\nsearch: {{max_iterations: 3}}\n"
         "flights: {two: {weight: 0.5}}\n"
     )
-    settings = settle(Options(names, vehicle="hovergames", config=str(job)))
+    settings = resolve_settings(Options(names, vehicle="hovergames", config=str(job)))
     prepared = job_of(settings, read_recordings(settings)[0])
     return prepared, unfitted(prepared)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks import fast_flights
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.config.job import Search
 from tuner.equation_error.estimate import GAINS
 from tuner.equation_error.model_accelerations import Linear
@@ -50,7 +50,9 @@ def flown(request, racer, tmp_path_factory):
     folder, rate = tmp_path_factory.mktemp("fast"), request.param
     vehicle, signals = racer
     paths = fast_flights.write(vehicle, signals, folder, seed=4, rotor_rate=rate)
-    settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
+    settings = resolve_settings(
+        Options([str(path) for path in paths], config=str(folder / "tune.yaml"))
+    )
     recordings, _ = read_recordings(settings)
     return vehicle, settings, recordings
 
@@ -261,7 +263,9 @@ def commanded(request, racer, tmp_path_factory):
     """A job by commands alone, and what it begins with."""
     folder = tmp_path_factory.mktemp("commanded")
     paths = fast_flights.write(*racer, folder, seed=4, rotor_rate=request.param, fed="command")
-    settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
+    settings = resolve_settings(
+        Options([str(path) for path in paths], config=str(folder / "tune.yaml"))
+    )
     given = job_of(settings, read_recordings(settings)[0])
     return given, with_accelerations(given)
 

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from tests.tuner.evaluate.test_rmse import errors
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.validation import flights_not_followed
 from tuner.findings.findings import Code, remedy, sentence
@@ -23,7 +23,7 @@ def flown():
     """The settings, the recordings, and what flies them with so much of the true thrust."""
     names = ("lemniscate_4mps", "circle_3mps", "diagonal_3mps")
     paths = [str(FLIGHTS / f"{name}.bag") for name in names]
-    settings = settle(Options(paths, config=str(FLIGHTS / "tune.yaml")))
+    settings = resolve_settings(Options(paths, config=str(FLIGHTS / "tune.yaml")))
     recordings = read_recordings(settings, holdout=())[0]
     truth = yaml.safe_load((FLIGHTS / "truth.yaml").read_text())
     known = {name: value for name, value in truth.items() if name in COEFFICIENTS}

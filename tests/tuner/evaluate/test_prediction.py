@@ -7,7 +7,7 @@ import pytest
 
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.prediction import Predictions, hold_state, predict
-from tuner.findings.sentences import PREDICTED
+from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.recordings.flight import Series
 from tuner.recordings.states import MIN_HALF_WIDTH_S
 from tuner.search.job_flights import Recording
@@ -21,7 +21,7 @@ def truth(full_flight, updated):
 
 def test_the_vehicle_that_flew_predicts_its_flight_better_than_one_that_holds(truth, full_flight):
     naive = hold_state(full_flight, truth.begins, truth.ahead)
-    for name in PREDICTED:
+    for name in PREDICTED_UNITS:
         assert truth.mean(0.5)[name] < 0.05 * naive.mean(0.5)[name], name
     assert truth.errors["position"].shape == (50, len(truth.begins))
     assert truth.begins[-1] + 0.5 <= full_flight.duration

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks import fast_flights
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.evaluate.prediction import predict
 from tuner.evaluate.torque_observer import LAGS, TorqueObserver
 from tuner.recordings.flight import Series
@@ -31,7 +31,9 @@ def flown(request, flights, tmp_path_factory):
     """The racer as it is, its recordings and what observes it."""
     folder, (racer, signals) = tmp_path_factory.mktemp("fast"), flights
     paths = fast_flights.write(racer, signals, folder, seed=4, fed=request.param)
-    settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
+    settings = resolve_settings(
+        Options([str(path) for path in paths], config=str(folder / "tune.yaml"))
+    )
     recordings, _ = read_recordings(settings)
     motor = {
         "input_scaling": fast_flights.FASTEST - fast_flights.IDLE,

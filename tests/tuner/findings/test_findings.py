@@ -5,13 +5,13 @@ import pytest
 from tuner.findings.findings import (
     Code,
     Finding,
-    brief,
+    merge_alike,
     one_line,
     remedy,
     sentence,
-    with_alike_together,
+    shorten_finding,
 )
-from tuner.findings.sentences import PREDICTED
+from tuner.findings.sentences import PREDICTED_UNITS
 
 #: What each code's maker gives beside it.
 MADE = {
@@ -293,7 +293,7 @@ def test_a_lag_is_of_what_comes_late(lag: float, says: str) -> None:
     [
         (("attitude",), "Holding its attitude predicts it better 0.1 to 0.5 s ahead"),
         (("velocity", "body_rate"), "Holding its velocity and body rate predicts them better"),
-        (tuple(PREDICTED), "Holding its state predicts it better"),
+        (tuple(PREDICTED_UNITS), "Holding its state predicts it better"),
     ],
 )
 def test_what_is_predicted_worse_than_held_is_named(names: tuple[str, ...], says: str) -> None:
@@ -310,6 +310,8 @@ def test_what_holds_of_several_flights_but_for_numbers_is_said_once():
         return Finding(Code.SETPOINTS_SCALED, "warning", flight, numbers, (axis, ""))
 
     roll, pitch = scaled("a", "roll", 0.23), scaled("a", "pitch", 0.23)
-    said = with_alike_together([roll, pitch, scaled("b", "roll", 0.25), scaled("b", "roll", 2.0)])
+    said = merge_alike([roll, pitch, scaled("b", "roll", 0.25), scaled("b", "roll", 2.0)])
     assert [(one.subject, one.names[0]) for one in said] == [("a, b", "roll"), ("a", "pitch")]
-    assert brief(said[0], 98).startswith("a and 1 more: Roll rate set-points are 0.2 times")
+    assert shorten_finding(said[0], 98).startswith(
+        "a and 1 more: Roll rate set-points are 0.2 times"
+    )

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.recordings.micro_sd import log_of
-from tuner.config import Options, TrajectorySettings, settle
+from tuner.config import Options, TrajectorySettings, resolve_settings
 from tuner.core.errors import InputError, RecordingError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.closed_loop import fly, simulate
@@ -100,7 +100,7 @@ TRIM = 0.02
 
 
 def settings_for(path, vehicle):
-    return settle(Options([str(path)], vehicle=vehicle))
+    return resolve_settings(Options([str(path)], vehicle=vehicle))
 
 
 def test_intervals_hold_the_vehicle_that_flew(simulation, flown, tmp_path):
@@ -308,7 +308,7 @@ def test_what_cannot_be_used_is_left_out_and_what_is_held_out_is_predicted(
     on_ground = log_of(np.arange(2000) / 400, columns, tmp_path / "log03")
     paths = [str(path) for path in (on_ground, fitted, held_out, mixed_up)]
     start = with_values(flown, {"inertia_xx": 0.7 * values_of(flown)["inertia_xx"]})
-    settings = settle(Options(paths, vehicle=start, holdout=["log01"]))
+    settings = resolve_settings(Options(paths, vehicle=start, holdout=["log01"]))
     flights, left_out = read_inertial_flights(settings)
     assert [flight.name for flight in flights] == ["log00", "log01", "log02"]
     run = fit_without_pose(settings, flights, left_out=left_out, out=tmp_path / "run")
@@ -319,14 +319,14 @@ def test_what_cannot_be_used_is_left_out_and_what_is_held_out_is_predicted(
     (foretold,) = [f for f in run.result.findings if f.subject == "log01"]
     assert foretold.numbers["after"] < foretold.numbers["before"]
     with pytest.raises(RecordingError, match="the motors only idle"):
-        read_inertial_flights(settle(Options([str(on_ground)], vehicle=flown)))
+        read_inertial_flights(resolve_settings(Options([str(on_ground)], vehicle=flown)))
     with pytest.raises(InputError, match="holds out all flights that can be used"):
         fit_without_pose(settings, flights[1:2], out=tmp_path / "run")
 
 
 def test_beside_flights_with_a_pose_those_without_one_are_left_out(simulation, flown, tmp_path):
     bare, posed = log_file(simulation, tmp_path / "log00"), FLIGHTS / "circle_4mps.bag"
-    settings = settle(Options([str(bare), str(posed)], vehicle=flown, holdout=[]))
+    settings = resolve_settings(Options([str(bare), str(posed)], vehicle=flown, holdout=[]))
     assert read_inertial_flights(settings) == ((), ())
     usable, (left_out,) = read_recordings(settings)
     assert [recording.flight.name for recording in usable] == ["circle_4mps"]

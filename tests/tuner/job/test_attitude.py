@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.job.test_windows import stage_for
-from tuner.config import JobFile, Options, settle
+from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import FlightSettings, Search
 from tuner.findings.findings import Code, one_line
 from tuner.objective.rotor_signals import MotorOrder
@@ -69,7 +69,7 @@ def sparse(full_flight, updated):
 
 
 def settings_of(vehicle, bag, **job):
-    settings = settle(Options([str(bag)], vehicle=vehicle, controller="hovergames"))
+    settings = resolve_settings(Options([str(bag)], vehicle=vehicle, controller="hovergames"))
     return replace(settings, job=JobFile(search=Search(method="gradient", window=1.0), **job))
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from sim_jax.schedule import Schedule
 from tests.tuner.evaluate.test_rmse import errors
-from tuner.config import JobFile, Options, settle
+from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import Search
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.evaluate.validation import flights_worse
@@ -36,7 +36,7 @@ def without_commands(flight, begin, end):
 
 
 def settings_for(bag, **job):
-    settings = settle(Options([str(bag)]))
+    settings = resolve_settings(Options([str(bag)]))
     return replace(settings, job=JobFile(inlet="actuator", search=Search(window=0.5), **job))
 
 

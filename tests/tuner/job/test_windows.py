@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.config import JobFile, Options, settle
+from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import CoefficientSettings, FlightSettings, Search
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import configs_folder
@@ -36,7 +36,7 @@ def job_through(inlet, flight, bag, updated, *, free=FREE, method="gradient"):
     start = with_values(
         updated, {name: values_of(updated)[name] * WRONG.get(name, 1.0) for name in free}
     )
-    settings = settle(Options([str(bag)], vehicle=start, controller="hovergames"))
+    settings = resolve_settings(Options([str(bag)], vehicle=start, controller="hovergames"))
     job = JobFile(free=free, inlet=inlet, search=Search(method=method, window=0.5))
     settings = replace(settings, job=job)
     return job_of(settings, recordings_of(settings, [flight]))

@@ -12,7 +12,7 @@ from lanes.digest import digest_of
 from lanes.program import _program_of
 from sim_jax.terms import total
 from tests.tuner.uncertainty.making import criterion_of, problem
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.objective import simulation
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import recordings_of
@@ -49,7 +49,7 @@ def test_other_coefficients_and_bounds_are_the_same_program(free):
 
 
 def test_a_flight_of_another_length_is_the_same_program(flight, updated):
-    settings = settle(Options(flights=(str(flight.path),), vehicle=updated))
+    settings = resolve_settings(Options(flights=(str(flight.path),), vehicle=updated))
     whole, part = (
         job_of(settings, recordings_of(settings, [each])).objective
         for each in (flight, shortened(flight, 7.3))

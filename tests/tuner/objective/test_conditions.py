@@ -9,7 +9,7 @@ from tuner.objective.criterion import OFFSET_SD, Point, units_of
 from tuner.objective.information import information_at
 from tuner.objective.normal_equations import normal_equations, with_conditions
 from tuner.objective.segments import OFFSETS
-from tuner.vehicle import conditions
+from tuner.vehicle import condition_rows
 
 NAMES = ("wind_x", "wind_y", "battery_decline")
 TRUTH = np.array([[0.3, -0.2], [0.1, 0.25], [1e-3, 3e-3]])
@@ -37,9 +37,9 @@ def equations(objective, point):
 
 
 def test_the_prior_of_a_condition_is_that_of_an_offset_in_its_unit():
-    for name, row in conditions().items():
+    for name, row in condition_rows().items():
         assert units_of([name])[0] * OFFSET_SD == pytest.approx(row.prior_sd)
-    assert set(NAMES) <= set(conditions())
+    assert set(NAMES) <= set(condition_rows())
 
 
 def test_no_wind_and_a_steady_battery_change_nothing():

@@ -15,7 +15,7 @@ from sim_jax.rollout import rollout
 from sim_jax.state import AIRBORNE, hover
 from tests.sim_jax.support import controller, vec
 from tests.sim_jax.test_rotor_counts import SCHEDULE, STEPS, round_airframe
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.objective import simulation
 from tuner.objective.segments import Segments
 from tuner.objective.simulation import beginning_of, recorded_of
@@ -32,7 +32,7 @@ SAMPLES = 120
 @pytest.fixture(params=["reference", "body_rate", "actuator", "rotor_speed", "attitude"])
 def objective(request, flight, full_flight, updated):
     recording = flight if request.param == "reference" else full_flight
-    settings = settle(Options(flights=(str(recording.path),), vehicle=updated))
+    settings = resolve_settings(Options(flights=(str(recording.path),), vehicle=updated))
     settings = replace(settings, job=settings.job.replace(inlet=request.param))
     job = job_of(settings, recordings_of(settings, [recording]))
     return job.windows or job.objective

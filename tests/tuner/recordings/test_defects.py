@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.core.errors import RecordingError
 from tuner.recordings.defects import (
     clean,
@@ -258,7 +258,7 @@ def written(path, stops: float):
 def test_a_flight_of_which_too_little_is_left_is_read_but_not_fitted(tmp_path) -> None:
     short = written(tmp_path / "short.csv", 1.0)
     longer = written(tmp_path / "longer.csv", 6.0)
-    settings = settle(Options([short.path], vehicle="crazyflie"))
+    settings = resolve_settings(Options([short.path], vehicle="crazyflie"))
     with pytest.raises(RecordingError, match="its attitude stops changing"):
         recordings_of(settings, [short])
     assert short.duration == pytest.approx(TIME[-1], abs=0.02)

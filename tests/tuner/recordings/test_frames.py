@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.tuner.recordings import making
 from tuner.cli import main
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
 from tuner.recordings.flight import Series
@@ -63,7 +63,9 @@ def reversed_circle(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 def test_a_recording_that_runs_backwards_is_named_and_left_out(
     short: Path, reversed_circle: Path
 ) -> None:
-    usable, findings = read_recordings(settle(Options([str(short), str(reversed_circle)])))
+    usable, findings = read_recordings(
+        resolve_settings(Options([str(short), str(reversed_circle)]))
+    )
     assert [recording.flight.name for recording in usable] == ["short"]
     (left_out,) = (finding for finding in findings if finding.code is Code.LEFT_OUT)
     assert (left_out.subject, left_out.level) == ("reversed", "warning")
@@ -75,7 +77,7 @@ def test_where_nothing_else_flew_the_run_ends_with_one_line(
     reversed_circle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(RecordingError, match=r"reversed.bag: its attitude and its body_rate"):
-        read_recordings(settle(Options([str(reversed_circle)])))
+        read_recordings(resolve_settings(Options([str(reversed_circle)])))
     assert main(["--flights", str(reversed_circle), "--out", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert len([line for line in said if "contradict each other" in line]) == 1

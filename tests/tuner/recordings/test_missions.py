@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.recordings import making
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.findings.findings import Code
 from tuner.recordings.flight import Series
 from tuner.recordings.inspection import inspect_recordings
@@ -241,7 +241,7 @@ def test_missions_of_a_long_log(long_log: Path) -> None:
     assert all(flight.duration < 60 for flight in flights)
     (inspection,), _ = inspect_recordings([long_log])
     assert sum(mission.fitted for mission in inspection.missions) in (4, 5)
-    recordings, findings = read_recordings(settle(Options([str(long_log)])))
+    recordings, findings = read_recordings(resolve_settings(Options([str(long_log)])))
     assert len(recordings) == sum(mission.fitted for mission in inspection.missions)
     (chosen,) = [f for f in findings if f.code is Code.MANOEUVRES_CHOSEN]
     assert chosen.numbers["flights"] == 10
@@ -251,7 +251,7 @@ def test_a_side_car_names_the_missions(long_log: Path) -> None:
     beside = long_log.with_suffix(".yaml")
     beside.write_text("missions: [2, 7]\n")
     try:
-        recordings, _ = read_recordings(settle(Options([str(long_log)])))
+        recordings, _ = read_recordings(resolve_settings(Options([str(long_log)])))
     finally:
         beside.unlink()
     assert [recording.flight.name for recording in recordings] == ["long-2", "long-7"]

@@ -9,7 +9,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from tests.tuner.recordings import making
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
 from tuner.job.recording_verdict import Verdict, in_words, verdict_of
@@ -57,7 +57,7 @@ def log(
 
 def test_the_rate_loop_is_the_logs(messages, tmp_path: Path) -> None:
     path = log(messages, tmp_path / "log.ulg", PARAMETERS)
-    settings, (finding,) = with_logged_parameters(settle(Options([str(path)])))
+    settings, (finding,) = with_logged_parameters(resolve_settings(Options([str(path)])))
     flew = settings.controller
     assert (flew.rate.roll.p, flew.rate.roll.i, flew.rate.pitch.d) == (0.15, 0.2, 0.0036)
     assert (flew.rate.yaw.ff, flew.rate.rate, flew.physics.rate) == (0.05, 800, 800)
@@ -70,7 +70,7 @@ def test_the_rate_loop_is_the_logs(messages, tmp_path: Path) -> None:
     assert "integrator_limit" not in line
     assert finding.level == "info"
     named, (finding,) = with_logged_parameters(
-        settle(Options([str(path)], controller="hovergames"))
+        resolve_settings(Options([str(path)], controller="hovergames"))
     )
     assert (named.controller, finding.level) == (flew, "warning")
 
@@ -80,23 +80,23 @@ def test_logs_that_differ_are_named(messages, tmp_path: Path) -> None:
         log(messages, tmp_path / f"{name}.ulg", PARAMETERS | {"MC_ROLLRATE_P": gain})
         for name, gain in (("a", 0.15), ("b", 0.18))
     ]
-    _, findings = with_logged_parameters(settle(Options([str(path) for path in paths])))
+    _, findings = with_logged_parameters(resolve_settings(Options([str(path) for path in paths])))
     (differ,) = [finding for finding in findings if finding.code is Code.LOGS_DIFFER]
     assert differ.names == ("MC_ROLLRATE_P",)
 
 
 def test_parameters_that_no_controller_has_change_nothing(messages, tmp_path: Path) -> None:
     path = log(messages, tmp_path / "log.ulg", {"IMU_GYRO_CUTOFF": 1e9, "MC_ROLLRATE_P": np.nan})
-    settings = settle(Options([str(path)]))
+    settings = resolve_settings(Options([str(path)]))
     assert with_logged_parameters(settings) == (settings, ())
 
 
 def test_flights_of_px4s_own_loops_enter_below_them(messages, tmp_path: Path) -> None:
     path = log(messages, tmp_path / "log.ulg")
-    (recording,), (finding,) = read_recordings(settle(Options([str(path)])))
+    (recording,), (finding,) = read_recordings(resolve_settings(Options([str(path)])))
     assert (recording.inlet, finding.code) == ("body_rate", Code.PX4_LOOPS)
     (tmp_path / "job.yaml").write_text("inlet: reference\n")
-    asked = settle(Options([str(path)], config=str(tmp_path / "job.yaml")))
+    asked = resolve_settings(Options([str(path)], config=str(tmp_path / "job.yaml")))
     ((recording,), _) = read_recordings(asked)
     assert recording.inlet == "reference"
 

@@ -13,7 +13,7 @@ from scipy import signal
 from scipy.io import savemat
 
 from tests.tuner.recordings import making, ways
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.findings.findings import one_line
 from tuner.objective.rotor_signals import levers, order_findings
@@ -100,7 +100,7 @@ def test_quick_microseconds_are_no_slow_milliseconds(tmp_path: Path) -> None:
 def as_fitted(path: Path, **values: float) -> Flight:
     """Return a recording as a fit takes it, of a vehicle with some other coefficients."""
     vehicle = with_values(read_vehicle(ways.VEHICLE), values)
-    (recording,) = read_recordings(settle(Options([str(path)], vehicle=vehicle)))[0]
+    (recording,) = read_recordings(resolve_settings(Options([str(path)], vehicle=vehicle)))[0]
     return recording.flight
 
 
@@ -376,7 +376,7 @@ def test_motor_order(order: str, tmp_path: Path) -> None:
     read_so = load_flight(path, topics=tmp_path / "own.yaml")
     assert_same(read_so)
     ordered = vehicle.replace(motor_order=yaml.safe_load(order))
-    (recording,) = read_recordings(settle(Options([str(path)], vehicle=ordered)))[0]
+    (recording,) = read_recordings(resolve_settings(Options([str(path)], vehicle=ordered)))[0]
     assert_same(recording.flight)
     path.with_suffix(".yaml").write_text(f"motor_order: {order}\n")
     assert_same(load_flight(path))
@@ -501,7 +501,9 @@ def test_a_rotor_speed_that_never_changes_is_none(value: float, tmp_path: Path) 
 def test_a_clock_that_is_set_in_flight_parts_it(step: float, tmp_path: Path) -> None:
     path = tmp_path / "flight.csv"
     path.write_text(ways.changed({"time": lambda t: np.where(t > 7.0, t + step, t)}))
-    recordings, _ = read_recordings(settle(Options([str(path)], vehicle=str(ways.VEHICLE))))
+    recordings, _ = read_recordings(
+        resolve_settings(Options([str(path)], vehicle=str(ways.VEHICLE)))
+    )
     assert [recording.flight.duration for recording in recordings] == [
         pytest.approx(7.0, abs=0.1)
     ] * 2

@@ -9,10 +9,10 @@ from tuner.evaluate.records import AxesRmse
 from tuner.findings.findings import Code, Finding, remedy
 from tuner.report.outcome import (
     Usability,
-    counted,
     flights_table,
     next_step,
     outcome,
+    verdict_counts,
     warnings_of,
 )
 from tuner.result import ExportRecord
@@ -161,7 +161,7 @@ def test_how_far_flights_are_predicted_is_said_where_they_are_not_flown_whole(re
 
 def test_held_coefficients_are_counted_as_held():
     verdicts = [Verdict.WELL_KNOWN, Verdict.WELL_KNOWN, Verdict.HELD, Verdict.NOT_IDENTIFIABLE]
-    assert counted(verdicts) == (
+    assert verdict_counts(verdicts) == (
         "2 are well known, 1 is held at its initial value and 1 is not identifiable"
     )
-    assert counted([Verdict.HELD] * 2) == "all 2 are held at their initial values"
+    assert verdict_counts([Verdict.HELD] * 2) == "all 2 are held at their initial values"

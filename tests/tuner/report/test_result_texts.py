@@ -8,10 +8,10 @@ from tuner.report.result_texts import (
     calibration_in_words,
     effective_in_words,
     gain_in_words,
+    lost_groups,
     reason_in_words,
     rmse_in_words,
     selection_in_words,
-    what_is_lost,
 )
 from tuner.result import PoseRmse
 from tuner.uncertainty.records import COVERAGE_LEVELS, Calibration, CoverageRecord, calibration
@@ -36,7 +36,7 @@ def test_a_crash_and_a_metre_are_said_as_such():
 
 
 def test_what_a_target_holds_is_not_lost_there():
-    assert what_is_lost(EFFECTIVE, lambda _: Written("a tag"), ()) == ()
+    assert lost_groups(EFFECTIVE, lambda _: Written("a tag"), ()) == ()
 
 
 def row(code, *, kept=False):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import fitted_of, problem, truth
-from tuner.config import JobFile, Options, settle
+from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import Search
 from tuner.findings.findings import Code, sentence
 from tuner.objective.space import space_of
@@ -143,7 +143,7 @@ def test_a_checkpoint_is_of_flights_that_are_read_alike(bag, tmp_path):
     (tmp_path / "own.yaml").write_text("name: own\nformat: ros\nextends: mavros\nsignals: {}\n")
 
     def digest(topics=None):
-        settings = settle(Options([str(recording)], topics=topics))
+        settings = resolve_settings(Options([str(recording)], topics=topics))
         flight = SimpleNamespace(name="flight", sha256="0", path=str(recording))
         return fingerprint(SimpleNamespace(settings=settings, flights=[flight]))
 

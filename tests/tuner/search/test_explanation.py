@@ -9,7 +9,7 @@ import pytest
 
 from tuner.config import Options
 from tuner.core.errors import OutputError
-from tuner.findings.findings import LARGEST, Code, Finding, one_line
+from tuner.findings.findings import MAX_FINITE, Code, Finding, one_line
 from tuner.job.listener import Listener
 from tuner.job.run import run
 from tuner.result import read_run
@@ -61,7 +61,7 @@ def test_a_finding_is_told_once() -> None:
 
 def test_a_finding_holds_numbers_that_json_has() -> None:
     finding = Finding(Code.FLIGHT_WORSE, "warning", "f", {"before": 1.0, "after": np.inf})
-    assert finding.numbers == {"before": 1.0, "after": LARGEST}
+    assert finding.numbers == {"before": 1.0, "after": MAX_FINITE}
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks import fast_flights
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.findings.findings import Code
 from tuner.job.check import _motor_orders
 from tuner.objective.rotor_signals import order_findings
@@ -144,7 +144,7 @@ def test_what_the_loop_answers_to_hidden_torques_is_no_lateness(tmp_path):
     signals = fast_flights.fly(racer, seed=32, seconds=10.0)
     paths = fast_flights.write(racer, signals, tmp_path, seed=32)
     chosen = [str(p) for p in paths if p.stem in ("circle_13mps", "lemniscate_9mps")]
-    settings = settle(Options(chosen, config=str(tmp_path / "tune.yaml")))
+    settings = resolve_settings(Options(chosen, config=str(tmp_path / "tune.yaml")))
     recordings, _ = read_recordings(settings)
     lag = input_lag(recordings[0].flight, "rotor_speed", settings.vehicle)
     assert lag.seconds < -3.0 * lag.sd  # by spectra alone

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tuner.config import CHANNELS, JobFile, Options, settle
+from tuner.config import CHANNELS, JobFile, Options, resolve_settings
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import sentence
 from tuner.search.job_flights import (
@@ -22,7 +22,7 @@ SPIN, CIRCLE = "yaw_spin_3rps", "circle_4mps"
 
 @pytest.fixture(scope="module")
 def settings():
-    return settle(Options([str(FLIGHTS / f"{name}.bag") for name in (SPIN, CIRCLE)]))
+    return resolve_settings(Options([str(FLIGHTS / f"{name}.bag") for name in (SPIN, CIRCLE)]))
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,8 @@ def test_recordings_of_which_no_flight_can_be_made_are_left_out_by_name(tmp_path
     empty.touch()
     circle = str(FLIGHTS / f"{CIRCLE}.bag")
     settings = replace(
-        settle(Options([str(too_short), circle, str(empty)], holdout=["too_short"])), job=JobFile()
+        resolve_settings(Options([str(too_short), circle, str(empty)], holdout=["too_short"])),
+        job=JobFile(),
     )
     recordings, left_out = read_recordings(settings)
     assert [recording.flight.name for recording in recordings] == [CIRCLE]

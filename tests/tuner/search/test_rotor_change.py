@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tuner.config import Options, settle
+from tuner.config import Options, resolve_settings
 from tuner.findings.findings import Code
 from tuner.job.run import prepared
 from tuner.recordings.flight import Series
@@ -20,7 +20,9 @@ BROKEN = 20.0
 @pytest.fixture(scope="module")
 def flown():
     paths = sorted(str(path) for path in (ROOT / "reference_flights").glob("*.bag"))
-    settings = settle(Options(paths, config=str(ROOT / "reference_flights" / "tune.yaml")))
+    settings = resolve_settings(
+        Options(paths, config=str(ROOT / "reference_flights" / "tune.yaml"))
+    )
     return settings, read_recordings(settings)[0]
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.tuner.exporters.conftest import as_the_run_says, make_run
 from tests.tuner.service.conftest import listening
 from tests.tuner.test_names import EXAMPLES, NAMES, nothing_outside
-from tuner.config import settle
+from tuner.config import resolve_settings
 from tuner.config.job import ExportSettings
 from tuner.exporters.export import export_formats_of_job
 from tuner.result import BEST_FIT_FILE
@@ -46,7 +46,7 @@ def test_a_job_over_http_stays_in_its_folder(idle, client, make_run, called):
             claims.append(claim)
             folder = idle.settings.work / claim.id
             asked = prepare(folder, claim, idle.store)
-            flown = settle(asked.options(folder, tuple(claim.flights))).vehicle
+            flown = resolve_settings(asked.options(folder, tuple(claim.flights))).vehicle
             result = folder / "result"
             result.mkdir()
             for file in run.folder.glob("*.*"):

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tuner.config import JobFile, Options, settle
+from tuner.config import JobFile, Options, resolve_settings
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder, find_config
 from tuner.findings.findings import Code
@@ -186,4 +186,4 @@ def test_another_folder_is_refused(tmp_path):
     (tmp_path / "a.csv").write_text("time,x\n0,0\n")
     options = Options([str(tmp_path / "a.csv")], bench=str(tmp_path), vehicle="hovergames")
     with pytest.raises(InputError, match="the result folder of tune bench"):
-        settle(options)
+        resolve_settings(options)

@@ -17,7 +17,7 @@ from tuner.core.shipped import find_config
 from tuner.objective.space import space_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, VehicleFile, read_vehicle, with_values
 from tuner.vehicle.model import model_of
-from tuner.vehicle.vehicle import Size, size_of, sized
+from tuner.vehicle.vehicle import Size, scaled_to_size, size_of
 
 SMALL = Size(mass=0.015, arm=0.2)
 LINEAR = [
@@ -76,7 +76,7 @@ def acting(vehicle: VehicleFile, size: Size) -> np.ndarray:
 @pytest.mark.parametrize("row", LINEAR, ids=lambda row: row.name)
 def test_a_usual_coefficient_acts_on_a_small_vehicle_as_on_a_large_one(large, row) -> None:
     small = scaled(large, SMALL)
-    of_large, of_small = (sized(row, size_of(vehicle)) for vehicle in (large, small))
+    of_large, of_small = (scaled_to_size(row, size_of(vehicle)) for vehicle in (large, small))
     expected = acting(with_values(large, {row.name: of_large.step}), Size())
     found = acting(with_values(small, {row.name: of_small.step}), SMALL)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())

@@ -31,7 +31,7 @@ VERDICTS = {
     Verdict.TIED: ("kept", "=", GREY),
     Verdict.FIXED: ("kept", "–", GREY),
 }
-WIDEST = 1000.0
+MAX_PERCENT = 1000.0
 """% at which a bar of the figure ends."""
 
 
@@ -47,7 +47,7 @@ def coefficients(contents: Contents) -> Section | None:
         if fixed:
             tables.append(_fixed(fixed, knowledge))
     elif knowledge:
-        tables = [_examined(knowledge)]
+        tables = [_examined_table(knowledge)]
     else:
         return None
     note = (
@@ -61,7 +61,7 @@ def _name(name: str) -> Cell:
     return Cell(name, small=COEFFICIENTS[name].meaning)
 
 
-def _judged(verdict: Verdict, reason: str = "") -> Cell:
+def _verdict_cell(verdict: Verdict, reason: str = "") -> Cell:
     look, sign, _ = VERDICTS[verdict]
     words = verdict_in_words(verdict)
     return Cell(f"{sign} {words}", small="" if reason == words else reason, look=look)
@@ -75,7 +75,7 @@ def _fitted(free: Mapping[str, CoefficientResult]) -> Table:
             figures(found.best),
             half_width_in_words(found.ci95, found.best, found.unit),
             found.unit,
-            _judged(
+            _verdict_cell(
                 found.verdict,
                 "" if found.verdict is Verdict.WELL_KNOWN else reason_in_words(found.reason),
             ),
@@ -126,7 +126,7 @@ def _fixed(
     return Table(columns, rows, words=words, fold=f"Fixed: {', '.join(fixed)}")
 
 
-def _examined(knowledge: Mapping[str, CoefficientKnowledge]) -> Table:
+def _examined_table(knowledge: Mapping[str, CoefficientKnowledge]) -> Table:
     rows = [
         (
             Cell(known.label(name), small=COEFFICIENTS[name].meaning),
@@ -134,7 +134,7 @@ def _examined(knowledge: Mapping[str, CoefficientKnowledge]) -> Table:
             short(known.std_error),
             _from_to(known.ci95),
             known.unit,
-            _judged(
+            _verdict_cell(
                 known.verdict,
                 ("" if known.fitted else "were it fitted with the others: ")
                 + reason_in_words(known.reason),
@@ -163,7 +163,8 @@ def _intervals(known: Mapping[str, CoefficientKnowledge]) -> list[Chart]:
     bars = []
     for verdict, (_, sign, colour) in VERDICTS.items():
         widths = [
-            min(wide[name], WIDEST) if known[name].verdict == verdict else None for name in order
+            min(wide[name], MAX_PERCENT) if known[name].verdict == verdict else None
+            for name in order
         ]
         if any(value is not None for value in widths):
             texts = [
@@ -177,8 +178,8 @@ def _intervals(known: Mapping[str, CoefficientKnowledge]) -> list[Chart]:
             key="intervals",
             title="How closely each coefficient is known",
             caption="Half the 95 % interval, relative to the value, drawn to "
-            f"{WIDEST:.0f} % at most. For a fixed coefficient it is the one that it would have, "
-            "were it fitted with the others.",
+            f"{MAX_PERCENT:.0f} % at most. For a fixed coefficient it is the one that it would "
+            "have, were it fitted with the others.",
             panels=(Panel(bars, x_scale="log"),),
             x_title="± % of the value (of its usual uncertainty where the value is smaller)",
             height=120 + 24 * len(order),

@@ -9,13 +9,13 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse
-from tuner.findings.sentences import PREDICTED
+from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.report.chart import (
     FITTED,
     INITIAL,
+    MIN_DRAWN,
     PALETTE,
     RECORDED,
-    SMALLEST,
     Chart,
     Dash,
     Line,
@@ -36,22 +36,22 @@ CURVES = {
     "fitted": ("_best", FITTED),
     "simulated": ("_simulated", FITTED),
 }
-DRAWN_IN = {"position": "m", "attitude": "°"}
+PLOT_UNITS = {"position": "m", "attitude": "°"}
 PER_AXIS = {axis: (1e3, "mm") if unit == "m" else (1.0, "°") for axis, unit in RMSE_UNITS.items()}
 """Axis -> what its RMSE is multiplied by for a table, and the unit then."""
-WORSE = 1.05
+MIN_WORSE_RATIO = 1.05
 """Times the error before beyond which it is marked as worse."""
 TIME = "time since the mission's start [s]"
 PREFIX = "acting_"
 CLOCK = "time"
 BODY = ("forward", "left", "up")
-FAINTEST = 1e-9
+MIN_DRAWN_FORCE = 1e-9
 """N or N m below which a curve is no more than rounding."""
 DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 
 
 def flights(contents: Contents) -> Section | None:
-    """Return how closely each flight is met, and four charts of each; held-out flights first."""
+    """Return the RMSE of each flight, and four charts of each; held-out flights first."""
     result = None if contents.run is None else contents.run.result
     found = [] if result is None else list(result.flights)
     if not found and not contents.traces:
@@ -61,7 +61,7 @@ def flights(contents: Contents) -> Section | None:
     charts = [
         chart
         for name in order
-        for chart in _of_flight(name, contents.traces[name], held, open_=name == order[0])
+        for chart in _flight_charts(name, contents.traces[name], held, open_=name == order[0])
     ]
     legend = "Recorded (wide grey), " + (
         "simulated with the start values (dotted) and with the fitted coefficients."
@@ -87,7 +87,9 @@ def _tables(contents: Contents, result: RunResult) -> list[Table]:
     if laps := _laps(contents):
         tables.append(Table(("lap", *axes), laps, words=("lap",), fold="RMSE lap by lap"))
     if ahead := [row for flight in result.flights for row in _predictions(flight)]:
-        quantities = [f"{name.replace('_', ' ')} [{unit}]" for name, unit in PREDICTED.items()]
+        quantities = [
+            f"{name.replace('_', ' ')} [{unit}]" for name, unit in PREDICTED_UNITS.items()
+        ]
         fold = (
             "Open-loop predictions from recorded states: mean error before → after, knowing the "
             "torque that was unseen just before (of a state that stays as it is)"
@@ -98,7 +100,7 @@ def _tables(contents: Contents, result: RunResult) -> list[Table]:
     return tables
 
 
-def _of_flight(
+def _flight_charts(
     name: str, arrays: Mapping[str, Array], held: set[str], *, open_: bool
 ) -> list[Chart]:
     title = f"{name}, held out" if name in held else name
@@ -119,7 +121,7 @@ def _of_flight(
 
 
 def _over_time(name: str, title: str, quantity: str, arrays: Mapping[str, Array]) -> Chart:
-    unit = DRAWN_IN[quantity]
+    unit = PLOT_UNITS[quantity]
     time = rounded(arrays[f"{quantity}_time"], 3)
     digits = 4 if quantity == "position" else 3
     panels = []
@@ -144,7 +146,7 @@ def _errors(name: str, title: str, arrays: Mapping[str, Array]) -> Chart:
             error = arrays[quantity + suffix] - arrays[quantity]
             if quantity == "attitude":
                 error = (error + 180.0) % 360.0 - 180.0
-            size = np.maximum(scale * np.linalg.norm(error, axis=1), SMALLEST)
+            size = np.maximum(scale * np.linalg.norm(error, axis=1), MIN_DRAWN)
             curves.append(Line(which, time, rounded(size, 4), look))
         panels.append(Panel(curves, y_title=f"{quantity} [{unit}]", y_scale="log"))
     return Chart(f"{name}_error", f"{title}: error over time", panels, x_title=TIME, height=420)
@@ -184,15 +186,17 @@ def _predictions(flight: FlightResult) -> list[tuple[Cell | str, ...]]:
             _title(flight),
             f"{best.seconds:g}",
             *(
-                _ahead(*(getattr(of, n, None) for of in (before, best, observed, naive)))
-                for n in PREDICTED
+                _predictions_table(
+                    *(getattr(of, n, None) for of in (before, best, observed, naive))
+                )
+                for n in PREDICTED_UNITS
             ),
         )
         for before, best, observed, naive in rows
     ]
 
 
-def _ahead(
+def _predictions_table(
     before: float | None, best: float | None, observed: float | None, held: float | None
 ) -> Cell | str:
     if best is None:
@@ -216,7 +220,7 @@ def _pairs(before: AxesRmse, after: AxesRmse) -> list[Cell | str]:
             continue
         scale = PER_AXIS[axis][0]
         text = " → ".join("crash" if v is None else f"{scale * v:.3g}" for v in (one, other))
-        worse = one is not None and (other is None or other > WORSE * one)
+        worse = one is not None and (other is None or other > MIN_WORSE_RATIO * one)
         cells.append(Cell(text, look="worse" if worse else ""))
     return cells
 
@@ -241,11 +245,11 @@ def forces(contents: Contents) -> Section | None:
 
     Of the flight that accelerates most: the others' curves are much the same.
     """
-    flights = {name: _of_terms(arrays) for name, arrays in contents.traces.items()}
+    flights = {name: _forces_by_term(arrays) for name, arrays in contents.traces.items()}
     flights = {name: of_term for name, of_term in flights.items() if CLOCK in of_term}
     if not flights:
         return None
-    name = max(flights, key=lambda name: _pull(flights[name]))
+    name = max(flights, key=lambda name: _weight_of(flights[name]))
     of_term = dict(flights[name])
     time = of_term.pop(CLOCK)
     charts = (
@@ -262,7 +266,7 @@ def forces(contents: Contents) -> Section | None:
     return Section("forces", "Forces and moments by term", charts=charts, note=note, folded=True)
 
 
-def _of_terms(arrays: Mapping[str, Array]) -> dict[str, Array]:
+def _forces_by_term(arrays: Mapping[str, Array]) -> dict[str, Array]:
     return {
         name.removeprefix(PREFIX): values
         for name, values in arrays.items()
@@ -270,7 +274,7 @@ def _of_terms(arrays: Mapping[str, Array]) -> dict[str, Array]:
     }
 
 
-def _pull(of_term: Mapping[str, Array]) -> float:
+def _weight_of(of_term: Mapping[str, Array]) -> float:
     """Return the root mean square of mass times acceleration, N."""
     total = sum(values[:, :3] for name, values in of_term.items() if name != CLOCK)
     return float(np.sqrt(np.mean(np.square(total)))) if np.size(total) else 0.0
@@ -286,7 +290,7 @@ def _chart(
             [
                 Line(name.replace("_", " "), clock, rounded(values[:, axis], 5), looks[name])
                 for name, values in of_term.items()
-                if np.abs(values[:, axis]).max(initial=0.0) > FAINTEST
+                if np.abs(values[:, axis]).max(initial=0.0) > MIN_DRAWN_FORCE
             ],
             y_title=f"{title} [{unit}]",
         )

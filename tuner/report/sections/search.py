@@ -1,4 +1,4 @@
-"""How the search went, and which terms beyond the base model the flights speak for."""
+"""The sections on the search, and on the selection of terms."""
 
 from __future__ import annotations
 

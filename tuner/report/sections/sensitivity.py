@@ -1,4 +1,4 @@
-"""What the flights say of each coefficient: effects, information, residuals, profiles, indices."""
+"""The sections on effects, information, residuals, profiles and indices of coefficients."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tuner.uncertainty.records import (
 )
 from tuner.uncertainty.verdict_texts import direction_in_words
 
-FAINTEST = 1e-4
+MIN_DRAWN_SHARE = 1e-4
 """Changes smaller than this share of the present RMSE are drawn as this."""
 
 
@@ -34,7 +34,7 @@ def effects(contents: Contents) -> Section | None:
     return Section("effects", "Local sensitivity", charts=charts, note=note, folded=True)
 
 
-def _together(rmse: Sequence[float | None]) -> float | None:
+def _pose_rmse(rmse: Sequence[float | None]) -> float | None:
     """Return the root mean square over outputs of one unit, None if one of them failed."""
     known = [value for value in rmse if value is not None]
     return float(np.sqrt(np.mean(np.square(known)))) if known and len(known) == len(rmse) else None
@@ -49,9 +49,9 @@ def _by_signal(knowledge: Knowledge, names: Sequence[str]) -> Chart:
         for channel, axis, unit in signals:
             outputs = [o for o in knowledge.outputs if (o.channel, o.axis) == (channel, axis)]
             change = float(np.sqrt(np.mean([o.change[name] ** 2 for o in outputs])))
-            rmse = _together([o.rmse for o in outputs if o.rmse is not None])
+            rmse = _pose_rmse([o.rmse for o in outputs if o.rmse is not None])
             share = change / max(rmse, 1e-300) if rmse else 0.0  # none was flown to its end
-            shares.append(float(np.log10(max(share, FAINTEST))))
+            shares.append(float(np.log10(max(share, MIN_DRAWN_SHARE))))
             each = "".join(f"<br>{o.flight}: {o.change[name]:.3g} {unit}" for o in outputs)
             sentences.append(
                 f"{name} +1 % changes {_name(channel, axis)} by {change:.3g} {unit}{each}"
@@ -122,11 +122,11 @@ def _name(channel: str, axis: str) -> str:
     return f"{channel.replace('_', ' ')} {axis}"
 
 
-NOTICED = 0.05
+MIN_BIAS = 0.05
 """Percent of bias for each percent of a fixed coefficient below which it is not listed."""
-MOST = 3
+MAX_BIASES = 3
 """Biased coefficients named for each fixed one."""
-ANNOTATED = 14
+MAX_ANNOTATED = 14
 """Rows up to which a correlation is written into its cell."""
 
 
@@ -153,11 +153,11 @@ def information(contents: Contents) -> Section | None:
 
 
 def _biases(knowledge: Knowledge) -> list[Table]:
-    """Return what an error of a fixed coefficient does to fitted ones."""
+    """Return the biases of fitted coefficients by errors of fixed ones."""
     rows = []
     for name, known in knowledge.coefficients.items():
-        follows = sorted(known.bias.items(), key=lambda item: -abs(item[1]))[:MOST]
-        noticed = [(other, share) for other, share in follows if abs(share) >= NOTICED]
+        follows = sorted(known.bias.items(), key=lambda item: -abs(item[1]))[:MAX_BIASES]
+        noticed = [(other, share) for other, share in follows if abs(share) >= MIN_BIAS]
         if noticed:
             rows.append((name, ", ".join(f"{share:+.2g} % into {o}" for o, share in noticed)))
     columns = ("fixed coefficient", "1 % of error in it puts")
@@ -236,7 +236,7 @@ def _correlation(knowledge: Knowledge) -> Chart:
         rows=names,
         values=[[round(r, 4) for r in row] for row in knowledge.correlation],
         text=texts,
-        digits=2 if len(names) <= ANNOTATED else None,
+        digits=2 if len(names) <= MAX_ANNOTATED else None,
         diverging=True,
         bar="correlation",
     )
@@ -301,8 +301,8 @@ def residuals(contents: Contents) -> Section | None:
     )
 
 
-HIGHEST = 12.0
-"""Of χ² above the lowest that is drawn."""
+MAX_CHI_SQUARE = 12.0
+"""Of the drawn χ² above the lowest."""
 
 
 def profiles(contents: Contents) -> Section | None:
@@ -328,8 +328,8 @@ def _interval(profile: Profile) -> str:
 
 
 def _chart(profile: Profile) -> Chart:
-    rise = [None if value is None or value > HIGHEST else value for value in profile.rise]
-    expected = [value if value <= HIGHEST else None for value in profile.quadratic]
+    rise = [None if value is None or value > MAX_CHI_SQUARE else value for value in profile.rise]
+    expected = [value if value <= MAX_CHI_SQUARE else None for value in profile.quadratic]
     lines = (
         Line(
             "standard error's parabola",

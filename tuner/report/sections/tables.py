@@ -15,11 +15,11 @@ from tuner.uncertainty.records import CONFLICT_SE
 from tuner.vehicle import COEFFICIENTS
 
 #: Settings that other sections show.
-SHOWN = ("command", "origin", "starts")
+PROVENANCE_KEYS = ("command", "origin", "starts")
 
 
 def remarks(contents: Contents) -> Section | None:
-    """Return what was noticed that is no warning; warnings stand above, beside the outcome."""
+    """Return the findings that are no warnings; warnings are beside the outcome."""
     points = [
         Cell(f"{found.subject}: {sentence(found)} {remedy(found)}".strip())
         for found in contents.about.findings
@@ -91,7 +91,7 @@ def sources(contents: Contents) -> Section | None:
 
 
 def next_log(contents: Contents) -> Section | None:
-    """Return what other signals, or more samples, would narrow."""
+    """Return the effects of further signals, or of more samples, on intervals."""
     if contents.run is None or not contents.run.result.next_log:
         return None
     points = [Cell(sentence) for sentence in next_log_in_words(contents.run.result.next_log)]
@@ -170,7 +170,9 @@ def provenance(contents: Contents) -> Section:
     rows += list(about.versions.items())
     columns = ("what", "which")
     tables = [Table(columns, rows, words=columns)]
-    settings = {name: value for name, value in about.settings.items() if name not in SHOWN}
+    settings = {
+        name: value for name, value in about.settings.items() if name not in PROVENANCE_KEYS
+    }
     tables += [
         Table(("",), [(json.dumps(value, indent=2),)], words=("",), fold=name)
         for name, value in settings.items()

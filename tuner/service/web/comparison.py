@@ -18,7 +18,7 @@ from tuner.result import CoefficientResult, ExportRecord, ExportRecords, RunResu
 from tuner.service.errors import NotKnownError, NotNowError
 from tuner.service.shapes import CoefficientHistory
 from tuner.service.tables import JobRow
-from tuner.vehicle.registry import at_mass
+from tuner.vehicle.registry import mass_factor
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def pairs(a: RunResult, b: RunResult) -> list[Pair]:
     """Return the coefficients of both, at the first's mass, those first that lie furthest apart."""
     masses = mass_of(b), mass_of(a)
     both = [
-        _pair(name, one, b.coefficients[name], at_mass(name, *masses))
+        _pair(name, one, b.coefficients[name], mass_factor(name, *masses))
         for name, one in a.coefficients.items()
         if name in b.coefficients and (one.fitted or b.coefficients[name].fitted)
     ]

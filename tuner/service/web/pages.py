@@ -25,7 +25,7 @@ from tuner.core.validation import config_error
 from tuner.core.yaml_document import document_of
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
-from tuner.report.outcome import LOOKS, flights_table, outcome, warnings_of
+from tuner.report.outcome import STYLE_OF, flights_table, outcome, warnings_of
 from tuner.report.section import figures
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
@@ -78,7 +78,7 @@ def environment() -> Environment:
         "damage": lambda raw: damage_sentence(TypeAdapter(Damage).validate_python(raw)),
     }
     made.filters |= filters
-    made.globals |= {"states": STATES, "looks": LOOKS, "visitor": VISITOR.get}
+    made.globals |= {"states": STATES, "looks": STYLE_OF, "visitor": VISITOR.get}
     return made
 
 
