@@ -511,7 +511,10 @@ def with_hidden(
         blocks=predicted.blocks + np.where(np.outer(upstream, upstream), blocks, 0.0),
         score=predicted.score + np.where(upstream, looped.score @ clear.T, 0.0),
         changes={
-            name: change + np.where(upstream, looped.changes[name] @ clear.T, 0.0)
+            name: change._replace(
+                across=change.across
+                + np.where(upstream, looped.changes[name].across @ clear.T, 0.0)
+            )
             for name, change in predicted.changes.items()
         },
     )
@@ -538,6 +541,6 @@ def with_strengths(
     """
     learnt = np.flatnonzero((strengths > LEAST) & (strengths < MOST))
     changes = dict(information.changes)
-    across = np.array([changes.pop(name).sum(axis=0) for name in STRENGTHS])[learnt]
+    across = np.array([changes.pop(name).gradient for name in STRENGTHS])[learnt]
     own = of_strengths[np.ix_(learnt, learnt)] + np.eye(len(learnt)) / USUALLY**2
     return replace(information, lost=across.T @ scaled_solve(own, across), changes=changes)

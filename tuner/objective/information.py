@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,6 +34,27 @@ ASTRAY = 2.0
 """Residuals' mean square, over that of what was recorded about its mean in all flights, from which
 a simulated flight is another one. What disturbs a vehicle is in its recording, too, so that the
 right model leaves no more than 1; of two flights that have nothing to do with each other, 2."""
+
+
+class Change(NamedTuple):
+    """How the residuals of C channels and F segments change in B stretches, simulated otherwise.
+
+    Attributes
+    ----------
+    across
+        (C, F, B, K): JᵀW times the change, nuisances eliminated.
+    own, score
+        (C, F, B): the change's weighted square, and its product with the residuals.
+    """
+
+    across: Array
+    own: Array
+    score: Array
+
+    @property
+    def gradient(self) -> Array:
+        """By how much the slope of the loss (K,) changes."""
+        return np.asarray(self.across.sum(axis=(0, 1, 2)))
 
 
 @dataclass(frozen=True)
@@ -67,7 +89,7 @@ class FisherInformation:
     lost
         (K, K): what flights tell less for nuisances that all of them share; None without.
     changes
-        What might be simulated differently -> (F, K) JᵀW times the change of the residuals.
+        What might be simulated differently -> how residuals change.
     selection_shifts
         (K,) how far the estimates would move with terms that were left out; None if none was tried.
     astray
@@ -89,7 +111,7 @@ class FisherInformation:
     scale: Array
     ground: Array | None = None
     lost: Array | None = None
-    changes: Mapping[str, Array] = field(default_factory=dict)
+    changes: Mapping[str, Change] = field(default_factory=dict)
     selection_shifts: Array | None = None
     astray: NDArray[np.bool_] | None = None
     pull: Array | None = None
@@ -135,7 +157,12 @@ class FisherInformation:
             scale=np.concatenate([part.scale for part in parts], axis=1),
             ground=first.ground,
             changes={
-                name: np.concatenate([part.changes[name] for part in parts])
+                name: Change(
+                    *(
+                        np.concatenate(same, axis=1)
+                        for same in zip(*(part.changes[name] for part in parts), strict=True)
+                    )
+                )
                 for name in first.changes
             },
             astray=None
@@ -172,10 +199,37 @@ class FisherInformation:
             prior=self.prior[square],
             ground=None if self.ground is None else self.ground[square],
             lost=None if self.lost is None else self.lost[square],
-            changes={name: change[:, indices] for name, change in self.changes.items()},
+            changes={
+                name: change._replace(across=change.across[..., indices])
+                for name, change in self.changes.items()
+            },
             selection_shifts=some(self.selection_shifts),
             pull=some(self.pull),
             nuisance_pull=some(self.nuisance_pull),
+        )
+
+    def beside(self, change: Change) -> FisherInformation:
+        """Return the same with the size of a change as the last of K + 1 coefficients.
+
+        Now it is zero, and it would be one were the change what flew; it has no prior.
+        """
+        beside = np.append(change.across, change.own[..., None], axis=-1)
+        blocks = np.concatenate([self.blocks, change.across[..., None, :]], axis=-2)
+        edge = ((0, 1), (0, 1))
+        return replace(
+            self,
+            blocks=np.append(blocks, beside[..., None], axis=-1),
+            score=np.append(self.score, change.score[..., None], axis=-1),
+            nuisance_prior=np.pad(self.nuisance_prior, edge),
+            prior=np.pad(self.prior, edge),
+            ground=None if self.ground is None else np.pad(self.ground, edge),
+            lost=None if self.lost is None else np.pad(self.lost, edge),
+            changes={},
+            selection_shifts=None,
+            pull=None if self.pull is None else np.append(self.pull, 0.0),
+            nuisance_pull=None
+            if self.nuisance_pull is None
+            else np.append(self.nuisance_pull, 0.0),
         )
 
     @property
@@ -311,10 +365,10 @@ def information_at(
     blocks = max(int(seconds / BLOCK), 1)
     states = 0 if criterion.states is None else len(criterion.states)
     size = len(space) + point.offsets.shape[0] + states
-    information = np.zeros((len(channels), segments, blocks, size, size))
-    score = np.zeros((len(channels), segments, blocks, size))
+    every = size + len(alternatives)  # a change of the residuals is a column like a derivative
+    information = np.zeros((len(channels), segments, blocks, every, every))
+    score = np.zeros((len(channels), segments, blocks, every))
     spread = np.ones((len(channels), segments))
-    changes = {name: np.zeros((segments, size)) for name in alternatives}
     crashed = np.isfinite(np.asarray(jacobian.crash_time))
     for number, channel in enumerate(channels):
         columns = np.asarray(jacobian.columns[channel])
@@ -322,39 +376,36 @@ def information_at(
         weight = np.asarray(objective.segments.measured[channel].weight)
         time = np.asarray(objective.segments.measured[channel].time)
         for segment, scale in enumerate(scales[number]):
-            rows = np.moveaxis(columns[..., segment], 0, -1) / scale  # as it lies in memory
             error = residuals[..., segment] / scale
+            changes = [o[channel][..., segment] / scale - error for o in alternatives.values()]
+            rows = np.stack([*(columns[..., segment] / scale), *changes], axis=-1)
             robust = huber_weights(error, criterion.huber)
             stretch = np.minimum((time[:, segment] / BLOCK).astype(int), blocks - 1)
             for index in range(blocks):
                 inside = stretch == index
-                own = rows[inside].reshape(-1, size)
+                own = rows[inside].reshape(-1, every)
                 weighted = (own * robust[inside].reshape(-1, 1)).T
                 curved = weighted @ own
-                if not is_steady(curved, len(own)):
+                if not is_steady(curved[:size, :size], len(own)):
                     rows[inside], crashed[segment] = 0.0, True
                     continue
                 information[number, segment, index] = curved
                 score[number, segment, index] = weighted @ error[inside].ravel()
-            for name, others in alternatives.items():
-                change = others[channel][..., segment] / scale - error
-                changes[name][segment] += (robust * change).ravel() @ rows.reshape(-1, size)
-            compared = (weight[..., segment] > 0) & np.any(rows != 0, axis=-1)
+            compared = (weight[..., segment] > 0) & np.any(rows[..., :size] != 0, axis=-1)
             if compared.any():
                 spread[number, segment] = np.mean((robust * error**2)[compared])
-    to_scaled = np.ones(size)
-    to_scaled[: len(space)] = 1.0 / space.slope(np.asarray(point.coefficients))
-    information = information * to_scaled[:, None] * to_scaled
+    slope = space.slope(np.asarray(point.coefficients))
+    to_scaled = np.append(1.0 / slope, np.ones(every - len(space)))
+    information, score = information * to_scaled[:, None] * to_scaled, score * to_scaled
     fitted = np.asarray(point.offsets) != 0.0 if offsets_fitted is None else offsets_fitted
-    closed = (
-        isinstance(objective.segments.inlet, ReferenceInlet) and not objective.segments.windowed
-    )
-    along, prior, pull = _along(objective, point, criterion, information, fitted)
+    of_point = information[..., :size, :size]
+    along, prior, pull = _along(objective, point, criterion, of_point, fitted)
+    movable = np.hstack([fitted[:, flight].T, np.ones((segments, states), bool)])
     return FisherInformation(
         channels=channels,
         flight=flight,
-        blocks=np.einsum("lap,clbpq,ldq->clbad", along, information, along, optimize=True),
-        score=np.einsum("lap,clbp->clba", along, score * to_scaled),
+        blocks=np.einsum("lap,clbpq,ldq->clbad", along, of_point, along, optimize=True),
+        score=np.einsum("lap,clbp->clba", along, score[..., :size]),
         spread=spread,
         nuisance_prior=prior,
         prior=np.diag(criterion.prior**2 / space.prior_sd**2),
@@ -362,20 +413,28 @@ def information_at(
         begins=objective.segments.begins,
         scale=scales,
         changes={
-            name: np.einsum("lap,lp->la", along, change * to_scaled)
-            for name, change in changes.items()
+            name: _change(information, score, number, along, movable)
+            for number, name in enumerate(alternatives, size)
         },
         ground=None
         if space.joint_prior is None
         else criterion.prior**2 * space.joint_rows.T @ space.joint_rows,
-        astray=crashed | _astray(objective, jacobian) if closed else None,
+        astray=_astray(objective, jacobian, crashed),
         pull=_pull(space, point, criterion),
         nuisance_pull=pull,
     )
 
 
-def _astray(objective: Objective, jacobian: Jacobian) -> NDArray[np.bool_]:
-    """Return which segments (F,) are `ASTRAY` in some channel; an attitude has no mean."""
+def _astray(
+    objective: Objective, jacobian: Jacobian, crashed: NDArray[np.bool_]
+) -> NDArray[np.bool_] | None:
+    """Return which segments (F,) crashed or are `ASTRAY` in some channel, if the loop is closed.
+
+    An attitude has no mean.
+    """
+    segments = objective.segments
+    if segments.windowed or not isinstance(segments.inlet, ReferenceInlet):
+        return None
     furthest = np.zeros(objective.segments.count)
     for channel, measured in objective.segments.measured.items():
         values, weight = np.asarray(measured.values), np.asarray(measured.weight)
@@ -388,7 +447,7 @@ def _astray(objective: Objective, jacobian: Jacobian) -> NDArray[np.bool_]:
         of_recorded = np.square(np.where(used, values - mean, 0.0) * weight).sum() / own.sum()
         of_residuals = np.square(np.asarray(jacobian.residuals[channel])).sum(axis=(0, 1)) / own
         furthest = np.maximum(furthest, of_residuals / max(of_recorded, 1.0))
-    return np.asarray(furthest > ASTRAY)
+    return np.asarray(crashed | (furthest > ASTRAY))
 
 
 def _along(
@@ -432,6 +491,29 @@ def _pull(space: Space, point: Point, criterion: Criterion) -> Array:
     """Return the slope (K,) of the loss of the priors and of ground measurements."""
     slope = space.prior_rows.T @ space.prior_residuals(point.coefficients)
     return np.asarray(criterion.prior**2 * slope)
+
+
+def _change(
+    information: Array, score: Array, number: int, along: Array, movable: NDArray[np.bool_]
+) -> Change:
+    """Return a change of the residuals, one of the columns, with nuisances at best.
+
+    ``movable`` (F, N) says which of a segment's nuisances move.
+    """
+    size = along.shape[-1]
+    across, score, own = information[..., :size, number], score[..., number], score[..., :size]
+    whole, right = information.sum(axis=(0, 2)), across.sum(axis=(0, 2))
+    follow = np.zeros_like(right)
+    for segment, moves in enumerate(movable):
+        there = size - len(moves) + np.flatnonzero(moves)
+        square = whole[segment][np.ix_(there, there)] + np.eye(len(there)) / OFFSET_SD**2
+        follow[segment, there] = -np.linalg.solve(square, right[segment, there])
+    beside = across + np.einsum("clbpq,lq->clbp", information[..., :size, :size], follow)
+    return Change(
+        np.einsum("lap,clbp->clba", along, beside),
+        information[..., number, number] + np.einsum("clbp,lp->clb", beside + across, follow),
+        score + np.einsum("clbp,lp->clb", own, follow),
+    )
 
 
 def _without_start(whole: Array, kept: int) -> Array:

@@ -13,7 +13,7 @@ from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to 
 from tuner.core.numerics import Z95, Array, Inverse, scaled_inverse, symmetric_eigen
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
-from tuner.objective.information import FisherInformation, information_at
+from tuner.objective.information import Change, FisherInformation, information_at
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import Covariance, IndependentErrors, covariance_of, flight_parts
@@ -388,13 +388,16 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
     """
     inverse = information.inverse
     moved = {
-        name: np.abs(inverse.matrix @ change.sum(axis=0))
+        name: np.abs(inverse.matrix @ change.gradient)
         for name, change in information.changes.items()
     }
     if STEP in moved:
         moved[STEP] = np.hypot(moved[STEP], lags * SIMULATOR_STEP_S / 2.0 / np.sqrt(3.0))
     if LOGGED in moved:
         moved[STEP] = np.hypot(moved[STEP], moved[LOGGED])
+    if MODEL_ERRORS in moved:
+        flew = share_that_flew(information, information.changes[MODEL_ERRORS])
+        moved[MODEL_ERRORS] = moved[MODEL_ERRORS] * flew
     drawn = [moves for name, moves in moved.items() if name.startswith(READINGS)]
     parts = {
         "noise": noise_alone(information),
@@ -408,6 +411,20 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
         "search": np.abs(inverse.matrix @ information.slope),
     }
     return {name: part for name, part in parts.items() if part is not None}
+
+
+def share_that_flew(information: FisherInformation, change: Change) -> float:
+    """Return how much of a change of the simulation the residuals leave room for, at most all.
+
+    That is the root mean square of what its size may be, judged by the residuals, which hold all of
+    what flew that no coefficient takes up. Accelerations and commands show a law each by itself;
+    where a law of theirs is chance, flights that are met as well as noise allows show none.
+    """
+    beside = information.beside(change)
+    if not beside.inverse.known[-1]:
+        return 1.0
+    size = (beside.inverse.matrix @ beside.slope)[-1]
+    return float(min(np.hypot(size, covariance_of(beside).error[-1]), 1.0))
 
 
 def noise_alone(information: FisherInformation) -> Array:

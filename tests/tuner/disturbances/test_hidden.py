@@ -8,7 +8,7 @@ import numpy as np
 
 from tuner.disturbances.disturbances import LEAST, MOST, STRENGTHS
 from tuner.disturbances.predictor import hidden, with_hidden, with_strengths
-from tuner.objective.information import FisherInformation
+from tuner.objective.information import Change, FisherInformation
 from tuner.uncertainty.estimates import _shares
 
 NAMES = ("inertia_xx", "estimate_latency", "motor_constant", "moment_constant")
@@ -67,7 +67,11 @@ def test_how_high_markers_sit_is_told_by_the_loop_alone():
 def test_what_strengths_take_is_taken_from_the_flights_and_shares_still_add_up() -> None:
     """Nothing of it counts as the priors'."""
     random, said = np.random.default_rng(1), looped()
-    across = {name: 5.0 * random.standard_normal((3, len(NAMES))) for name in STRENGTHS}
+    nothing = np.zeros((1, 3, 1))
+    across = {
+        name: Change(5.0 * random.standard_normal((1, 3, 1, len(NAMES))), nothing, nothing)
+        for name in STRENGTHS
+    }
     learnt = with_strengths(
         replace(said, changes=across), 100.0 * np.eye(len(STRENGTHS)), 0.5 * (LEAST + MOST)
     )

@@ -165,7 +165,7 @@ def test_errors_are_those_of_coefficients_and_strengths_that_are_learnt_together
     assert learnt.changes.keys() == fixed.changes.keys()
     alone, together = (np.linalg.inv(found.total) for found in (fixed, learnt))
     free = np.flatnonzero((predictor.strengths > LEAST) & (predictor.strengths < MOST))
-    across = np.array([moving.changes[name].sum(axis=0) for name in NAMED])[free]
+    across = np.array([moving.changes[name].gradient for name in NAMED])[free]
     own = slopes.information[np.ix_(free, free)] + np.eye(len(free)) / USUALLY**2
     both = np.linalg.inv(np.block([[fixed.total, across.T], [across, own]]))
     np.testing.assert_allclose(together, both[: len(FREE), : len(FREE)], rtol=1e-6)
@@ -179,7 +179,7 @@ def test_a_strength_is_taken_for_what_moves_innovations(fitted) -> None:
     problem, predictor, point = fitted
     slopes, criterion = predictor.slopes(problem, point), making.fitted_of(problem, point).criterion
     information = predictor.information(problem, point, criterion, by_strengths=slopes.moved)
-    across = np.array([information.changes[name].sum(axis=0) for name in NAMED])
+    across = np.array([information.changes[name].gradient for name in NAMED])
     free = np.concatenate([np.ones(len(FREE), bool), OFFSETS.ravel()])
     equations = _equations(predictor, problem, point, unscaled(criterion), free)
     hessian = equations.hessian[-len(NAMED) :, : len(FREE)]

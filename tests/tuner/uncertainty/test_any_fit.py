@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tuner.core.numerics import scaled_solve
-from tuner.objective.information import FisherInformation
+from tuner.objective.information import Change, FisherInformation
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.estimates import _shares, left_out, parts_of, total_error
 
@@ -75,7 +75,11 @@ def information_of(fit: Fit) -> FisherInformation:
         begins=np.zeros(flights),
         scale=np.ones((1, flights)),
         lost=shrink if fit.lost else None,
-        changes={"physics step": 1e-3 * score},
+        changes={
+            "physics step": Change(
+                1e-3 * score[None, :, None], np.zeros((1, flights, 1)), np.zeros((1, flights, 1))
+            )
+        },
         pull=prior @ minimum,
         nuisance_pull=np.zeros(size),
     )

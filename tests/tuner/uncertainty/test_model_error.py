@@ -349,8 +349,13 @@ def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
     """Flights of a P that is not the file's, whose set-points and commands were recorded."""
     fitted, flights = flown_with_p(factor)
     model_errors = model_errors_of(fitted, flights)
-    if factor == 1.0:
+    if factor == 1.0:  # another gain than the one that the flights are met with did not fly
         assert model_errors is None
+        found = (ControllerEstimate("roll", "P", 1.06, 0.01, differs=True),)
+        known = examine(fitted, model_errors=ModelErrors((), None, found)).uncertainty.estimates[
+            "inertia_xx"
+        ]
+        assert 0.0 < known.parts.lack < 0.01 * known.value
         return
     known = {(one.axis, one.part): one for one in model_errors.controller_estimates}
     assert {("roll", "P"), ("pitch", "P")} <= set(known)

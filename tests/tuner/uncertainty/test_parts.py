@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tuner.objective.information import FisherInformation
+from tuner.objective.information import Change, FisherInformation
 from tuner.uncertainty.covariance import overdispersion_factors
 from tuner.uncertainty.estimates import (
     READINGS,
@@ -59,6 +59,11 @@ def regression(
         nuisance_pull=np.zeros(COUNT),
     )
     return information, fit
+
+
+def change(across: np.ndarray) -> Change:
+    """Return a change of the residuals that changes the slope of the loss so."""
+    return Change(across[None, None, None], np.zeros((1, 1, 1)), np.zeros((1, 1, 1)))
 
 
 def errors(information: FisherInformation) -> tuple[np.ndarray, np.ndarray]:
@@ -130,7 +135,7 @@ def test_the_quoted_error_holds_every_part():
     total = information.total
     step = np.array([0.3, -0.2, 0.0])
     spread = parts_of(
-        replace(information, changes={"step": (total @ step)[None]}),
+        replace(information, changes={"step": change(total @ step)}),
         np.full(COUNT, 0.01),
         np.zeros(COUNT),
     )
@@ -149,7 +154,7 @@ def test_a_lag_is_known_no_better_than_half_a_simulators_step():
     """Stepped by Euler's rule, a lag acts as if it were shorter by that much, and never by more."""
     information, _ = regression(np.random.default_rng(5), apart=0.0)
     spread = parts_of(
-        replace(information, changes={"step": np.zeros((1, COUNT))}),
+        replace(information, changes={"step": change(np.zeros(COUNT))}),
         np.full(COUNT, 1e-6),
         np.array([1.0, 0.0, 0.0]),
     )
@@ -165,7 +170,7 @@ def test_readings_drawn_again_count_as_far_as_they_scatter_the_estimates():
     total, random, held = information.total, np.random.default_rng(7), []
     for _ in range(400):
         moves = random.normal(size=(VOLTMETER_DRAWS + 1, COUNT))
-        changes = {f"{READINGS} {i}": (total @ moves[i])[None] for i in range(VOLTMETER_DRAWS)}
+        changes = {f"{READINGS} {i}": change(total @ moves[i]) for i in range(VOLTMETER_DRAWS)}
         spread = parts_of(
             replace(information, changes=changes), np.full(COUNT, 1e-9), np.zeros(COUNT)
         )
