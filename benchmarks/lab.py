@@ -42,6 +42,7 @@ from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import refit_and_examine
 from tuner.terms.search_with_terms import search_with_terms
+from tuner.uncertainty.agreement import flights_disagree
 from tuner.uncertainty.estimates import Estimate, Uncertainty, term_findings
 from tuner.uncertainty.model_error import model_error_findings
 from tuner.vehicle import COEFFICIENTS, values_of
@@ -293,6 +294,7 @@ def trial_of(seed: int) -> Trial:
         *fitted.findings,
         *explanation.findings,
         *model_error_findings(examination.model_errors, examination.uncertainty),
+        *flights_disagree(fitted, examination),
         *term_findings(fitted, examination.uncertainty),
     )
     trial = Trial(lab, found, free, {}, seconds, reference, said)

@@ -111,7 +111,8 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "intervals hold that, and which terms are of that kind.",
     Code.CONTROLLER_ANSWERS: "Recorded commands follow from rate set-points and gyro with another "
     "P or I than the controller file's, or later or earlier than its filters and D let them. "
-    "Compare it with the autopilot's parameters; intervals hold what the difference moves.",
+    "Compare it with the autopilot's parameters; intervals hold what the difference moves. Where "
+    "one flight alone has another P, the line names it: leave it out.",
     Code.ROTOR_SPEEDS_LATE: "Recorded rotor speeds come after the turning that they make, or "
     "before it: they were filtered, or are stamped otherwise than the gyro. Intervals hold what "
     "that moves.",
@@ -134,6 +135,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "less far ahead, or with more recorded.",
     Code.DISTURBANCES_FOLLOWED: "The residuals hold more than noise, as gusts leave it, and a "
     "Kalman filter estimates the disturbances. Nothing to do.",
+    Code.FLIGHTS_DISAGREE: "Some flights call for another value of a coefficient than the others, "
+    "by more than chance; the line says which and by how much. Fit them by themselves: their "
+    "vehicle, payload, propellers, battery or gains may differ.",
     Code.FLIGHT_UNMATCHED: "The simulation does not match this flight, and its weight in the fit "
     "was lowered accordingly. Leave it out: its vehicle, payload, controller, clock or wind may be "
     "others.",

@@ -58,7 +58,7 @@ class ControllerEstimate(NamedTuple):
 
     ``part`` is of `PARTS`; ``value`` the gain over the file's, or s by which an axis answers its
     gyro later than the file's filters and D let it; ``sd`` its standard error; ``differs`` whether
-    they differ by more than chance.
+    they differ by more than chance; ``flight`` the one that alone has that gain.
     """
 
     axis: str
@@ -66,6 +66,7 @@ class ControllerEstimate(NamedTuple):
     value: float
     sd: float
     differs: bool
+    flight: str = ""
 
 
 def estimate_controller(
@@ -92,6 +93,46 @@ def estimate_controller(
         for name, parts in zip(AXES, known, strict=True)
         for part, one in parts.items()
     )
+
+
+def others_gains(recorded: Sequence[Signals], simulated: Sequence[Signals]) -> tuple[int, ...]:
+    """Return the flights, of three or more, whose P is none that the others have.
+
+    Parameters are those of `estimate_controller`.
+    """
+    odd, rest = list[int](), list(range(len(recorded)))
+    while len(rest) > 2:
+        apart = {
+            number: max(_apart(recorded, simulated, number, rest, axis) for axis in range(3))
+            for number in rest
+        }
+        furthest = max(apart, key=lambda number: apart[number])
+        if not apart[furthest]:
+            break
+        odd.append(furthest)
+        rest.remove(furthest)
+    return tuple(sorted(odd))
+
+
+def _apart(
+    recorded: Sequence[Signals],
+    simulated: Sequence[Signals],
+    number: int,
+    rest: Sequence[int],
+    axis: int,
+) -> float:
+    """Return by how many standard errors a flight's P is off the others'; zero for chance."""
+    others = [other for other in rest if other != number]
+    own, all_others = (
+        _of_axis([recorded[i] for i in some], [simulated[i] for i in some], axis).get("P")
+        for some in ([number], others)
+    )
+    if own is None or all_others is None:
+        return 0.0
+    sd, off = float(np.hypot(own.sd, all_others.sd)), abs(own.value - all_others.value)
+    compared = own._replace(neutral=all_others.value, sd=sd)
+    sure = off > SMALLEST["P"] and compared.is_sure(LEVEL / (len(AXES) * len(rest)))
+    return off / sd if sure else 0.0
 
 
 class _Part(NamedTuple):

@@ -343,7 +343,7 @@ class Code(Worded):
     CONTROLLER_ANSWERS = (
         "controller_answers",  # AXIS, AXIS_error; names: P, I or late, the AXES
         sentences.controller_gains_differ,
-        "Compare the controller file with the autopilot's parameters, as they are now.",
+        sentences.controller_remedy,
     )
     ROTOR_SPEEDS_LATE = (
         "rotor_speeds_late",  # seconds
@@ -372,6 +372,11 @@ class Code(Worded):
         "gyro_offset",  # rate (rad/s); names: the axis
         "The {first} reads {rate:+.4f} rad/s at rest, which the fit takes into account.",
         "",
+    )
+    FLIGHTS_DISAGREE = (
+        "flights_disagree",  # difference, error (shares); names: the coefficient
+        sentences.flights_disagree,
+        "Fit them by themselves: their vehicle, payload, propellers, battery or gains may differ.",
     )
     FLIGHT_UNMATCHED = (
         "flight_unmatched",  # channel -> multiple of the noise

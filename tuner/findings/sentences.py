@@ -55,6 +55,10 @@ def recording(finding: Finding) -> str:
     return f"{topic}: {text}." if topic else as_sentence(text)
 
 
+CONTROLLER_FILE = "controller file"
+"""Subject of what all flights say of the rate controller; one flight's has that one's name."""
+
+
 def left_out(finding: Finding) -> str:
     """Return why a flight is left out; it is the subject of a clause without one."""
     what = finding.names[0]
@@ -255,9 +259,17 @@ def controller_gains_differ(finding: Finding) -> str:
     else:
         parts = [f"{axis} reacts as if its {part} were {_excess(numbers, axis)}" for axis in axes]
         than = "than in the controller file"
-    return as_sentence(
-        f"{listed(parts)} {than}, by the recorded commands; intervals hold what that moves"
-    )
+    said = f"{listed(parts)} {than}, by the recorded commands"
+    if finding.subject != CONTROLLER_FILE:
+        return as_sentence(f"{said}, and the other flights do not")
+    return as_sentence(f"{said}; intervals hold what that moves")
+
+
+def controller_remedy(finding: Finding) -> str:
+    """Return what to compare, or to leave out."""
+    if finding.subject != CONTROLLER_FILE:
+        return "Leave it out, or fit it by itself with the gains that flew."
+    return "Compare the controller file with the autopilot's parameters, as they are now."
 
 
 def rotor_speeds_late(finding: Finding) -> str:
@@ -380,6 +392,16 @@ _TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
     "tachometer_lag": (_tachometer_lag, "Log both unfiltered, by one clock."),
 }
 """Group of terms -> its sentence, and the remedy."""
+
+
+def flights_disagree(finding: Finding) -> str:
+    """Return by how much another value of a coefficient some flights call for."""
+    difference, (name,) = finding.numbers["difference"], finding.names
+    return (
+        f"Flights disagree: these call for a {name} that is {100.0 * abs(difference):.2g} ± "
+        f"{100.0 * finding.numbers['error']:.1g} % {'higher' if difference > 0.0 else 'lower'} "
+        "than the others'."
+    )
 
 
 def flight_unmatched(finding: Finding) -> str:

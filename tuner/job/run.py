@@ -60,6 +60,7 @@ from tuner.search.rotor_change import cut_at_rotor_changes
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import ExaminedFit, refit_and_examine
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
+from tuner.uncertainty.agreement import flights_disagree
 from tuner.uncertainty.estimates import (
     FLIGHTS_REFUTE,
     finer_than_steps,
@@ -295,6 +296,7 @@ def _known(
     explanation.notice(flights_refute(uncertainty))
     explanation.notice(finer_than_steps(uncertainty))
     explanation.notice(model_error_findings(examination.model_errors, uncertainty))
+    explanation.notice(flights_disagree(fitted, examination))
     explanation.notice(term_findings(fitted, uncertainty))
     sources: dict[str, Sources] = explanation.part(
         "ground measurements", partial(sources_of, fitted, uncertainty, known), {}

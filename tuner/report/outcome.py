@@ -55,6 +55,7 @@ DOUBT_CODES = CONFLICT_CODES | frozenset(
     {
         Code.MODEL_UNMATCHED,
         Code.FLIGHT_UNMATCHED,
+        Code.FLIGHTS_DISAGREE,
         Code.FLIGHT_WORSE,
         Code.FLIGHT_NOT_FLOWN,
         Code.LAW_LACKING,

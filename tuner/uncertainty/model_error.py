@@ -35,9 +35,11 @@ from tuner.equation_error.rate_controller import (
     ControllerEstimate,
     Signals,
     estimate_controller,
+    others_gains,
 )
 from tuner.equation_error.recorded_accelerations import MIN_SAMPLES, Mask, Steps, steps_of
 from tuner.findings.findings import Code, Finding
+from tuner.findings.sentences import CONTROLLER_FILE
 from tuner.objective.battery import log_voltage_of, read_again
 from tuner.objective.criterion import Point
 from tuner.objective.inlets import zero_order_hold
@@ -87,7 +89,8 @@ class ModelErrors:
     disturbance
         Their forces and moments in every segment; None for no laws.
     controller_estimates
-        Gains and latencies of the rate controller that differ from the file's.
+        Gains and latencies of the rate controller that differ from the file's, of all flights or
+        of one.
     speed_lag
         s by which recorded rotor speeds lag behind the turning that they cause; 0 for none.
     gains
@@ -113,7 +116,8 @@ class ModelErrors:
         segments, model = objective.segments, objective.model
         rate = model.controller.rate
         for estimate in self.controller_estimates:
-            rate = _with_gain(rate, estimate)
+            if not estimate.flight:
+                rate = _with_gain(rate, estimate)
         pushed = replace(
             objective,
             segments=replace(segments, disturbance=self.disturbance),
@@ -214,7 +218,11 @@ def gain_by_commands(
 
     None where one of its axes has no estimate.
     """
-    those = [one for one in controller_estimates if one.part == "P" and one.axis in GAIN_AXES[name]]
+    those = [
+        one
+        for one in controller_estimates
+        if one.part == "P" and one.axis in GAIN_AXES[name] and not one.flight
+    ]
     if len(those) < len(GAIN_AXES[name]):
         return None
     weights = np.array([one.sd**-2.0 for one in those])
@@ -359,12 +367,16 @@ def gains_far_off(fitted: Fitted, flights: Sequence[Flight]) -> tuple[Finding, .
 
 
 def _controller_findings(controller_estimates: Sequence[ControllerEstimate]) -> tuple[Finding, ...]:
-    parts = {part: [one for one in controller_estimates if one.part == part] for part in PARTS}
+    kinds = dict.fromkeys((one.flight, part) for part in PARTS for one in controller_estimates)
+    alike = {
+        kind: [one for one in controller_estimates if (one.flight, one.part) == kind]
+        for kind in kinds
+    }
     return tuple(
         Finding(
             Code.CONTROLLER_ANSWERS,
             "warning",
-            "controller file",
+            flight or CONTROLLER_FILE,
             {
                 name: number
                 for one in those
@@ -372,7 +384,7 @@ def _controller_findings(controller_estimates: Sequence[ControllerEstimate]) -> 
             },
             (part, *(one.axis for one in those)),
         )
-        for part, those in parts.items()
+        for (flight, part), those in alike.items()
         if those
     )
 
@@ -400,9 +412,10 @@ def _controller_estimates(
 ) -> tuple[ControllerEstimate, ...]:
     """Return the estimates of recorded rate controllers relative to those of the fit.
 
-    ``usable`` (F,) are the flights to use.
+    ``usable`` (F,) are the flights to use. A flight with another P than the others' is estimated
+    by itself.
     """
-    recorded, simulated = [], []
+    names, recorded, simulated = [], [], []
     for number, flight in enumerate(flights):
         series = flight.series
         known = set(LOOP_SIGNALS) <= set(series)
@@ -416,6 +429,7 @@ def _controller_estimates(
         ):
             continue
         even = np.linspace(time[0], time[-1], len(time))
+        names.append(flight.name)
         recorded.append(_signals([series[name] for name in LOOP_SIGNALS], mixer, even))
         made = []
         for name, channel in zip(LOOP_SIGNALS, (SETPOINTS, "body_rate", "command"), strict=True):
@@ -426,7 +440,22 @@ def _controller_estimates(
             read = _interpolated if name == "body_rate" else zero_order_hold
             made.append(Series(stamps, read(there, stamps)))
         simulated.append(_signals(made, mixer, even))
-    return estimate_controller(recorded, simulated) if recorded else ()
+    if not recorded:
+        return ()
+    odd = others_gains(recorded, simulated)
+    rest = [number for number in range(len(recorded)) if number not in odd]
+    alike = estimate_controller(
+        [recorded[number] for number in rest], [simulated[number] for number in rest]
+    )
+    return (
+        *alike,
+        *(
+            answer._replace(flight=names[number])
+            for number in odd
+            for answer in estimate_controller([recorded[number]], [simulated[number]])
+            if answer.part == "P"
+        ),
+    )
 
 
 def _signals(parts: Sequence[Series], mixer: MixerSettings, time: Array) -> Signals:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from tuner.equation_error.rate_controller import AXES, Signals, estimate_controller
+from tuner.equation_error.rate_controller import AXES, Signals, estimate_controller, others_gains
 
 RATE, SECONDS = 100.0, 40.0
 P_GAIN, I_GAIN, D_GAIN = 0.15, 0.2, 0.003
@@ -67,6 +67,23 @@ def test_a_slower_filter_is_told_of_roll_and_pitch_together():
 
 def test_the_file_that_flew_is_not_doubted():
     assert sum(bool(told(seed)) for seed in range(60)) <= 1
+
+
+def four_flights(seed, p):
+    """Return four recorded flights, of which the third has another P, and the simulated ones."""
+    random = np.random.default_rng(seed)
+    gains = [P_GAIN, P_GAIN, p, P_GAIN]
+    return [flight(random, p=p, gusts=0.2, noise=0.01) for p in gains], 4 * [flight(random)]
+
+
+def test_one_flight_of_another_p_is_told_from_the_others():
+    assert others_gains(*four_flights(0, 0.6 * P_GAIN)) == (2,)
+
+
+def test_flights_of_the_same_gains_are_not_told_apart():
+    assert not any(others_gains(*four_flights(seed, P_GAIN)) for seed in range(40))
+    two = [part[1:3] for part in four_flights(0, 0.6 * P_GAIN)]
+    assert others_gains(*two) == ()  # nothing says which of them is the other one
 
 
 def test_what_a_gyro_reads_at_rest_is_not_what_the_loop_integrated():

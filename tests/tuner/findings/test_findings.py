@@ -208,6 +208,13 @@ MADE = {
         {"seconds": 22.0, "rotor": 1, "loss": 0.05},
         ("front right",),
     ),
+    Code.FLIGHTS_DISAGREE: Finding(
+        Code.FLIGHTS_DISAGREE,
+        "warning",
+        "a, b",
+        {"difference": -0.019, "error": 0.0006},
+        ("motor_constant",),
+    ),
     Code.FLIGHT_UNMATCHED: Finding(
         Code.FLIGHT_UNMATCHED, "warning", "a", {"position": 90.0, "body_rate": 12.0}
     ),

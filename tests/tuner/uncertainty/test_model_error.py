@@ -344,6 +344,17 @@ def test_odd_flights_say_nothing_of_the_controller_or_the_model(monkeypatch):
     assert model_errors_of(fitted, flights) is None
 
 
+def test_one_flight_of_another_p_is_named_and_moves_no_gain_of_the_others():
+    (fitted, flights), (_, others) = flown_with_p(1.0), flown_with_p(0.6)
+    found = model_errors_of(fitted, [*flights[:2], others[2]])
+    assert {(one.flight, one.part) for one in found.controller_estimates} == {(others[2].name, "P")}
+    said = model_error_findings(found, examine(fitted).uncertainty)
+    assert [one.subject for one in said] == [others[2].name]
+    assert said[0].numbers["roll"] == pytest.approx(0.6, abs=0.05)
+    gains = found.applied_to(fitted.objective).model.controller.rate.p
+    assert gains == fitted.objective.model.controller.rate.p
+
+
 @pytest.mark.parametrize("factor", [1.0, 1.06])
 def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
     """Flights of a P that is not the file's, whose set-points and commands were recorded."""

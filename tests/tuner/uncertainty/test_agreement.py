@@ -1,0 +1,86 @@
+"""Flights of two vehicles are told from flights of one, in linear models of known answers."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tuner.equation_error.rate_controller import ControllerEstimate
+from tuner.findings.findings import Code, Finding
+from tuner.objective.information import FisherInformation
+from tuner.uncertainty.agreement import flights_disagree
+from tuner.uncertainty.model_error import ModelErrors
+
+COUNT, FLIGHTS, BLOCKS, LENGTH = 3, 4, 9, 50
+NAMES = ("inertia_xx", "motor_constant", "moment_constant")
+
+
+def fit_of(seed: int, difference: float, *, memory: int = 1) -> tuple[SimpleNamespace, ...]:
+    """Return a fit and its examination; b and d have another motor constant by a difference.
+
+    Each error lasts for ``memory`` samples.
+    """
+    random = np.random.default_rng(seed)
+    design = random.normal(size=(FLIGHTS, BLOCKS * LENGTH, COUNT))
+    own = np.zeros((FLIGHTS, COUNT))
+    own[1::2, 1] = difference
+    noise = random.normal(size=(FLIGHTS, BLOCKS * LENGTH // memory)).repeat(memory, axis=1)
+    measured = np.einsum("fnp,fp->fn", design, own) + 0.1 * noise
+    fit, *_ = np.linalg.lstsq(design.reshape(-1, COUNT), measured.ravel())
+    left = (design @ fit - measured).reshape(FLIGHTS, BLOCKS, LENGTH) / 0.1
+    rows = design.reshape(FLIGHTS, BLOCKS, LENGTH, COUNT) / 0.1
+    information = FisherInformation(
+        channels=("only",),
+        flight=np.arange(FLIGHTS),
+        blocks=np.einsum("fbnp,fbnq->fbpq", rows, rows)[None],
+        score=np.einsum("fbnp,fbn->fbp", rows, left)[None],
+        spread=np.mean(left**2, axis=(1, 2))[None],
+        nuisance_prior=np.zeros((COUNT, COUNT)),
+        prior=1e-9 * np.eye(COUNT),
+        crashed=np.zeros(FLIGHTS, bool),
+        begins=np.zeros(FLIGHTS),
+        scale=np.ones((1, FLIGHTS)),
+        pull=1e-9 * fit,
+        nuisance_pull=np.zeros(COUNT),
+    )
+    uncertainty = SimpleNamespace(names=NAMES, flights=tuple("abcd"), reference=np.ones(COUNT))
+    examination = SimpleNamespace(
+        uncertainty=uncertainty, information=information, model_errors=None
+    )
+    return SimpleNamespace(findings=(), held={}), examination
+
+
+def test_flights_of_another_vehicle_are_named_with_what_differs():
+    (found,) = flights_disagree(*fit_of(0, 0.1))
+    assert (found.subject, found.names) in (("a, c", NAMES[1:2]), ("b, d", NAMES[1:2]))
+    sign = 1.0 if found.subject == "b, d" else -1.0
+    assert sign * found.numbers["difference"] == pytest.approx(
+        0.1, abs=4.0 * found.numbers["error"]
+    )
+    assert found.numbers["error"] < 0.01
+
+
+@pytest.mark.parametrize("memory", [1, 10])
+def test_flights_of_one_vehicle_agree(memory):
+    assert not any(flights_disagree(*fit_of(seed, 0.0, memory=memory)) for seed in range(100))
+
+
+def test_a_difference_that_does_not_matter_is_not_said():
+    fitted, examination = fit_of(0, 0.1)
+    examination.uncertainty.reference[:] = 20.0
+    assert not flights_disagree(fitted, examination)
+
+
+def test_what_is_held_and_flights_that_are_told_already_are_left():
+    fitted, examination = fit_of(0, 0.1)
+    fitted.held["motor_constant"] = "motor_constant"
+    assert not flights_disagree(fitted, examination)
+    fitted, examination = fit_of(0, 0.1)
+    fitted.findings = (Finding(Code.FLIGHT_UNMATCHED, "warning", "a", {"position": 20.0}),)
+    assert not flights_disagree(fitted, examination)
+    fitted.findings = ()
+    gain = ControllerEstimate("roll", "P", 0.6, 0.01, differs=True, flight="a")
+    examination.model_errors = ModelErrors((), None, (gain,))
+    assert not flights_disagree(fitted, examination)
