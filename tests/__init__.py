@@ -17,7 +17,7 @@ import os
 from beartype import BeartypeConf, beartype
 
 from tuner.core.disk import cache_folder
-from tuner.core.runtime import set_environment
+from tuner.core.runtime import collect_rarely, set_environment
 
 checked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int passes for a float
 
@@ -37,3 +37,4 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "compile
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 set_environment()
+collect_rarely()  # before jax is imported, a million objects that stay

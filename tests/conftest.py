@@ -25,11 +25,10 @@ from tests import memory
 from tests.demo import demo
 from tests.memory import MOST_IN_A_MODULE, MOST_MEMORY
 from tuner.core.disk import cache_folder
-from tuner.core.runtime import collect_rarely, keep_memory
+from tuner.core.runtime import keep_memory
 
 __all__ = ["demo"]
 
-collect_rarely()
 keep_memory()
 threadpool_limits(1, user_api="blas")
 KERNELS = cache_folder() / "kernels"

@@ -1,8 +1,10 @@
 """Arguments in, exit status out; no logic."""
 
 from tuner.cli.app import main, program
-from tuner.core.runtime import set_environment
+from tuner.core.runtime import collect_rarely, set_environment
 
-set_environment()  # before a command imports NumPy
+# before a command imports NumPy, and many other objects that stay
+set_environment()
+collect_rarely()
 
 __all__ = ["main", "program"]
