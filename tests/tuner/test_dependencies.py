@@ -5,6 +5,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,7 @@ def modules(tree: ast.AST, *, by_name: bool = True) -> Iterator[str]:
                 yield module
 
 
+@cache
 def imported(*folders: str) -> set[str]:
     packages = {
         module.split(".")[0]
