@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,8 +85,13 @@ def stretches_of(
 
 def low_pass(values: Array, step: float, cutoff: float = CUTOFF_HZ) -> Array:
     """Return (n, k) values, low-passed without delay at a cutoff in Hz."""
-    sections = signal.butter(2, cutoff, fs=1.0 / step, output="sos")
-    return np.asarray(signal.sosfiltfilt(sections, values, axis=0))
+    return np.asarray(signal.sosfiltfilt(_sections(step, cutoff), values, axis=0))
+
+
+@cache
+def _sections(step: float, cutoff: float) -> Array:
+    """Return second-order sections of a Butterworth filter, which a search asks for repeatedly."""
+    return np.asarray(signal.butter(2, cutoff, fs=1.0 / step, output="sos"))
 
 
 def blocks_of(stretches: tuple[Stretch, ...], order: int) -> NDArray[np.int64]:
