@@ -66,12 +66,12 @@ def test_the_batch_holds_a_crash_and_flights(batch: Rollout) -> None:
 
 def test_neighbours_change_nothing(batch: Rollout) -> None:
     for index, target in enumerate(TARGETS):
-        single = compiled(jnp.asarray([target]), limits=LIMITS)
-        for got, want in zip(jax.tree.leaves(single), jax.tree.leaves(batch), strict=True):
+        alike = compiled(jnp.asarray([target] * len(TARGETS)), limits=LIMITS)
+        for got, want in zip(jax.tree.leaves(alike), jax.tree.leaves(batch), strict=True):
             np.testing.assert_allclose(got[..., 0], want[..., index], rtol=1e-9, atol=1e-9)
 
 
-def test_vmap_gives_the_same(batch: Rollout) -> None:
+def test_vmap_of_one_alone_gives_the_same(batch: Rollout) -> None:
     mapped = eqx.filter_jit(jax.vmap(lambda x: fly(x[None], limits=LIMITS)))
     flown = mapped(jnp.asarray(TARGETS))
     for got, want in zip(jax.tree.leaves(flown), jax.tree.leaves(batch), strict=True):
@@ -90,11 +90,12 @@ def test_a_crashed_vehicle_stays_where_it_crashed(batch: Rollout) -> None:
 
 @pytest.mark.parametrize("log_rate", [50, 400])
 def test_logging_more_or_less_often_changes_nothing(log_rate: int) -> None:
-    usual = compiled(jnp.asarray([0.5]), limits=LIMITS).log
+    target = jnp.asarray([0.5] * len(TARGETS))
+    usual = compiled(target, limits=LIMITS).log
     schedule = Schedule(
         log_rate=log_rate, longest_estimate_latency=0.03, longest_actuator_latency=0.01
     )
-    other = compiled(jnp.asarray([0.5]), schedule, limits=LIMITS).log
+    other = compiled(target, schedule, limits=LIMITS).log
     ours, theirs = max(1, 100 // log_rate), max(1, log_rate // 100)
     for got, want in zip(jax.tree.leaves(other), jax.tree.leaves(usual), strict=True):
         rows = min(len(got[::theirs]), len(want[::ours]))
