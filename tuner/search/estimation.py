@@ -30,7 +30,7 @@ from tuner.recordings.content import ReadOptions
 from tuner.recordings.flight import Flight
 from tuner.recordings.loader import reading_key
 from tuner.search.continuation import Undecided, run_stages
-from tuner.search.findings import findings_at, unmatched
+from tuner.search.findings import unmatched, with_end_findings
 from tuner.search.iteration import Iteration, Outcome
 from tuner.search.levenberg_marquardt import MIN_DAMPING
 from tuner.search.problem import Job
@@ -282,7 +282,7 @@ def _attempt(
         wall_time=seconds,
         polished=progress.stage == len(stages),
     )
-    return replace(fitted, findings=(*findings, *findings_at(job, fitted)))
+    return with_end_findings(job, replace(fitted, findings=findings))
 
 
 def _end(job: Job, objective: Objective, stage: Stage, progress: Progress) -> dict[str, Any]:
@@ -470,4 +470,5 @@ def _run_again(
     progress = run_stages(
         fitted.objective, stages, progress, free=free, undecided=undecided, on_progress=on_progress
     )
-    return replace(fitted, **_end(job, fitted.objective, stages[-1], progress), polished=True)
+    end = _end(job, fitted.objective, stages[-1], progress)
+    return with_end_findings(job, replace(fitted, **end, polished=True))

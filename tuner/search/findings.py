@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -50,6 +51,25 @@ def outlying_flights(scales: Scales) -> frozenset[str]:
     lost = unmatched(scales)
     others = [max(channels.values()) for name, channels in scales.items() if name not in lost]
     return frozenset(lost if len(lost) < len(others) and max(others) < COLOURED_RATIO else ())
+
+
+END_CODES = frozenset(
+    {
+        Code.SATURATION_FEEDBACK,
+        Code.SEES_MARKERS,
+        Code.FLIGHT_UNMATCHED,
+        Code.MODEL_UNMATCHED,
+        Code.CLOCK_OFFSET,
+        Code.GYRO_OFFSET,
+    }
+)
+"""Codes of findings that hold for one end of a search, and not for the next."""
+
+
+def with_end_findings(job: Job, fitted: Fitted) -> Fitted:
+    """Return a fit with the findings at its end instead of those of the fits before it."""
+    others = [finding for finding in fitted.findings if finding.code not in END_CODES]
+    return replace(fitted, findings=(*others, *findings_at(job, fitted)))
 
 
 def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:

@@ -9,11 +9,9 @@ import numpy as np
 
 from sim_jax.numeric import Array
 from tuner.config import JobFile
-from tuner.findings.findings import Finding
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.objective.space import Space, extended
-from tuner.search.findings import findings_at
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, loop_of, with_loop
 from tuner.terms.score import ACCEPTED
@@ -165,7 +163,6 @@ def with_groups(
     groups: Groups,
     fitted: Fitted,
     *,
-    stale: Collection[Finding],
     vector: Mapping[str, float] | None = None,
 ) -> tuple[Job, Fitted]:
     """Return a base job with some groups added, and its fit at the values of another fit.
@@ -178,8 +175,6 @@ def with_groups(
         The groups to add.
     fitted
         The fit whose values are taken.
-    stale
-        Findings of ``fitted`` to replace: those about its coefficients.
     vector
         Coefficient -> value in the search vector; that of ``fitted`` by default.
     """
@@ -193,8 +188,7 @@ def with_groups(
             offsets_of(fitted, grown.objective),
         ),
     )
-    others = [finding for finding in fitted.findings if finding not in stale]
-    return job, replace(moved, findings=(*others, *findings_at(job, moved)))
+    return job, moved
 
 
 def offsets_of(fitted: Fitted, objective: Objective, *, reset: Collection[str] = ()) -> Array:

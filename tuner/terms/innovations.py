@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from tuner.disturbances.predictor import Predictor, hidden
 from tuner.objective.information import begun
 from tuner.objective.space import Space
-from tuner.search.findings import findings_at
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import (
@@ -223,8 +222,7 @@ class LinearisedInnovations:
         rows.sort(key=lambda row: not row.kept)
         groups = {row.group: row.names for row in rows if row.kept and row.reason in ACCEPTED}
         vector = dict(zip(self.space.names, moved.tolist(), strict=True))
-        stale = findings_at(self.selected.job, self.selected.fitted)
-        job, fitted = with_groups(base, groups, self.fitted, stale=stale, vector=vector)
+        job, fitted = with_groups(base, groups, self.fitted, vector=vector)
         return replace(self.selected, job=job, fitted=fitted, rows=tuple(rows))
 
     def _tried(self) -> dict[str, tuple[str, ...]]:

@@ -31,7 +31,6 @@ from tuner.search.estimation import (
     polished,
     search_again,
 )
-from tuner.search.findings import findings_at
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress, loop_of, with_loop
 from tuner.terms.candidates import (
@@ -100,7 +99,7 @@ class Selection:
         doubt = self._selection_shifts(state, selected.left_out)
         if state.added:
             fitted = self._fitted(state, state.added, roughly=False)
-            job, fitted = with_groups(base, state.added, fitted, stale=findings_at(*base))
+            job, fitted = with_groups(base, state.added, fitted)
             selected = replace(selected, job=job, fitted=fitted)
         return replace(selected, selection_shifts=doubt)
 

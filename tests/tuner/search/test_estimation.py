@@ -10,10 +10,10 @@ import pytest
 from tests.tuner.uncertainty.making import fitted_of, problem, truth
 from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import Search
-from tuner.findings.findings import Code, sentence
+from tuner.findings.findings import Code, Finding, sentence
 from tuner.objective.space import space_of
 from tuner.search import estimation as module
-from tuner.search.estimation import fingerprint, starting_vectors
+from tuner.search.estimation import fingerprint, polished, starting_vectors
 from tuner.search.findings import (
     end_findings,
     outlying_flights,
@@ -21,7 +21,7 @@ from tuner.search.findings import (
     unmatched,
 )
 from tuner.search.iteration import Outcome
-from tuner.search.progress import Loop
+from tuner.search.progress import Free, Loop
 from tuner.search.stages import plan, remaining_seconds
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.vehicle import ControllerFile
@@ -81,6 +81,24 @@ def test_flights_that_stay_far_off_ask_for_a_second_opinion(fitted, updated):
 
 def ends(*losses):
     return tuple(Outcome(origin="random", loss=loss, start={}, end={}) for loss in losses)
+
+
+def test_findings_are_those_of_the_last_polish(fitted, updated, monkeypatch):
+    """A flight that a term was missing for is matched with it, and the warning goes."""
+    job = job_with(updated)
+    job.settings.controller = ControllerFile()
+    job.fitted = [SimpleNamespace(name=name) for name in fitted.scales]
+    missed = Finding(Code.FLIGHT_UNMATCHED, "warning", "spin", {"position": 30.0})
+    doubt = Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": 3})
+    monkeypatch.setattr(module, "run_stages", lambda _, __, progress, **___: progress)
+    free = Free(np.ones(len(FREE), bool), np.ones(np.shape(fitted.point.offsets), bool))
+    matched = replace(fitted, findings=(missed, doubt))
+    again = polished(job, matched, free=free, title="again", on_progress=lambda _: None)
+    assert again.findings == (doubt,)
+    scales = {**fitted.scales, "spin": dict.fromkeys(fitted.scales["spin"], 30.0)}
+    lost = replace(matched, scales=scales)
+    again = polished(job, lost, free=free, title="again", on_progress=lambda _: None)
+    assert [finding.code for finding in again.findings] == [doubt.code, Code.MODEL_UNMATCHED]
 
 
 def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():

@@ -111,7 +111,6 @@ def chosen(monkeypatch: pytest.MonkeyPatch):
         return NOBODY, fitted
 
     monkeypatch.setattr(innovations, "with_groups", with_groups)
-    monkeypatch.setattr(innovations, "findings_at", lambda *_: ())
 
     def choose(
         innovation: LinearisedInnovations,

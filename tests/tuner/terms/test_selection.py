@@ -164,7 +164,6 @@ def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
     monkeypatch.setattr(own, "_with_added", lambda *_: standing)
     monkeypatch.setattr(own, "_rows", lambda *_: ())
     monkeypatch.setattr(own, "_selection_shifts", lambda *_: {})
-    monkeypatch.setattr(selection, "findings_at", lambda *_: ())
     monkeypatch.setattr(selection, "with_groups", lambda base, *_, **__: base)
     groups = {"fuselage_drag": ("fuselage_drag",)}
     own(SimpleNamespace(), fitted, groups, print, print).run()
