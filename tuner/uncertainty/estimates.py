@@ -332,13 +332,18 @@ REPORTED_TERMS = (
 
 
 def term_findings(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Return the findings on reported terms that differ significantly from neutral."""
+    """Return the findings on reported terms that differ significantly from neutral.
+
+    Each names those coefficients of its group that the flights identify.
+    """
     findings = []
     for group in REPORTED_TERMS:
         known = {
-            name: uncertainty.estimates[name]
+            name: estimate
             for name in term_groups()[group]
-            if name in uncertainty.estimates and name not in fitted.held
+            if name not in fitted.held
+            and (estimate := uncertainty.estimates.get(name)) is not None
+            and estimate.identifiable
         }
         neutral = {name: COEFFICIENTS[name].neutral or 0.0 for name in known}
         if any(not e.ci95[0] <= neutral[name] <= e.ci95[1] for name, e in known.items()):

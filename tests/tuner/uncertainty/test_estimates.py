@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.information import information_at
 from tuner.objective.normal_equations import Objective, normal_equations
-from tuner.uncertainty.estimates import Uncertainty, _lags, uncertainty_of
+from tuner.uncertainty.estimates import Uncertainty, _lags, term_findings, uncertainty_of
 from tuner.uncertainty.verdict import Verdict
 
 FREE = (
@@ -151,3 +153,15 @@ def test_a_rotor_and_what_delays_its_command_are_lags_the_estimate_of_the_state_
     assert by_name["time_constant_up"] == pytest.approx(1.0 / float(moved["time_constant_up"]))
     assert by_name["actuator_latency"] == 1.0
     assert by_name["estimate_latency"] == by_name["inertia_xx"] == 0.0
+
+
+def test_terms_that_flights_do_not_identify_have_no_number_in_findings():
+    """Its error may be any: 2e9 was."""
+    known = SimpleNamespace(value=1.02, std_error=0.001, ci95=(1.018, 1.022), identifiable=True)
+    unknown = SimpleNamespace(value=1.3, std_error=2e9, ci95=(1.1, 2.0), identifiable=False)
+    estimates = {"gyro_scale_x": known, "gyro_scale_y": known, "gyro_scale_z": unknown}
+    fitted = SimpleNamespace(held={"gyro_scale_y": "gyro_scale_y"})
+    (found,) = term_findings(fitted, SimpleNamespace(estimates=estimates))
+    assert found.names == ("gyro_scale_x",)
+    assert found.numbers == {"gyro_scale_x": 1.02, "gyro_scale_x_error": 0.001}
+    assert not term_findings(fitted, SimpleNamespace(estimates={"gyro_scale_z": unknown}))
