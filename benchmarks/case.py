@@ -30,7 +30,7 @@ from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rigid_body import Motion
-from sim_jax.rollout import begun, rollout
+from sim_jax.rollout import rollout, start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.state import State, hover
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
@@ -190,7 +190,7 @@ def _points(samples: int) -> Any:
 
 def _flown(given: _Given, lengths: Mapping[str, int]) -> Motion:
     factor = given.factor * given.shared
-    plant, first = begun(*_arguments(factor, given.points), precision=factor.dtype.name)
+    plant, first = start_simulation(*_arguments(factor, given.points), precision=factor.dtype.name)
 
     def sample(state: State, number: Array) -> tuple[State, Motion]:
         after, row = plant.sample(state, number)

@@ -29,7 +29,7 @@ from sim_jax.inlet import ReferenceInlet
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
-from sim_jax.trim import in_trim
+from sim_jax.trim import trimmed_start
 from tuner.config import TrajectorySettings
 from tuner.core.disk import write_text
 from tuner.core.shipped import find_config
@@ -224,7 +224,7 @@ def _flier(schedule: Schedule) -> Callable[..., Rollout]:
         )
         resting = jnp.ones(first.x.shape, bool)
         start = hover(model.vehicle, first)
-        start = in_trim(model.vehicle, model.controller, start, resting, speed_factor=factor)
+        start = trimmed_start(model.vehicle, model.controller, start, resting, speed_factor=factor)
         return rollout(
             model.vehicle,
             model.controller,

@@ -1,4 +1,4 @@
-"""What surrounds a flight: wind, battery, gusts, other pushes, and the air as rotors meet it."""
+"""The environment of a flight: wind, battery, gusts, disturbances, and the airflow at rotors."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Disturbance(eqx.Module):
         return now
 
     def plus(self, other: Disturbance) -> Disturbance:
-        """Return what both are together, in this one's ticks."""
+        """Return the sum of both, in this one's ticks."""
 
         def both(first: Any, second: Any) -> Any:
             return first if second is None else second if first is None else first + second
@@ -62,7 +62,7 @@ class Disturbance(eqx.Module):
         )
 
     def added_to(self, wrench: Wrench, motion: Motion) -> Wrench:
-        """Return what acts about the centre of mass where values (\\*batch) act besides."""
+        """Return the wrench about the centre of mass with added disturbances (\\*batch)."""
         force, moment = wrench.force, wrench.moment
         if self.force is not None:
             force = force + motion.attitude.to_body(self.force)
@@ -97,7 +97,7 @@ class Environment(eqx.Module):
         return series, self.wind, self.battery_decline, self.begin, self.draught
 
     def during(self, step: Int[Array, ""], schedule: Schedule) -> Environment:
-        """Return what surrounds the flight in a physics step: its gust is part of the wind."""
+        """Return the environment in a physics step, with the gust in the wind."""
         if self.disturbance is None:
             return self
         now = self.disturbance.during(step, schedule)
@@ -126,7 +126,7 @@ class Environment(eqx.Module):
         return factor
 
 
-NOTHING_AROUND = Environment()
+STILL_AIR = Environment()
 """Still air."""
 
 
@@ -150,7 +150,7 @@ class Air(eqx.Module):
     def around(
         vehicle: Vehicle,
         motion: Motion,
-        environment: Environment = NOTHING_AROUND,
+        environment: Environment = STILL_AIR,
         rotor_acceleration: PerRotor = (),
     ) -> Air:
         """Return the air as a vehicle meets it in a motion."""

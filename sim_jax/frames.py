@@ -39,14 +39,14 @@ from sim_jax.vehicle import Vehicle
 
 
 class Gyro(eqx.Module):
-    """What a gyro reads of a body rate; what is None is not off."""
+    """Errors of a gyro's axes and scale; None stands for no error."""
 
     turn: Quaternion | None
     """From the autopilot's axes to the body's."""
     scale: Vec3 | None
 
     def reading(self, body_rate: Vec3) -> Vec3:
-        """Return what it reads of a body rate in rad/s."""
+        """Return the reading of a body rate, rad/s."""
         along = body_rate if self.turn is None else self.turn.to_body(body_rate)
         return along if self.scale is None else self.scale.scaled_by(along)
 
@@ -138,7 +138,7 @@ def markers_of(vehicle: Vehicle) -> Markers:
     return Markers(vehicle.along_axes("marker_offset"), turn)
 
 
-def estimated(vehicle: Vehicle, controller: Controller, motion: Motion) -> Motion:
+def estimated_motion(vehicle: Vehicle, controller: Controller, motion: Motion) -> Motion:
     """Return the motion that position and attitude control see of a motion, were it not old."""
     markers, tilt = markers_of(vehicle), tilt_of(vehicle)
     if not jax.tree.leaves((markers, tilt)):

@@ -81,7 +81,7 @@ class Vec3(eqx.Module):
         return Vec3(values[0], values[1], values[2])
 
 
-SMALL = 1e-6
+SMALL_ANGLE = 1e-6
 """rad² below which sin(a)/a is its series."""
 
 
@@ -212,7 +212,7 @@ class Quaternion(eqx.Module):
 def rotation(vector: Vec3) -> Quaternion:
     """Return the rotation by a vector in rad, exp(vector / 2), with its derivative at zero."""
     square = 0.25 * vector.dot(vector)
-    small = square < SMALL
+    small = square < SMALL_ANGLE
     half = safe_sqrt(jnp.where(small, 1.0, square))
     cosine = jnp.where(small, 1.0 - square / 2.0, jnp.cos(half))
     scale = 0.5 * jnp.where(small, 1.0 - square / 6.0, jnp.sin(half) / half)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from sim_jax.control.geometric import ReferencePoint
 from sim_jax.geometry import Quaternion, Vec3
-from sim_jax.numeric import Array, Scalar, like, replaced, row_of, where
+from sim_jax.numeric import Array, Scalar, cast_like, replaced, row_of, where
 from sim_jax.rigid_body import Motion
 from sim_jax.state import Setpoints, State
 from sim_jax.vehicle import PerRotor
@@ -50,7 +50,7 @@ class Stages(Protocol):
 
 
 class Inlet(eqx.Module):
-    """What is fed into the loop; a subclass overrides the stages that it replaces."""
+    """An input of the loop; a subclass overrides the stages that it replaces."""
 
     @property
     def needs_mixer(self) -> bool:
@@ -58,7 +58,7 @@ class Inlet(eqx.Module):
         return False
 
     def next_setpoints(self, stages: Stages, state: State, step: Step) -> Setpoints:
-        """Return what the rate controller is to follow."""
+        """Return the set-points of the rate controller."""
         return state.setpoints
 
     def next_command(self, stages: Stages, state: State, step: Step) -> State:
@@ -134,7 +134,7 @@ class BodyRateInlet(Inlet):
         return True
 
     def next_setpoints(self, stages: Stages, state: State, step: Step) -> Setpoints:
-        return like(row_of(Setpoints(self.rate, self.thrust), step), state.setpoints)
+        return cast_like(row_of(Setpoints(self.rate, self.thrust), step), state.setpoints)
 
     def next_command(self, stages: Stages, state: State, step: Step) -> State:
         setpoints = self.next_setpoints(stages, state, step)
@@ -147,7 +147,7 @@ class ActuatorInlet(Inlet):
     command: PerRotor
 
     def next_command(self, stages: Stages, state: State, step: Step) -> State:
-        return stages.commanded(state, like(row_of(self.command, step), state.command))
+        return stages.commanded(state, cast_like(row_of(self.command, step), state.command))
 
     def rotor_counts(self) -> set[int]:
         return {len(self.command)}
@@ -164,8 +164,8 @@ class RotorSpeedInlet(Inlet):
     def next_rotor_speeds(
         self, stages: Stages, state: State, step: Step
     ) -> tuple[PerRotor, PerRotor]:
-        before = like(row_of(self.speed, step), state.rotor_speed)
-        after = like(row_of(self.speed, step + 1), state.rotor_speed)
+        before = cast_like(row_of(self.speed, step), state.rotor_speed)
+        after = cast_like(row_of(self.speed, step + 1), state.rotor_speed)
         return after, tuple(0.5 * (old + new) for old, new in zip(before, after, strict=True))
 
     def rotor_counts(self) -> set[int]:
@@ -184,7 +184,7 @@ class AttitudeInlet(Inlet):
     body_rate: Vec3
     """rad/s, body FLU."""
     drive: Inlet
-    """What turns the rotors: motor commands or rotor speeds that are fed in."""
+    """The input of the rotors: motor commands or rotor speeds."""
 
     @property
     def needs_mixer(self) -> bool:
@@ -205,7 +205,7 @@ class AttitudeInlet(Inlet):
         """Return the motion with the body rate of mid-step, whatever moments would make of it."""
         mean = 0.5 * (row_of(self.body_rate, step) + row_of(self.body_rate, step + 1))
         return Motion(
-            motion.position, motion.velocity, motion.attitude, like(mean, motion.body_rate)
+            motion.position, motion.velocity, motion.attitude, cast_like(mean, motion.body_rate)
         )
 
     def next_motion(self, moved: Motion, step: Step) -> Motion:
@@ -213,8 +213,8 @@ class AttitudeInlet(Inlet):
         return Motion(
             moved.position,
             moved.velocity,
-            like(attitude, moved.attitude),
-            like(body_rate, moved.body_rate),
+            cast_like(attitude, moved.attitude),
+            cast_like(body_rate, moved.body_rate),
         )
 
     def rotor_counts(self) -> set[int]:

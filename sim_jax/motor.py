@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from sim_jax.numeric import Flag, Scalar
 from sim_jax.vehicle import Motor
 
-INSTANT = 1e-9
-"""s of a lag up to which it is over at once."""
+MIN_TIME_CONSTANT_S = 1e-9
+"""A shorter lag is none."""
 
 
 class LagSlope(eqx.Module):
-    """How the time constants change with the rotor speed: τ·(1 + slope·(Ω - Ω_hover)/Ω_hover).
+    """Time constants that depend on rotor speed: τ·(1 + slope·(Ω - Ω_hover)/Ω_hover).
 
     Source: thesis 5, where bench and flight disagree about the time constants.
     """
@@ -53,7 +53,7 @@ class SecondLag(eqx.Module):
     @staticmethod
     def over(time_constant: Scalar, step: Scalar | float) -> SecondLag:
         """Prepare a step of ``step`` s; the time constant is τ₂ in s."""
-        acts = time_constant > INSTANT
+        acts = time_constant > MIN_TIME_CONSTANT_S
         steps = step / jnp.where(acts, time_constant, 1.0)
         return SecondLag(time_constant, step, acts, steps, jnp.exp(-steps), _mean_decay(steps))
 
@@ -92,7 +92,7 @@ class Lag(eqx.Module):
     constants: tuple[Scalar, ...] = ()
     """Both time constants, s; for a slope and a second lag."""
     carried: tuple[tuple[Scalar, Scalar], ...] = ()
-    """What the second lag carries over with both; where nothing changes them."""
+    """Contributions of the second lag with both, if these are constant."""
 
     @staticmethod
     def over(

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Bool, Float, Int, PyTree
 
 Array: TypeAlias = jax.Array | np.ndarray
-"""Of jax, or of NumPy: what is laid out on the host compiles nothing."""
+"""Of jax, or of NumPy: arrays on the host compile nothing."""
 
 #: One number per vehicle of the batch; shape () for a single vehicle or one that all share.
 Scalar: TypeAlias = Float[Array, "*#batch"]
@@ -26,12 +26,12 @@ def saturate(value: Scalar, lower: Scalar | float, upper: Scalar | float) -> Sca
     return jnp.where(value < lower, lower, jnp.where(value > upper, upper, value))
 
 
-def smaller(first: Scalar, second: Scalar) -> Scalar:
+def minimum(first: Scalar, second: Scalar) -> Scalar:
     """Return the smaller of two; where they are equal the derivative is the second's."""
     return jnp.where(first < second, first, second)
 
 
-def larger(first: Scalar, second: Scalar) -> Scalar:
+def maximum(first: Scalar, second: Scalar) -> Scalar:
     """Return the larger of two; where they are equal the derivative is the second's."""
     return jnp.where(first > second, first, second)
 
@@ -54,7 +54,7 @@ def safe_divide(numerator: Scalar, denominator: Scalar) -> Scalar:
 
 
 @jax.custom_batching.custom_vmap
-def anyone(flags: Flag) -> Bool[Array, ""]:
+def any_lane(flags: Flag) -> Bool[Array, ""]:
     """Return whether any vehicle is flagged, those of an outer `jax.vmap` included.
 
     One truth value for all, so that a `lax.cond` on it remains a branch under `jax.vmap`.
@@ -62,9 +62,9 @@ def anyone(flags: Flag) -> Bool[Array, ""]:
     return jnp.any(flags)
 
 
-@anyone.def_vmap
+@any_lane.def_vmap
 def _(_: int, __: list[bool], flags: Flag) -> tuple[Bool[Array, ""], bool]:
-    return anyone(flags), False
+    return any_lane(flags), False
 
 
 Precision: TypeAlias = Literal["float32", "float64"]
@@ -86,8 +86,8 @@ def repeat(count: int, body: Callable[[Array, T], T], start: T) -> T:
     return end
 
 
-def forgetful(function: Callable[P, T]) -> Callable[P, T]:
-    """Let reverse mode remember a function's arguments only, and compute the rest again."""
+def rematerialised(function: Callable[P, T]) -> Callable[P, T]:
+    """Let reverse mode store a function's arguments only, and recompute the rest."""
     again: Callable[P, T] = jax.checkpoint(function, prevent_cse=False)
     return again
 
@@ -97,7 +97,7 @@ def row_of(tree: PyTree[Array], index: Int[Array, ""]) -> PyTree[Array]:
     return jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, index, 0, keepdims=False), tree)
 
 
-def like(tree: PyTree[Array], other: T) -> T:
+def cast_like(tree: PyTree[Array], other: T) -> T:
     """Return a pytree in the shapes and precision of another."""
     same: T = jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), tree, other)
     return same

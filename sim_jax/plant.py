@@ -1,4 +1,4 @@
-"""What happens in one step of the closed loop: who computes what, and in which order."""
+"""One step of the closed loop: its stages and their order."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from jaxtyping import Int, PyTree
 from sim_jax.control import mixer, rate
 from sim_jax.control.gains import Controller
 from sim_jax.control.geometric import (
+    acceleration_setpoint,
     attitude_from_acceleration,
     heading_of,
     rate_setpoint,
     thrust_setpoint,
-    wanted_acceleration,
 )
 from sim_jax.environment import Air, Environment
-from sim_jax.frames import Gyro, estimated
+from sim_jax.frames import Gyro, estimated_motion
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
-from sim_jax.numeric import Array, forgetful, like, repeat, replaced, row_of, where
+from sim_jax.numeric import Array, cast_like, rematerialised, repeat, replaced, row_of, where
 from sim_jax.rigid_body import Integrator, Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import (
     GyroFilter,
     Tachometer,
-    filtered,
+    filter_gyro,
     look_back,
-    packed,
+    pack_motion,
     push,
-    switched,
-    unpacked,
+    read_between,
+    unpack_motion,
 )
 from sim_jax.state import Limits, Setpoints, State
 from sim_jax.terms.total import total_wrench
@@ -45,7 +45,7 @@ T = TypeVar("T")
 
 
 class Sample(eqx.Module):
-    """What a rollout logs: the state at a time and the commands computed at that time.
+    """A logged sample: the state at a time, and the commands computed then.
 
     In a `Rollout` every leaf is (samples, \\*batch).
     """
@@ -80,13 +80,13 @@ class Plant(eqx.Module):
     lag: Lag | SwitchedLag
     gyro: GyroFilter
     senses: Gyro
-    """What the gyro reads."""
+    """The model of the gyro."""
     tachometer: Tachometer | None = None
 
     def position_control(
         self, state: State, step: Int[Array, ""], reference: ReferenceInlet
     ) -> Setpoints:
-        """Return what position and attitude control ask for, or asked for when last due."""
+        """Return the set-points of position and attitude control, updated when due."""
         if self.schedule.block_rate == self.schedule.position_control_rate:
             return self._follow(state, step, reference)
         due = self.schedule.is_due(step, self.schedule.position_control_rate)
@@ -104,7 +104,7 @@ class Plant(eqx.Module):
         if reference.level_held is not None:
             heading = where(reference.level_held, estimate.heading(), heading)
             turns_freely = turns_freely & ~reference.level_held
-        wanted = wanted_acceleration(gains.position, point, position, velocity, heading)
+        wanted = acceleration_setpoint(gains.position, point, position, velocity, heading)
         goal = attitude_from_acceleration(wanted, heading)
         turn = rate_setpoint(gains.attitude, estimate, goal)
         still = jnp.zeros_like(turn.x)
@@ -120,14 +120,14 @@ class Plant(eqx.Module):
     def _estimate(self, state: State, step: Int[Array, ""]) -> tuple[Vec3, Vec3, Quaternion]:
         motion = state.motion
         if state.estimate_history is None:
-            seen = estimated(self.vehicle, self.controller, motion)
+            seen = estimated_motion(self.vehicle, self.controller, motion)
             return seen.position, seen.velocity, seen.attitude
         age = self.vehicle.setup.estimate_latency * self.schedule.physics_rate
         if self.schedule.pose_rate is not None:
             poses = step * self.schedule.step * self.schedule.pose_rate
             waited = (poses - jnp.floor(poses + 1e-9)) / self.schedule.pose_rate
             age = age + waited * self.schedule.physics_rate
-        return unpacked(look_back(state.estimate_history, step, age))
+        return unpack_motion(look_back(state.estimate_history, step, age))
 
     def rate_control(self, state: State, step: Int[Array, ""]) -> State:
         """Run rate control where it is due."""
@@ -140,7 +140,9 @@ class Plant(eqx.Module):
     def _stabilise(self, state: State) -> State:
         """Run gyro filters, rate PID and mixer once; PX4 thinks in FRD."""
         controller, rate_hz = self.controller, self.schedule.rate_control_rate
-        gyro = filtered(self.gyro, state.gyro, self.senses.reading(state.motion.body_rate), rate_hz)
+        gyro = filter_gyro(
+            self.gyro, state.gyro, self.senses.reading(state.motion.body_rate), rate_hz
+        )
         measured, wanted = _frd(gyro.rate), _frd(state.setpoints.rate)
         torque = rate.torque_setpoint(
             controller.rate,
@@ -169,7 +171,9 @@ class Plant(eqx.Module):
     def commanded(self, state: State, command: PerRotor) -> State:
         """Return the state in which the motors have received commands 0..1."""
         speeds = tuple(reference_speed(self.vehicle.motor, share) for share in command)
-        return replaced(state, command=command, reference_speed=like(speeds, state.reference_speed))
+        return replaced(
+            state, command=command, reference_speed=cast_like(speeds, state.reference_speed)
+        )
 
     def motors(self, state: State, step: Int[Array, ""]) -> tuple[PerRotor, PerRotor]:
         """Return the rotor speeds after a step and those that act during it, in rad/s."""
@@ -188,7 +192,7 @@ class Plant(eqx.Module):
         if state.reference_history is None:
             return (state.reference_speed,)
         age = self.vehicle.setup.actuator_latency * self.schedule.physics_rate
-        return switched(state.reference_history, step, age)
+        return read_between(state.reference_history, step, age)
 
     def _on_battery(self, references: T, step: Int[Array, ""]) -> T:
         """Return reference speeds, rad/s, as the battery's voltage lets the motors reach them."""
@@ -240,8 +244,8 @@ class Plant(eqx.Module):
             lagged = tuple(self.lag.lag_reference(*speeds) for speeds in held)
             state = replaced(state, lagged_speed=lagged)
         if state.estimate_history is not None:
-            seen = estimated(self.vehicle, self.controller, state.motion)
-            history = push(state.estimate_history, packed(seen), step + 1)
+            seen = estimated_motion(self.vehicle, self.controller, state.motion)
+            history = push(state.estimate_history, pack_motion(seen), step + 1)
             state = replaced(state, estimate_history=history)
         return state
 
@@ -266,7 +270,7 @@ class Plant(eqx.Module):
             after = self.step(before, number * count + offset)
             return after, where(offset == 0, after.command, command)
 
-        body = forgetful(advance) if self.reversible else advance
+        body = rematerialised(advance) if self.reversible else advance
         end, command = repeat(count, body, (state, state.command))
         logged = where(crashed, start.command, command)
         row = Sample(start.motion, start.rotor_speed, logged, state.setpoints, start.read_speed)
@@ -292,7 +296,7 @@ class Plant(eqx.Module):
 
 
 def _flight(state: State) -> dict[str, PyTree[Array]]:
-    """Return what stays as it is once a vehicle has crashed."""
+    """Return the part of the state that is frozen after a crash."""
     motors = ("rotor_speed", "command", "reference_speed", "lagged_speed", "read_speed")
     return {name: getattr(state, name) for name in ("motion", "integral", "gyro", *motors)}
 

@@ -11,11 +11,11 @@ from jaxtyping import Int
 from sim_jax.constants import GRAVITY
 from sim_jax.control import mixer
 from sim_jax.control.gains import Controller, with_gains_of
-from sim_jax.environment import NOTHING_AROUND, Environment
-from sim_jax.frames import estimated, gyro_of
+from sim_jax.environment import STILL_AIR, Environment
+from sim_jax.frames import estimated_motion, gyro_of
 from sim_jax.inlet import Inlet
 from sim_jax.motor import Lag, LagSlope, SwitchedLag
-from sim_jax.numeric import Array, Precision, Scalar, forgetful, in_precision, precision_of
+from sim_jax.numeric import Array, Precision, Scalar, in_precision, precision_of, rematerialised
 from sim_jax.plant import Plant, Sample
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter, Tachometer
@@ -24,8 +24,8 @@ from sim_jax.vehicle import Vehicle
 
 SECOND_LAG = "time_constant_second"
 """The effect of a second lag of the motors."""
-STRETCH = 100
-"""Physics steps from one state that reverse mode remembers to the next."""
+CHECKPOINT_STEPS = 100
+"""Physics steps between the states that reverse mode stores."""
 
 
 class Rollout(eqx.Module):
@@ -69,20 +69,20 @@ def _check_rotors(vehicle: Vehicle, inlet: Inlet, start: Start) -> None:
             )
 
 
-def begun(
+def start_simulation(
     vehicle: Vehicle,
     controller: Controller,
     schedule: Schedule,
     inlet: Inlet,
     start: Start,
     *,
-    environment: Environment = NOTHING_AROUND,
+    environment: Environment = STILL_AIR,
     limits: Limits | None = None,
     gravity: float = GRAVITY,
     precision: Precision | None = None,
     reversible: bool = False,
 ) -> tuple[Plant, State]:
-    """Return what is stepped, and the state at time 0; the arguments are those of `rollout`.
+    """Return the plant and its state at time 0; the arguments are those of `rollout`.
 
     ``reversible``: whether reverse mode is to remember as little as can be.
     """
@@ -113,7 +113,7 @@ def begun(
         schedule,
         plant.gyro,
         shape,
-        seen=estimated(vehicle, controller, start.motion),
+        seen=estimated_motion(vehicle, controller, start.motion),
         read=senses.reading(start.motion.body_rate),
         lags_twice=SECOND_LAG in vehicle.effects,
         read_late=read_late is not None,
@@ -128,14 +128,14 @@ def rollout(
     start: Start,
     *,
     samples: int,
-    environment: Environment = NOTHING_AROUND,
+    environment: Environment = STILL_AIR,
     limits: Limits | None = None,
     gravity: float = GRAVITY,
     precision: Precision | None = None,
 ) -> Rollout:
     """Fly: one vehicle, or a batch along trailing axes of any leaf.
 
-    Reverse mode remembers a state every `STRETCH`, and from it computes those of all steps again.
+    Reverse mode stores a state every `CHECKPOINT_STEPS`, and recomputes those in between.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def rollout(
         The inlet or the start is for another number of rotors than the vehicle's, or the inlet
         needs the mixer and the vehicle is no quadrotor.
     """
-    plant, first = begun(
+    plant, first = start_simulation(
         vehicle,
         controller,
         schedule,
@@ -184,7 +184,9 @@ def rollout(
         reversible=True,
     )
 
-    stretches = -(-samples // max(1, STRETCH * schedule.log_rate // schedule.physics_rate)) or 1
+    stretches = (
+        -(-samples // max(1, CHECKPOINT_STEPS * schedule.log_rate // schedule.physics_rate)) or 1
+    )
     length = -(-samples // stretches)
 
     def sample(state: State, number: Int[Array, ""]) -> tuple[State, Sample]:
@@ -194,7 +196,7 @@ def rollout(
         return lax.scan(sample, state, numbers)
 
     numbers = jnp.arange(stretches * length).reshape(stretches, length)
-    state, log = lax.scan(forgetful(stretch), first, numbers)
+    state, log = lax.scan(rematerialised(stretch), first, numbers)
     log = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:samples], log)
     flown = state.crash_time <= samples / schedule.log_rate  # the last stretch may be longer
     return Rollout(log, jnp.where(flown, state.crash_time, jnp.inf))

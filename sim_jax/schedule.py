@@ -34,9 +34,9 @@ class Schedule(eqx.Module):
     pose_rate: float | None = eqx.field(static=True, default=None)
     """Hz at which poses reach the controller, which keeps the last in between; None: every tick."""
     longest_estimate_latency: float = eqx.field(static=True, default=0.0)
-    """s that the estimate's delay line holds; 0 leaves it out."""
+    """The length of the estimate's delay line, s; 0 for none."""
     longest_actuator_latency: float = eqx.field(static=True, default=0.0)
-    """s that the commands' delay line holds; 0 leaves it out."""
+    """The length of the commands' delay line, s; 0 for none."""
 
     def __check_init__(self) -> None:
         for name in ("rate_control_rate", "position_control_rate", "log_rate"):

@@ -1,4 +1,4 @@
-"""What the controllers see: a state estimate that is old, a gyro that is filtered.
+"""Sensing of the controllers: a delayed state estimate, a filtered gyro.
 
 And what tachometers read of the rotors, which nothing acts upon.
 """
@@ -14,13 +14,13 @@ from jaxtyping import Float, Int
 
 from sim_jax.control.gains import Filters
 from sim_jax.geometry import Quaternion, Vec3
-from sim_jax.motor import INSTANT
+from sim_jax.motor import MIN_TIME_CONSTANT_S
 from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
 
 
 def history_length(longest: float, step: float) -> int:
-    """Return how many steps a delay line must hold to look ``longest`` seconds back."""
+    """Return the number of steps in a delay line of ``longest`` seconds."""
     return ceil(longest / step - 1e-9) + 2
 
 
@@ -69,7 +69,7 @@ def look_back(
     return newer + (age - whole) * (older - newer)
 
 
-def switched(
+def read_between(
     history: Float[Array, "length rows *batch"], step: Int[Array, ""], age: Scalar
 ) -> tuple[Float[Array, "rows *batch"], Float[Array, "rows *batch"]]:
     """Read a delay line of held values ``age`` steps back, over the step that begins now.
@@ -81,26 +81,26 @@ def switched(
     return _slot(history, step, whole + 1.0), _slot(history, step, whole)
 
 
-def packed(motion: Motion) -> Float[Array, "10 *batch"]:
-    """Return what an estimator delivers (position, velocity, attitude) as rows."""
+def pack_motion(motion: Motion) -> Float[Array, "10 *batch"]:
+    """Return position, velocity and attitude, which an estimator delivers, as rows."""
     return jnp.concatenate(
         [motion.position.stacked(), motion.velocity.stacked(), motion.attitude.stacked()]
     )
 
 
-def unpacked(rows: Float[Array, "10 *batch"]) -> tuple[Vec3, Vec3, Quaternion]:
+def unpack_motion(rows: Float[Array, "10 *batch"]) -> tuple[Vec3, Vec3, Quaternion]:
     """Return position, velocity and attitude from rows; the attitude is normalised again."""
     return Vec3.of(rows[0:3]), Vec3.of(rows[3:6]), Quaternion.of(rows[6:10]).normalized()
 
 
-def past_of(motion: Motion, length: int, step: float) -> Float[Array, "length 10 *batch"]:
+def constant_history(motion: Motion, length: int, step: float) -> Float[Array, "length 10 *batch"]:
     """Fill a delay line as if the vehicle had arrived with constant velocity and attitude.
 
     Slot 0 is the present; ``step`` is the physics step in s.
     """
     ages = (-jnp.arange(length) % length) * step
     ages = ages.astype(motion.position.x.dtype).reshape((length,) + (1,) * motion.position.x.ndim)
-    now = jnp.broadcast_to(packed(motion), (length, *packed(motion).shape))
+    now = jnp.broadcast_to(pack_motion(motion), (length, *pack_motion(motion).shape))
     moved = now[:, 0:3] - now[:, 3:6] * ages[:, None]
     return jnp.concatenate([moved, now[:, 3:]], axis=1)
 
@@ -146,7 +146,7 @@ class GyroMemory(eqx.Module):
         return GyroMemory(settled, settled, rate, Vec3.zeros(rate.x))
 
 
-def filtered(gyro: GyroFilter, memory: GyroMemory, rate: Vec3, sample_rate: float) -> GyroMemory:
+def filter_gyro(gyro: GyroFilter, memory: GyroMemory, rate: Vec3, sample_rate: float) -> GyroMemory:
     """Take one gyro sample in rad/s through the filters."""
     newer, older, smooth = memory.newer, memory.older, rate
     if gyro.b0 is not None and newer is not None and older is not None:
@@ -179,11 +179,11 @@ class Tachometer(eqx.Module):
     @staticmethod
     def over(lag: Scalar, step: float) -> Tachometer:
         """Prepare the filter for steps of so many s."""
-        acts = lag > INSTANT
+        acts = lag > MIN_TIME_CONSTANT_S
         kept = jnp.where(acts, jnp.exp(-step / jnp.where(acts, lag, 1.0)), 0.0)
         return Tachometer(lag, kept, step)
 
     def reading(self, read: Scalar, before: Scalar, after: Scalar) -> Scalar:
-        """Return what is read after a step, of a speed before and after it and what was read."""
+        """Return the reading after a step from the last one, and the speeds before and after."""
         behind = self.lag * (after - before) / self.step
         return after - behind + self.kept * (read - before + behind)

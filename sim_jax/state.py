@@ -16,12 +16,12 @@ from sim_jax.motor import command_of, reference_speed
 from sim_jax.numeric import Array, Flag, Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
-from sim_jax.sensing import GyroFilter, GyroMemory, history_length, past_of
+from sim_jax.sensing import GyroFilter, GyroMemory, constant_history, history_length
 from sim_jax.vehicle import Motor, PerRotor, Vehicle
 
 
 class Start(eqx.Module):
-    """What a flight starts from."""
+    """The start of a flight."""
 
     motion: Motion
     rotor_speed: PerRotor
@@ -33,7 +33,7 @@ class Start(eqx.Module):
 
 
 class Setpoints(eqx.Module):
-    """What the attitude controller asks of the rate controller."""
+    """Set-points of the attitude controller for the rate controller."""
 
     rate: Vec3
     """rad/s, body FLU."""
@@ -134,7 +134,7 @@ def first_state(
     if schedule.longest_estimate_latency > 0:
         hold = 0.0 if schedule.pose_rate is None else 1.0 / schedule.pose_rate
         length = history_length(schedule.longest_estimate_latency + hold, schedule.step)
-        estimate_history = past_of(seen, length, schedule.step)
+        estimate_history = constant_history(seen, length, schedule.step)
     elif schedule.pose_rate is not None:
         raise ValueError("pose_rate needs a delay line: set longest_estimate_latency")
     if schedule.longest_actuator_latency > 0:

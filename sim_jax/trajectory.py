@@ -26,7 +26,7 @@ WINDUP_STEP = 0.001
 """Wind-up per tick, from 0 to 1 in ten seconds."""
 PUBLISHER_PI = 3.14
 """The publisher's own π, by which it counts laps."""
-LEVEL = 1.0
+FLIGHT_HEIGHT = 1.0
 """m, the height that is written into the straight and the diagonal."""
 
 
@@ -42,7 +42,7 @@ class Shape(eqx.Module):
     """
 
     name: ClassVar[str]
-    """What a configuration calls it."""
+    """Its name in configuration files."""
     peak_speed: ClassVar[float]
     """Largest speed of the curve, in radius·omega; 0 for a place."""
     peak_acceleration: ClassVar[float]
@@ -137,7 +137,7 @@ class Straight(Shape):
     def position(self, angle: Scalar) -> Vec3:
         """Return (0, 0, 1) + r(cos θ, 0)."""
         still = jnp.zeros_like(angle)
-        return Vec3(self.radius * jnp.cos(angle), still, jnp.full_like(angle, LEVEL))
+        return Vec3(self.radius * jnp.cos(angle), still, jnp.full_like(angle, FLIGHT_HEIGHT))
 
 
 class Diagonal(Shape):
@@ -151,7 +151,7 @@ class Diagonal(Shape):
     def position(self, angle: Scalar) -> Vec3:
         """Return (0, 0, 1) + r(cos θ, cos θ)."""
         along = self.radius * jnp.cos(angle)
-        return Vec3(along, along, jnp.full_like(angle, LEVEL))
+        return Vec3(along, along, jnp.full_like(angle, FLIGHT_HEIGHT))
 
 
 class Hover(Shape):
@@ -187,7 +187,7 @@ def shapes() -> dict[str, type[Shape]]:
 
 
 class Publication(eqx.Module):
-    """What the publisher sent at a tick; from `publish`, leaves are (ticks, \\*batch)."""
+    """The published reference at a tick; from `publish`, leaves are (ticks, \\*batch)."""
 
     points: ReferencePoint
     shape_time: Scalar

@@ -31,7 +31,7 @@ from sim_jax.vehicle import PerRotor, Vehicle
 _Row: TypeAlias = list[Scalar]
 
 
-def in_trim(
+def trimmed_start(
     vehicle: Vehicle,
     controller: Controller,
     start: Start,
@@ -94,10 +94,10 @@ def trim_speeds(vehicle: Vehicle, *, gravity: float = GRAVITY) -> PerRotor:
     rows = [
         [*(column[axis] - none[axis] for column in columns), wanted[axis]] for axis in range(ROTORS)
     ]
-    return tuple(jnp.sqrt(jnp.maximum(square, 1.0)) for square in _solved(rows))
+    return tuple(jnp.sqrt(jnp.maximum(square, 1.0)) for square in _solve_rows(rows))
 
 
-def _solved(rows: list[_Row]) -> _Row:
+def _solve_rows(rows: list[_Row]) -> _Row:
     """Return the solution of rows (matrix | right side), by elimination in their order.
 
     That order never divides by zero for a quad X: lift, roll, pitch and yaw of rotors front right,

@@ -80,7 +80,7 @@ class Aerodynamics(eqx.Module):
     N s/rad, as in simulators whose state is a thrust or a throttle."""
 
     def squared(self, speed: Scalar) -> Scalar:
-        """Return what motor_constant multiplies: the squared rotor speed, or the speed."""
+        """Return the factor of motor_constant: the squared rotor speed, or the speed."""
         return speed if self.thrust_law == "linear" else speed * speed
 
     def speed_at(self, thrust: Scalar) -> Scalar:
@@ -90,7 +90,7 @@ class Aerodynamics(eqx.Module):
 
 
 class Setup(eqx.Module):
-    """What the set-up around the vehicle adds: both are coefficients like any other."""
+    """Latencies of the set-up, which are coefficients as well."""
 
     estimate_latency: Scalar = eqx.field(converter=_number, default=0.0)
     """s, age of the state estimate that the position and attitude controllers see."""

@@ -105,12 +105,8 @@ def heading_of(gains: PositionGains, velocity: Vec3) -> Vec3:
     )
 
 
-def wanted_acceleration(
-    gains: PositionGains,
-    reference: ReferencePoint,
-    position: Vec3,
-    velocity: Vec3,
-    heading: Vec3,
+def acceleration_setpoint(
+    gains: PositionGains, reference: ReferencePoint, position: Vec3, velocity: Vec3, heading: Vec3
 ) -> Vec3:
     """Return a_fb + a_ref - R_ref D R_refᵀ v_ref + (0, 0, 9.8) in m/s², world.
 

@@ -13,20 +13,11 @@ import jax.numpy as jnp
 from sim_jax.control.gains import MixerSettings
 from sim_jax.control.rate import Saturation
 from sim_jax.geometry import Vec3
-from sim_jax.numeric import (
-    Flag,
-    Scalar,
-    anyone,
-    larger,
-    magnitude,
-    safe_sqrt,
-    saturate,
-    smaller,
-)
+from sim_jax.numeric import Flag, Scalar, any_lane, magnitude, maximum, minimum, safe_sqrt, saturate
 from sim_jax.vehicle import PerRotor
 
 ROTORS = 4
-"""How many rotors a quad X has."""
+"""The rotors of a quad X."""
 HALF_SQRT2 = 0.7071070075035095
 """PX4's own rounding in its generated mixer table: 0.707107 in single precision."""
 YAW_HEADROOM = 1.149999976158142
@@ -37,15 +28,15 @@ LOW_CLIP = 0.00499998
 single precision, where a command of exactly 0.005 comes out as -0.99 and does not count."""
 
 
-def _balanced(amount: Scalar, lower: Scalar, upper: Scalar) -> Scalar:
+def _balance(amount: Scalar, lower: Scalar, upper: Scalar) -> Scalar:
     """Bring an amount between its limits, or to their middle where they exclude each other."""
     middle = 0.5 * (lower + upper)
-    return saturate(amount, smaller(lower, middle), larger(upper, middle))
+    return saturate(amount, minimum(lower, middle), maximum(upper, middle))
 
 
-def _reduced(amount: Scalar, lower: Scalar, upper: Scalar) -> Scalar:
+def _reduce(amount: Scalar, lower: Scalar, upper: Scalar) -> Scalar:
     """Do the same, but only downwards."""
-    return smaller(amount, larger(upper, 0.5 * (lower + upper)))
+    return minimum(amount, maximum(upper, 0.5 * (lower + upper)))
 
 
 def _yaw_limits(
@@ -55,13 +46,13 @@ def _yaw_limits(
 
     Rotors that yaw drives up lie at thrust ± ahead, those that it drives down at thrust ± across.
     """
-    lower = larger(ahead - thrust, thrust + across - highest)
-    return lower, -larger(thrust + ahead - highest, across - thrust)
+    lower = maximum(ahead - thrust, thrust + across - highest)
+    return lower, -maximum(thrust + ahead - highest, across - thrust)
 
 
 def _thrust_limits(yaw: Scalar, ahead: Scalar, across: Scalar) -> tuple[Scalar, Scalar]:
     """Return the least and most thrust that keep all rotors within 0..1."""
-    return larger(ahead - yaw, across + yaw), 1.0 - larger(ahead + yaw, across - yaw)
+    return maximum(ahead - yaw, across + yaw), 1.0 - maximum(ahead + yaw, across - yaw)
 
 
 def _sum(roll: Scalar, pitch: Scalar, yaw: Scalar, thrust: Scalar) -> PerRotor:
@@ -73,33 +64,33 @@ def _outputs(airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
     roll, pitch, yaw = torque.x * HALF_SQRT2, torque.y * HALF_SQRT2, torque.z
     if airmode == 0:  # thrust may only be reduced; then roll, then pitch give way
         tilt = magnitude(roll) + magnitude(pitch)
-        thrust = _reduced(thrust, tilt, 1.0 - tilt)
-        margin = smaller(thrust, 1.0 - thrust)
-        for_roll = larger(margin - magnitude(pitch), jnp.zeros_like(margin))
+        thrust = _reduce(thrust, tilt, 1.0 - tilt)
+        margin = minimum(thrust, 1.0 - thrust)
+        for_roll = maximum(margin - magnitude(pitch), jnp.zeros_like(margin))
         roll = saturate(roll, -for_roll, for_roll)
-        for_pitch = larger(margin - magnitude(roll), jnp.zeros_like(margin))
+        for_pitch = maximum(margin - magnitude(roll), jnp.zeros_like(margin))
         pitch = saturate(pitch, -for_pitch, for_pitch)
     elif airmode == 1:  # thrust may rise to keep roll and pitch
         tilt = magnitude(roll) + magnitude(pitch)
-        thrust = _balanced(thrust, tilt, 1.0 - tilt)
+        thrust = _balance(thrust, tilt, 1.0 - tilt)
     ahead, across = magnitude(pitch - roll), magnitude(pitch + roll)
     if airmode == 2:  # thrust may rise to keep all three, then yaw gives way
-        thrust = _balanced(thrust, *_thrust_limits(yaw, ahead, across))
-        yaw = _balanced(yaw, *_yaw_limits(thrust, ahead, across, 1.0))
+        thrust = _balance(thrust, *_thrust_limits(yaw, ahead, across))
+        yaw = _balance(yaw, *_yaw_limits(thrust, ahead, across, 1.0))
     else:  # yaw gives way, then thrust
-        yaw = _balanced(yaw, *_yaw_limits(thrust, ahead, across, YAW_HEADROOM))
-        thrust = _reduced(thrust, *_thrust_limits(yaw, ahead, across))
+        yaw = _balance(yaw, *_yaw_limits(thrust, ahead, across, YAW_HEADROOM))
+        thrust = _reduce(thrust, *_thrust_limits(yaw, ahead, across))
     return _sum(roll, pitch, yaw, thrust)
 
 
-def single(value: Scalar) -> Scalar:
+def as_float32(value: Scalar) -> Scalar:
     """Round to single precision, whatever precision the rollout runs in."""
     return jax.lax.reduce_precision(value, exponent_bits=8, mantissa_bits=23)
 
 
-def quantised(command: Scalar) -> Scalar:
+def quantise(command: Scalar) -> Scalar:
     """Truncate to whole microseconds of a 1000..2000 pulse; the derivative passes straight."""
-    pulse = jnp.floor(single(1500.0 + single(500.0 * single(2.0 * command - 1.0))))
+    pulse = jnp.floor(as_float32(1500.0 + as_float32(500.0 * as_float32(2.0 * command - 1.0))))
     return command + jax.lax.stop_gradient((pulse - 1000.0) * 1e-3 - command)
 
 
@@ -112,19 +103,19 @@ def _linearised(output: Scalar, thrust_factor: float) -> Scalar:
     return safe_sqrt(square + positive / factor) - linear / (2.0 * factor)
 
 
-def _outside(middle: Scalar, reach: Scalar) -> Flag:
+def _excess(middle: Scalar, reach: Scalar) -> Flag:
     """Return whether outputs this far either side of a middle leave 0..1."""
     return (middle < reach) | (middle + reach > 1.0)
 
 
-def _desaturated_where_needed(
+def _desaturate_lanes(
     airmode: int, torque: Vec3, thrust: Scalar, desaturates: Flag | bool, counts: Flag | bool
 ) -> PerRotor:
     """Mix; desaturation, which is most of the work, is left out while no vehicle saturates."""
     roll, pitch, yaw = torque.x * HALF_SQRT2, torque.y * HALF_SQRT2, torque.z
     ahead, across = jnp.abs(pitch - roll), jnp.abs(pitch + roll)
-    without_yaw = _outside(thrust, larger(ahead, across))
-    saturates = without_yaw | _outside(thrust + yaw, ahead) | _outside(thrust - yaw, across)
+    without_yaw = _excess(thrust, maximum(ahead, across))
+    saturates = without_yaw | _excess(thrust + yaw, ahead) | _excess(thrust - yaw, across)
     plain = _sum(roll, pitch, yaw, thrust)
 
     def desaturated() -> PerRotor:
@@ -135,7 +126,7 @@ def _desaturated_where_needed(
         return a, b, c, d
 
     mixed: PerRotor = jax.lax.cond(
-        anyone(saturates & desaturates & counts), desaturated, lambda: plain
+        any_lane(saturates & desaturates & counts), desaturated, lambda: plain
     )
     return mixed
 
@@ -166,13 +157,13 @@ def mix(
     """
     within = Vec3(*(saturate(axis, -1.0, 1.0) for axis in (torque.x, torque.y, torque.z)))
     thrust = saturate(thrust, 0.0, 1.0)
-    outputs = _desaturated_where_needed(settings.airmode, within, thrust, desaturates, counts)
+    outputs = _desaturate_lanes(settings.airmode, within, thrust, desaturates, counts)
     if settings.thrust_factor > 0:
         a, b, c, d = (_linearised(out, settings.thrust_factor) for out in outputs)
         outputs = (a, b, c, d)
     a, b, c, d = (saturate(out, 0.0, 1.0) for out in outputs)
     if settings.pwm_quantisation:
-        a, b, c, d = (quantised(out) for out in (a, b, c, d))
+        a, b, c, d = (quantise(out) for out in (a, b, c, d))
     return a, b, c, d
 
 

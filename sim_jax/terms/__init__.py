@@ -1,1 +1,1 @@
-"""What pushes and turns the vehicle: one pure function for each force or moment."""
+"""Forces and moments on the vehicle, one pure function each."""

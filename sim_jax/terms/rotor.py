@@ -23,7 +23,7 @@ from sim_jax.vehicle import Aerodynamics, PerRotor, Vehicle
 def thrust(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Air) -> Wrench:
     """Return motor_constant·Ω²·clip(1 - |v∥|/max_relative_airspeed, 0, 1) along body z, at r.
 
-    Ω² is that of `lifting`.
+    Ω² is that of `thrust_terms_act`.
 
     Times the rotor's own ``rotor_thrust_scale_i`` and 1/(1 - ground_effect·(R/4h)²), h the height
     of the rotor's centre, where a vehicle has these effects. Source: thesis Eq. 6.5 and 6.6 (the
@@ -34,7 +34,7 @@ def thrust(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Air) ->
     """
     aerodynamics = vehicle.aerodynamics
     zero = jnp.zeros_like(motion.velocity.x)
-    lifts, lifted = [], lifting(vehicle)
+    lifts, lifted = [], thrust_terms_act(vehicle)
     for number, (speed, through) in enumerate(zip(rotor_speed, air.at_rotors, strict=True)):
         share = _remaining_share(aerodynamics, through.z, air.draught)
         square = lifted(speed) * share
@@ -86,7 +86,7 @@ def drag_torque(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Ai
     """
     aerodynamics = vehicle.aerodynamics
     square = zero = jnp.zeros_like(motion.velocity.x)
-    lifted = lifting(vehicle)
+    lifted = thrust_terms_act(vehicle)
     for number, (rotor, speed) in enumerate(zip(vehicle.rotors, rotor_speed, strict=True)):
         scale = _thrust_scale(vehicle, number)
         turned = lifted(speed)
@@ -99,8 +99,8 @@ def drag_torque(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Ai
     return Wrench(Vec3.zeros(zero), Vec3(zero, zero, torque))
 
 
-def lifting(vehicle: Vehicle) -> Callable[[Scalar], Scalar]:
-    """Return what makes of a rotor's speed in rad/s what motor_constant multiplies, (rad/s)².
+def thrust_terms_act(vehicle: Vehicle) -> Callable[[Scalar], Scalar]:
+    """Return the function from rotor speed, rad/s, to the factor of motor_constant, (rad/s)².
 
     Ω²·(Ω/Ω_h)^(thrust_exponent - 2): blades at low Reynolds numbers, or that bend, lift by another
     power of the speed than the second. At Ω_h, at which equal rotors carry the weight, motor

@@ -51,7 +51,7 @@ def total_wrench(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: A
         force, moment = force + at_rotor, moment + arm.cross(at_rotor)
     for wrench in wrenches:
         force, moment = force + wrench.force, moment + wrench.moment
-    unseen = _unseen(vehicle, motion, moment)
+    unseen = _unobserved(vehicle, motion, moment)
     return Wrench(force, moment if unseen is None else moment + unseen)
 
 
@@ -70,7 +70,7 @@ def wrench_of_each_term(
         if wrench is not None
     }
     zero = Vec3.zeros(air.velocity.x)
-    unseen = _unseen(vehicle, motion, sum((w.moment for w in wrenches.values()), start=zero))
+    unseen = _unobserved(vehicle, motion, sum((w.moment for w in wrenches.values()), start=zero))
     return wrenches if unseen is None else wrenches | {"torque_gain": Wrench(zero, unseen)}
 
 
@@ -81,8 +81,8 @@ def _about_center_of_mass(wrench: Wrench, air: Air) -> Wrench:
     return Wrench(force, moment)
 
 
-def _unseen(vehicle: Vehicle, motion: Motion, moment: Vec3) -> Vec3 | None:
-    """Return (torque_gain - 1)·(M - ω × Iω), axis by axis: what of a moment is not seen to turn.
+def _unobserved(vehicle: Vehicle, motion: Motion, moment: Vec3) -> Vec3 | None:
+    """Return (torque_gain - 1)·(M - ω × Iω), axis by axis: the unobserved part of a moment.
 
     No physics: a loop's rotors answer what disturbs the vehicle. Where their speeds are recorded
     and what they answer is not, less than all of the angular acceleration that they stand for

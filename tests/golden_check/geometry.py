@@ -85,7 +85,7 @@ def _position_controller(table: Table) -> list[Deviation]:
     heading = geometric.heading_of(gains, velocity) if follows_velocity else given
     used = table.column("yaw_used")
     feedback = geometric.feedback_acceleration(gains, reference, place, velocity)
-    wanted = geometric.wanted_acceleration(gains, reference, place, velocity, heading)
+    wanted = geometric.acceleration_setpoint(gains, reference, place, velocity, heading)
     goal = geometric.attitude_from_acceleration(wanted, heading)
     attitude_gains = _attitude_gains(table)
     constant = attitude_gains.time_constant

@@ -9,7 +9,7 @@ from jax import Array
 from sim_jax.control import mixer, rate
 from sim_jax.control.gains import Filters, MixerSettings, RateGains
 from sim_jax.geometry import Vec3
-from sim_jax.sensing import GyroFilter, GyroMemory, filtered
+from sim_jax.sensing import GyroFilter, GyroMemory, filter_gyro
 from sim_jax.vehicle import PerRotor
 from tests.golden_check import stepwise_mixer
 from tests.golden_check.controllers import hovergames_rates
@@ -81,7 +81,7 @@ def _gyro_sequence(table: Table) -> list[Deviation]:
     )
 
     def step(memory: GyroMemory, raw: Array) -> tuple[GyroMemory, tuple[Array, Array]]:
-        memory = filtered(gyro, memory, Vec3(raw, raw, raw), sample_rate)
+        memory = filter_gyro(gyro, memory, Vec3(raw, raw, raw), sample_rate)
         return memory, (memory.rate.x, memory.acceleration.x)
 
     rest = GyroMemory.settled(gyro, Vec3.zeros(jnp.zeros(())))
@@ -103,8 +103,8 @@ def _mixer_part(table: Table) -> list[Deviation]:
         thrust_factor=table.only("thrust_factor"),
     )
     torque, thrust = _torque(table), table.column("thrust")
-    commands = stepwise_mixer.mix(mixer.single, settings, torque, thrust)
-    pulses = tuple(mixer.quantised(command) for command in commands)
+    commands = stepwise_mixer.mix(mixer.as_float32, settings, torque, thrust)
+    pulses = tuple(mixer.quantise(command) for command in commands)
     saturation = mixer.saturation(settings, commands)
     wanted = [
         [table.column(f"{axis}_{sign}") for axis in ("roll", "pitch", "yaw")]

@@ -38,7 +38,7 @@ def mix(rounded: Rounding, settings: MixerSettings, torque: Vec3, thrust: Scalar
     Parameters
     ----------
     rounded
-        What is done after every operation: `sim_jax.control.mixer.single` or `exact`.
+        What is done after every operation: `sim_jax.control.mixer.as_float32` or `exact`.
     settings
         Airmode and thrust factor.
     torque, thrust

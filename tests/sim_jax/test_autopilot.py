@@ -14,7 +14,7 @@ import pytest
 from sim_jax.constants import GRAVITY
 from sim_jax.control.gains import with_gains_of
 from sim_jax.control.geometric import ReferencePoint
-from sim_jax.frames import estimated, gyro_of
+from sim_jax.frames import estimated_motion, gyro_of
 from sim_jax.geometry import rotation
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rollout import rollout
@@ -127,10 +127,10 @@ def test_who_is_fed_by_motion_capture_does_not_know_that_its_autopilot_is_askew(
 
 def test_the_attitude_that_is_seen_is_the_autopilots_own():
     motion = moving_start(vehicle()).motion
-    seen = estimated(craft_with(TILT), controller(), motion)
+    seen = estimated_motion(craft_with(TILT), controller(), motion)
     turned = motion.attitude.product(rotation(vec(0.02, -0.01, 0.0)))
     np.testing.assert_allclose(seen.attitude.stacked(), turned.stacked())
-    assert estimated(craft_with(SCALE), controller(), motion) is motion
+    assert estimated_motion(craft_with(SCALE), controller(), motion) is motion
 
 
 def test_gains_are_those_of_the_file_times_a_factor():

@@ -20,7 +20,7 @@ from sim_jax.environment import Air
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
-from sim_jax.sensing import GyroFilter, GyroMemory, filtered, look_back
+from sim_jax.sensing import GyroFilter, GyroMemory, filter_gyro, look_back
 from sim_jax.terms.total import total_wrench
 from sim_jax.trajectory import Circle, publish
 from sim_jax.vehicle import PerRotor, Rotor, Vehicle
@@ -39,7 +39,7 @@ HALF = jnp.asarray(0.5)
 def steer(reference: ReferencePoint, place: Vec3, velocity: Vec3, now: Quaternion) -> object:
     gains = CONTROL.position
     heading = geometric.heading_of(gains, velocity)
-    wanted = geometric.wanted_acceleration(gains, reference, place, velocity, heading)
+    wanted = geometric.acceleration_setpoint(gains, reference, place, velocity, heading)
     goal = geometric.attitude_from_acceleration(wanted, heading)
     return (
         geometric.rate_setpoint(CONTROL.attitude, now, goal),
@@ -302,8 +302,8 @@ def test_gyro_filters() -> None:
     def run(cutoff: Array, derivative_cutoff: Array, first: Vec3, second: Vec3) -> GyroMemory:
         filters = Filters(cutoff, derivative_cutoff)
         gyro = GyroFilter.at(filters, 400.0)
-        memory = filtered(gyro, GyroMemory.settled(gyro, first), second, 400.0)
-        return filtered(gyro, memory, first, 400.0)
+        memory = filter_gyro(gyro, GyroMemory.settled(gyro, first), second, 400.0)
+        return filter_gyro(gyro, memory, first, 400.0)
 
     cutoffs = jnp.asarray(40.0), jnp.asarray(20.0)
     assert_derivatives(run, *cutoffs, STILL, STILL, tolerance=1e-5)

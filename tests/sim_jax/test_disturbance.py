@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim_jax.environment import NOTHING_AROUND, Disturbance, Environment
+from sim_jax.environment import STILL_AIR, Disturbance, Environment
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import RotorSpeedInlet
 from sim_jax.rollout import Rollout, rollout
@@ -46,7 +46,7 @@ def fallen(around: Environment) -> Rollout:
 
 def test_a_force_accelerates_by_newtons_law() -> None:
     pushed = fallen(acting(force=series(0.3, -0.2, 0.5)))
-    free = fallen(NOTHING_AROUND)
+    free = fallen(STILL_AIR)
     mass = float(vehicle().body.mass)
     gained = pushed.log.motion.velocity - free.log.motion.velocity
     for axis, force in zip(gained.stacked()[:, -1], (0.3, -0.2, 0.5), strict=True):
@@ -58,7 +58,7 @@ def test_a_moment_turns_by_eulers_law_and_thrust_acts_along_the_bodys_axis() -> 
     rate = float(turned.log.motion.body_rate.y[-1])
     assert rate == pytest.approx(0.002 / float(vehicle().body.inertia_yy) * SECONDS, rel=1e-9)
     lifted = fallen(acting(thrust=jnp.full(TICKS, 0.4)))
-    gained = lifted.log.motion.velocity.z[-1] - fallen(NOTHING_AROUND).log.motion.velocity.z[-1]
+    gained = lifted.log.motion.velocity.z[-1] - fallen(STILL_AIR).log.motion.velocity.z[-1]
     assert float(gained) == pytest.approx(0.4 / float(vehicle().body.mass) * SECONDS, rel=1e-9)
 
 
@@ -103,7 +103,7 @@ def test_a_steady_gust_is_a_wind() -> None:
 
 
 def test_a_disturbance_of_zero_moves_nothing() -> None:
-    assert apart(flown(acting()).log, flown(NOTHING_AROUND).log) < 1e-12
+    assert apart(flown(acting()).log, flown(STILL_AIR).log) < 1e-12
 
 
 def test_values_are_linear_between_control_ticks() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from jax import Array
 
-from sim_jax.environment import NOTHING_AROUND, Air, Environment
+from sim_jax.environment import STILL_AIR, Air, Environment
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet, RotorSpeedInlet
 from sim_jax.rigid_body import Motion
@@ -42,7 +42,7 @@ def with_effects(craft: Vehicle, effects: Mapping[str, float | Array]) -> Vehicl
     return replace(craft, effects=numbers)
 
 
-def flown(craft: Vehicle, inlet: ActuatorInlet, around: Environment = NOTHING_AROUND) -> Rollout:
+def flown(craft: Vehicle, inlet: ActuatorInlet, around: Environment = STILL_AIR) -> Rollout:
     start = moving_start(craft)
     return rollout(craft, controller(), SCHEDULE, inlet, start, samples=SAMPLES, environment=around)
 

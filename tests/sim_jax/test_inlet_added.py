@@ -10,7 +10,7 @@ import pytest
 from sim_jax.constants import GRAVITY
 from sim_jax.geometry import Quaternion
 from sim_jax.inlet import ActuatorInlet, Inlet, MixedInlet, Stages, Step
-from sim_jax.numeric import like, row_of
+from sim_jax.numeric import cast_like, row_of
 from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from sim_jax.state import State
@@ -39,10 +39,10 @@ class HeldAttitude(Inlet):
     attitude: Quaternion
 
     def next_command(self, stages: Stages, state: State, step: Step) -> State:
-        return stages.commanded(state, like(row_of(self.command, step), state.command))
+        return stages.commanded(state, cast_like(row_of(self.command, step), state.command))
 
     def next_motion(self, moved: Motion, step: Step) -> Motion:
-        attitude = like(row_of(self.attitude, step + 1), moved.attitude)
+        attitude = cast_like(row_of(self.attitude, step + 1), moved.attitude)
         return Motion(moved.position, moved.velocity, attitude, moved.body_rate)
 
     def rotor_counts(self) -> set[int]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim_jax.environment import NOTHING_AROUND, Air, Environment
+from sim_jax.environment import STILL_AIR, Air, Environment
 from sim_jax.rigid_body import Motion
 from sim_jax.terms import total
 from sim_jax.terms.beyond import fuselage_drag
@@ -60,7 +60,7 @@ def test_a_draught_leaves_of_thrust_and_damping_what_gusts_leave_in_the_mean(cli
     scatter = np.asarray(blown).std(axis=0) / np.sqrt(len(gusts))
     found = np.asarray(acting(Environment(draught=jnp.asarray(sd))))
     assert (np.abs(found - np.asarray(blown).mean(axis=0)) < 4.0 * scatter + 1e-9).all()
-    still = np.asarray(acting(NOTHING_AROUND))
+    still = np.asarray(acting(STILL_AIR))
     if 0.0 < climbs < sd:
         assert (np.abs(found - still)[2:5] > 10.0 * scatter[2:5]).all()
     if climbs > 10.0 * sd:

@@ -14,7 +14,7 @@ from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import Tachometer
 from sim_jax.state import hover_speed
-from sim_jax.terms.rotor import lifting
+from sim_jax.terms.rotor import thrust_terms_act
 from sim_jax.terms.total import total_wrench, wrench_of_each_term
 from tests.sim_jax.support import (
     compiled_rollout,
@@ -141,7 +141,9 @@ def test_ground_lifts_by_cheeseman_and_bennett():
 @pytest.mark.parametrize("exponent", [1.8, 1.93, 2.15])
 def test_thrust_grows_by_a_power_of_the_speed_about_the_hovers(exponent):
     speeds = np.linspace(0.34, 2.0, 12) * float(hover_speed(CRAFT))
-    lifted = np.asarray(lifting(with_effects(thrust_exponent=exponent))(jnp.asarray(speeds)))
+    lifted = np.asarray(
+        thrust_terms_act(with_effects(thrust_exponent=exponent))(jnp.asarray(speeds))
+    )
     power = (speeds / float(hover_speed(CRAFT))) ** (exponent - 2.0)
     np.testing.assert_allclose(lifted / speeds**2, power, rtol=2e-3)
     near = np.abs(speeds / float(hover_speed(CRAFT)) - 1.0) < 0.3

@@ -15,7 +15,7 @@ from sim_jax.inlet import ReferenceInlet
 from sim_jax.motor import command_of, reference_speed
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
-from sim_jax.trim import in_trim, trim_speeds
+from sim_jax.trim import trim_speeds, trimmed_start
 from tests.sim_jax.support import compiled_rollout, controller, reference, vec, vehicle
 
 UNEVEN = {
@@ -46,7 +46,7 @@ def drift(craft, start):
 def test_an_uneven_vehicle_in_trim_stays_and_without_trim_moves():
     craft = uneven(**UNEVEN)
     level = hover(craft, vec(0.0, 0.0, 1.0))
-    trimmed = in_trim(craft, controller(), level, AT_REST)
+    trimmed = trimmed_start(craft, controller(), level, AT_REST)
     assert drift(craft, trimmed) < 1e-4
     assert drift(craft, level) > 1e-3
 
@@ -54,8 +54,8 @@ def test_an_uneven_vehicle_in_trim_stays_and_without_trim_moves():
 def test_a_battery_asks_for_larger_commands_and_the_same_speeds():
     craft = uneven(**UNEVEN)
     level = hover(craft, vec(0.0, 0.0, 1.0))
-    full = in_trim(craft, controller(), level, AT_REST)
-    low = in_trim(craft, controller(), level, AT_REST, speed_factor=jnp.asarray(0.95))
+    full = trimmed_start(craft, controller(), level, AT_REST)
+    low = trimmed_start(craft, controller(), level, AT_REST, speed_factor=jnp.asarray(0.95))
     np.testing.assert_allclose(low.rotor_speed, full.rotor_speed, rtol=1e-12)
     for speed, command in zip(low.rotor_speed, low.command, strict=True):
         assert 0.95 * reference_speed(craft.motor, command) == pytest.approx(speed)
@@ -64,14 +64,14 @@ def test_a_battery_asks_for_larger_commands_and_the_same_speeds():
 def test_an_even_vehicle_rests_whatever_its_first_command_answers():
     level = hover(vehicle(), vec(0.0, 0.0, 1.0))
     pushed = replace(level, command=tuple(command + 0.2 for command in level.command))
-    trimmed = in_trim(vehicle(), controller(), pushed, AT_REST)
+    trimmed = trimmed_start(vehicle(), controller(), pushed, AT_REST)
     for kept, held in zip(jax.tree.leaves(trimmed), jax.tree.leaves(level), strict=True):
         np.testing.assert_allclose(kept, held, atol=1e-12)
 
 
 def test_a_moving_vehicle_starts_as_recorded():
     level = hover(vehicle(), vec(0.0, 0.0, 1.0))
-    moving = in_trim(uneven(**UNEVEN), controller(), level, jnp.asarray(False))
+    moving = trimmed_start(uneven(**UNEVEN), controller(), level, jnp.asarray(False))
     for kept, recorded in zip(jax.tree.leaves(moving), jax.tree.leaves(level), strict=True):
         np.testing.assert_array_equal(kept, recorded)
     np.testing.assert_allclose(trim_speeds(vehicle()), hover(vehicle(), vec(0, 0, 1)).rotor_speed)

@@ -29,7 +29,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.terms import total
 from tests.memory import BEFORE_A_FIT, give_back
 from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
-from tuner.cli.options import EACH, EVERY
+from tuner.cli.options import FLATTENED, MANY_WORDS
 from tuner.config import JobFile, resolve_settings
 from tuner.core import shipped
 from tuner.core.errors import ConfigError, ExportError
@@ -100,10 +100,10 @@ class MoreOptions(Options):
 
 
 def test_an_option_is_one_field_for_the_command_line_python_the_job_file_and_http(tmp_path, capsys):
-    app = App(name="tune", default_parameter=EVERY, result_action="return_value")
+    app = App(name="tune", default_parameter=MANY_WORDS, result_action="return_value")
 
     @app.default
-    def command(*, options: Annotated[MoreOptions, EACH]):
+    def command(*, options: Annotated[MoreOptions, FLATTENED]):
         return options
 
     app(["--help"])

@@ -13,7 +13,7 @@ from typing import NoReturn
 
 from cyclopts import App, CycloptsError
 
-from tuner.cli.options import EVERY, TYPED
+from tuner.cli.options import MANY_WORDS, TYPED_WORDS
 from tuner.cli.tune import tune
 from tuner.core.errors import InputError, ServerFaultError, did_you_mean
 from tuner.core.phrases import printable
@@ -38,7 +38,7 @@ app = App(
     help=SUMMARY,
     help_epilogue="\n".join(f"Example: {example}" for example in EXAMPLES),
     help_format="plaintext",
-    default_parameter=EVERY,
+    default_parameter=MANY_WORDS,
     version=version,
     result_action="return_value",
     exit_on_error=False,
@@ -108,10 +108,7 @@ COMMANDS = {
         "Fetch the result of a job of a tuning service.",
         "tune fetch 3f2a91c05d7e4b68 --out runs/first",
     ),
-    "cancel": (
-        "Cancel a job of a tuning service.",
-        "tune cancel 3f2a91c05d7e4b68",
-    ),
+    "cancel": ("Cancel a job of a tuning service.", "tune cancel 3f2a91c05d7e4b68"),
     "watch-folder": (
         "Submit a job to a tuning service whenever new recordings in a folder have settled.",
         "tune watch-folder lab/ --server http://lab:8000",
@@ -145,7 +142,7 @@ DONE = 0
 INTERNAL_ERROR = 1
 WRONG_INPUT = 2
 INTERRUPTED = 130
-FULL = (errno.ENOSPC, errno.EDQUOT)
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def program() -> NoReturn:
@@ -162,7 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Without the program's name; None takes those of the process.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
-    TYPED.set(shlex.join(["tune", *given]))
+    TYPED_WORDS.set(shlex.join(["tune", *given]))
     for stream in (sys.stdout, sys.stderr):  # a terminal of another encoding lacks letters
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -170,35 +167,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     logging.captureWarnings(True)
     status = DONE
     try:
-        _know_the_command(given)
+        _require_command(given)
         answer = app(given or ["--help"])
         sys.stdout.flush()
         status = answer if isinstance(answer, int) else DONE  # of a command that answers by it
     except ServerFaultError as error:
-        return _say(str(error), INTERNAL_ERROR)
+        return _print_error(str(error), INTERNAL_ERROR)
     except InputError as error:
-        return _say(str(error), WRONG_INPUT)
+        return _print_error(str(error), WRONG_INPUT)
     except CycloptsError as error:
-        return _say(f"{' '.join(str(error).split())} See {_help(given)}.", WRONG_INPUT)
+        return _print_error(f"{' '.join(str(error).split())} See {_help(given)}.", WRONG_INPUT)
     except KeyboardInterrupt:
-        return _say("interrupted", INTERRUPTED)
+        return _print_error("interrupted", INTERRUPTED)
     except BrokenPipeError:
         sys.stderr.close()  # whoever read our output has gone; nothing is left to say
     except Exception as error:
-        return _unforeseen(error)
+        return _report_internal_error(error)
     return status
 
 
-def _unforeseen(error: Exception) -> int:
+def _report_internal_error(error: Exception) -> int:
     """Report what no part of the program answers for, the full disk of a redirected output too."""
-    if isinstance(error, OSError) and error.errno in FULL:
-        return _say("the disk is full; free some space and try again", WRONG_INPUT)
+    if isinstance(error, OSError) and error.errno in DISK_FULL:
+        return _print_error("the disk is full; free some space and try again", WRONG_INPUT)
     traceback.print_exception(error)
     what = f"internal error ({type(error).__name__}: {error})"
-    return _say(f"{what}; please report it", INTERNAL_ERROR)
+    return _print_error(f"{what}; please report it", INTERNAL_ERROR)
 
 
-def _know_the_command(arguments: Sequence[str]) -> None:
+def _require_command(arguments: Sequence[str]) -> None:
     """Refuse a first word that is neither an option nor a command."""
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         raise InputError("command line", f"no command '{arguments[0]}'", _remedy(arguments[0]))
@@ -215,6 +212,6 @@ def _help(arguments: Sequence[str]) -> str:
     return f"tune {arguments[0]} --help" if named else "tune --help"
 
 
-def _say(line: str, status: int) -> int:
+def _print_error(line: str, status: int) -> int:
     sys.stderr.write(printable(f"tune: {' '.join(line.split())}") + "\n")
     return status

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from tuner.cli.options import EACH, TYPED, Quiet, Verbose
+from tuner.cli.options import FLATTENED, TYPED_WORDS, Quiet, Verbose
 from tuner.core.errors import InputError
 from tuner.core.phrases import printable
 from tuner.options import (
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 def inspect(
     *flights: Annotated[str, Parameter(help="Inspect these recordings, or a quoted glob.")],
-    reading: Annotated[ReadingOptions, EACH] = ReadingOptions(),
+    reading: Annotated[ReadingOptions, FLATTENED] = ReadingOptions(),
     vehicle: str | None = None,
     json: bool = False,
     suggest: bool = False,
@@ -80,7 +80,7 @@ def inspect(
 
 def compare(
     *,
-    recordings: Annotated[RecordingOptions, EACH],
+    recordings: Annotated[RecordingOptions, FLATTENED],
     vehicle: list[str],
     out: list[Path] | None = None,
     laps: bool = False,
@@ -100,7 +100,7 @@ def compare(
     plot
         Draw the position errors over time into this FILE.png, .svg or .pdf.
     """
-    from tuner.cli.progress import listening
+    from tuner.cli.progress import progress_on_terminal
     from tuner.cli.tables import print_comparison
     from tuner.core.runtime import configure
 
@@ -117,7 +117,7 @@ def compare(
         if plot is not None:
             write_figure(comparison_figure(flown), plot)
 
-    with listening(quiet=quiet, verbose=True) as listener:
+    with progress_on_terminal(quiet=quiet, verbose=True) as listener:
         table, settings = compare_vehicles(
             recordings, vehicle, out or (), on_flown=draw, on_message=listener.on_message
         )
@@ -128,7 +128,7 @@ def compare(
 def simulate(
     *,
     out: Path,
-    asked: Annotated[SimulationOptions, EACH],
+    asked: Annotated[SimulationOptions, FLATTENED],
     sweep: list[str] | None = None,
     forces: Path | None = None,
     quiet: Quiet = False,
@@ -172,7 +172,7 @@ def simulate(
 
 def sensitivity(
     *,
-    asked: Annotated[ExaminationOptions, EACH],
+    asked: Annotated[ExaminationOptions, FLATTENED],
     arena: str | None = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -186,7 +186,7 @@ def sensitivity(
         recorded flights took, and a little more.
     """
     from tuner.cli.options import lengths
-    from tuner.cli.progress import listening
+    from tuner.cli.progress import progress_on_terminal
     from tuner.cli.results import print_sensitivity
     from tuner.core.runtime import configure
 
@@ -196,12 +196,12 @@ def sensitivity(
 
     with (
         engine_for(asked.workers, asked.cluster),
-        listening(quiet=quiet, verbose=verbose) as listener,
+        progress_on_terminal(quiet=quiet, verbose=verbose) as listener,
     ):
         result = examine_vehicle(
             asked,
             None if arena is None else lengths("--arena", arena),
-            command=TYPED.get(),
+            command=TYPED_WORDS.get(),
             on_message=listener.on_message,
         )
     if not quiet:
@@ -209,11 +209,7 @@ def sensitivity(
 
 
 def export(
-    run: Path,
-    /,
-    *,
-    asked: Annotated[ExportOptions, EACH],
-    quiet: Quiet = False,
+    run: Path, /, *, asked: Annotated[ExportOptions, FLATTENED], quiet: Quiet = False
 ) -> None:
     """Write the coefficients of a run, or a vehicle file, for a simulator.
 
@@ -319,7 +315,7 @@ def bench(
     """
     from tuner.job.bench import bench as run_bench
 
-    result = run_bench(file, out=out, command=TYPED.get())
+    result = run_bench(file, out=out, command=TYPED_WORDS.get())
     if not quiet:
         from tuner.cli.results import print_bench
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tuner.vehicle.scaling_laws import Airframe
 
 INCH = 0.0254
-ASKED = {
+QUESTIONS = {
     "--mass": (0.01, 100.0, "kg", "Mass, ready to fly [kg]: "),
     "--wheelbase": (0.03, 5.0, "m", "Distance between opposite motors [m]: "),
     "--cells": (1.0, 24.0, "cells", "Cells of the battery in series (empty if not known): "),
@@ -90,9 +90,9 @@ def new_vehicle(
              "--motor-kv": motor_kv, "--hover-throttle": hover_throttle,
              "--rotor-height": rotor_height}  # fmt: skip
     if asking:
-        for option, (*_, question) in ASKED.items():
+        for option, (*_, question) in QUESTIONS.items():
             if given[option] is None:
-                given[option] = _answer(option, input(question))
+                given[option] = _parse_answer(option, input(question))
         if propeller is None:
             propeller = input("Propeller, diameter x pitch in inch, as 11x4.7: ").strip()
     for option, value in given.items():
@@ -108,7 +108,7 @@ def new_vehicle(
 def _airframe(
     given: Mapping[str, float | None], propeller: str | None, known: Airframe | None
 ) -> Airframe:
-    """Return what is given, and the rest from a known vehicle, its motors with its propeller."""
+    """Return the given properties, and the others of a known vehicle."""
     from tuner.vehicle.scaling_laws import Airframe
 
     numbers = {option: value for option, value in given.items() if value is not None}
@@ -138,7 +138,7 @@ def _airframe(
     )
 
 
-def _answer(option: str, text: str) -> float | None:
+def _parse_answer(option: str, text: str) -> float | None:
     try:
         return float(text) if text.strip() else None
     except ValueError:
@@ -146,7 +146,7 @@ def _answer(option: str, text: str) -> float | None:
 
 
 def _check(option: str, value: float | None) -> None:
-    low, high, unit, _ = ASKED[option]
+    low, high, unit, _ = QUESTIONS[option]
     if value is not None and not low <= value <= high:
         remedy = f"give {low:g} to {high:g} {unit}"
         raise InputError(option, f"{value:g} is not one of a multirotor", remedy)

@@ -12,20 +12,20 @@ from cyclopts import CoercionError, Parameter, Token, convert
 from tuner.core.errors import InputError
 
 #: The command line as the user typed it, for the record of a run.
-TYPED: ContextVar[str] = ContextVar("TYPED", default="")
+TYPED_WORDS: ContextVar[str] = ContextVar("TYPED", default="")
 
 
 def _exactly(kind: Any, words: Sequence[Token]) -> Any:
-    """Return what words mean, none of them rounded: ``1.7`` is no whole number."""
+    """Return the values of words without rounding: ``1.7`` is no whole number."""
     if int in (kind, *get_args(kind)) and not all(w.value.strip("+-").isdecimal() for w in words):
         raise CoercionError(token=words[0], target_type=int)
     return convert(kind, words)
 
 
 #: An option takes all words up to the next option, and a switch takes none.
-EVERY = Parameter(consume_multiple=True, negative=(), converter=_exactly)
+MANY_WORDS = Parameter(consume_multiple=True, negative=(), converter=_exactly)
 #: The fields of a class of `tuner.options` are options of the command.
-EACH = Parameter(name="*")
+FLATTENED = Parameter(name="*")
 Quiet = Annotated[bool, Parameter(help="Print nothing but errors.")]
 Verbose = Annotated[bool, Parameter(help="Print all that the report says, and each message.")]
 

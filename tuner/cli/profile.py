@@ -1,4 +1,4 @@
-"""What ``tune --profile`` leaves: a table by stage and a trace that Perfetto opens."""
+"""The files of ``tune --profile``: a table by stage, and a trace for Perfetto."""
 
 from __future__ import annotations
 

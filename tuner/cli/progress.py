@@ -1,4 +1,4 @@
-"""What a long run shows while it works: a moving line on a terminal, one line a stage elsewhere."""
+"""Progress of a run: a live line on a terminal, one line per stage elsewhere."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from tuner.search.iteration import Iteration, PointEstimate
 
 
-SEARCHED = (
+SEARCH_ENDED = (
     "The search ended here. Which terms the flights call for, how far each value can be trusted, "
     "and how well held-out flights are predicted, follows."
 )
 
 
 STARTING = "Starting"
-DOING = {
+STAGE_PHRASES = {
     "reading": "Reading the flights",
     "check": "Checking the flights, and compiling their simulation",
     "search": "Searching, and compiling its first steps",
@@ -53,7 +53,7 @@ DOING = {
 
 
 @contextmanager
-def listening(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
+def progress_on_terminal(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
     """Yield a listener that shows a run on the terminal, or nothing; each message if verbose."""
     from tuner.cli.results import WIDTH, estimates_table, folds_table
     from tuner.findings.findings import shorten_finding
@@ -63,14 +63,14 @@ def listening(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
         yield SILENT
         return
     screen = console()
-    search = _MovingLine(screen) if screen.is_terminal else _StageLines(screen)
+    search = _LiveLine(screen) if screen.is_terminal else _StageLines(screen)
 
     def say(text: str) -> None:
         search.line(text)
 
     def show_estimates(estimates: Sequence[PointEstimate]) -> None:
         search.table(estimates_table(estimates))
-        say(SEARCHED)
+        say(SEARCH_ENDED)
 
     def show_settings(settings: Settings) -> None:
         for name, origin in settings.origin.items():
@@ -99,7 +99,7 @@ def listening(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
         search.close()
 
 
-class _MovingLine:
+class _LiveLine:
     """One line at the foot of a terminal: what runs now, and for how long.
 
     How long it will still take depends on what the flights call for, and is not said.
@@ -116,7 +116,7 @@ class _MovingLine:
         return Text(f"{self._doing}, {time.perf_counter() - self._began:.0f} s so far")
 
     def stage(self, name: str) -> None:
-        self._doing = DOING.get(name, as_sentence(name)) if name else STARTING
+        self._doing = STAGE_PHRASES.get(name, as_sentence(name)) if name else STARTING
 
     def show(self, iteration: Iteration) -> None:
         self._doing = _iteration(iteration)
@@ -141,9 +141,9 @@ class _StageLines:
         self._last: Iteration | None = None
 
     def stage(self, name: str) -> None:
-        if name in DOING and name not in self._named:
+        if name in STAGE_PHRASES and name not in self._named:
             self._named.add(name)
-            self.line(DOING[name])
+            self.line(STAGE_PHRASES[name])
 
     def show(self, iteration: Iteration) -> None:
         self._last = iteration

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from tuner.cli.options import EACH, Quiet
+from tuner.cli.options import FLATTENED, Quiet
 from tuner.options import FitOptions
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> No
 
 def submit(
     *,
-    fitted: Annotated[FitOptions, EACH],
+    fitted: Annotated[FitOptions, FLATTENED],
     server: Server = None,
     token: Token = None,
     wait: bool = False,
@@ -90,9 +90,9 @@ def submit(
     name
         Call the job so in lists.
     """
-    from tuner.cli.progress import listening
+    from tuner.cli.progress import progress_on_terminal
     from tuner.cli.results import print_run
-    from tuner.client.client import ended_well
+    from tuner.client.client import is_success
     from tuner.result import place_for
 
     with client_of(server, token) as client:
@@ -103,13 +103,13 @@ def submit(
             print(job if quiet else f"job {job}: {client.url}/jobs/{job}")
             return
         try:
-            with listening(quiet=quiet) as listener:
+            with progress_on_terminal(quiet=quiet) as listener:
                 show(client.follow(job), listener)
         except KeyboardInterrupt:
             if not quiet:
                 print(f"Job {job} goes on at the server: tune watch {job}, or tune cancel {job}.")
             raise
-        ended_well(client.job(job))
+        is_success(client.job(job))
         run = client.fetch(job, out)
     if not quiet:
         print_run(run.folder, run.result)
@@ -149,12 +149,12 @@ def jobs(
         return
     rows = [
         (
-            _plain(job["id"]),
-            _standing(job),
-            *(_plain(job[key]) for key in ("vehicle", "name")),
-            _plain(job["submitted"][:16].replace("T", " ")),
+            _in_a_line(job["id"]),
+            _state_of(job),
+            *(_in_a_line(job[key]) for key in ("vehicle", "name")),
+            _in_a_line(job["submitted"][:16].replace("T", " ")),
             "" if job["rmse"] is None else f"{1000 * job['rmse']:.2f}",
-            _plain(job["error"] or (job["stage"] if job["state"] == "running" else "") or ""),
+            _in_a_line(job["error"] or (job["stage"] if job["state"] == "running" else "") or ""),
         )
         for job in page["jobs"]
     ]
@@ -166,12 +166,12 @@ def jobs(
         screen.print(f"more with --after {page['next']}")
 
 
-def _standing(job: Mapping[str, Any]) -> str:
+def _state_of(job: Mapping[str, Any]) -> str:
     """Return a job's state, and of one that is done whether its result can be used."""
-    return _plain(", ".join(filter(None, (job["state"], job.get("usability")))))
+    return _in_a_line(", ".join(filter(None, (job["state"], job.get("usability")))))
 
 
-def _plain(word: str) -> str:
+def _in_a_line(word: str) -> str:
     """Return a server's word so that the terminal takes nothing in it for control."""
     return "".join(c if c.isprintable() else "?" for c in word)
 
@@ -186,16 +186,16 @@ def watch(
     job
         Its id.
     """
-    from tuner.cli.progress import listening
-    from tuner.client.client import ended_well
+    from tuner.cli.progress import progress_on_terminal
+    from tuner.client.client import is_success
 
     with client_of(server, token) as client:
-        with listening(quiet=quiet, verbose=True) as listener:
+        with progress_on_terminal(quiet=quiet, verbose=True) as listener:
             show(client.follow(job), listener)
         done = client.job(job)
-        ended_well(done)
+        is_success(done)
     if not quiet:
-        print(f"Job {job} is {_standing(done)}; its result comes with: tune fetch {job}")
+        print(f"Job {job} is {_state_of(done)}; its result comes with: tune fetch {job}")
 
 
 def fetch(
@@ -234,7 +234,7 @@ def cancel(job: JobName, /, *, server: Server = None, token: Token = None) -> No
     """
     with client_of(server, token) as client:
         cancelled = client.cancel(job)["id"]
-    print(f"job {_plain(cancelled)}: cancelled")
+    print(f"job {_in_a_line(cancelled)}: cancelled")
 
 
 def watch_folder(

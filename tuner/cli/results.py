@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from tuner.cli.tables import STYLES, console, rich_table
+from tuner.cli.tables import STYLE_OF_LOOK, console, rich_table
 from tuner.core.phrases import listed_within, shorten
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.report.section import Cell, Section, Table
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from tuner.uncertainty.records import Refit
 
 WIDTH, LINES = 100, 30
-"""What a finished job takes of a terminal at most, without --verbose."""
+"""A finished job prints at most so many lines of each, without --verbose."""
 MOST_FLIGHTS, MOST_WARNINGS, LEAST_COEFFICIENTS = 4, 6, 6
-DEFAULT = "default"
+DEFAULT_ORIGIN = "default"
 
 
 def print_run(
@@ -66,14 +66,14 @@ def _summary(contents: Contents, result: RunResult, seconds: float | None) -> li
     lines: list[Text | Table] = [
         Text(
             shorten(f"{found.usability.capitalize()}. {found.what}", WIDTH),
-            f"bold {STYLES[found.look]}",
+            f"bold {STYLE_OF_LOOK[found.look]}",
         ),
         *(Text(line) for line in _origins(result)),
     ]
     if found.checks:
         lines.append(flights_table(found.checks[:MOST_FLIGHTS]))
     lines += _warnings(result)
-    end = [Text(line) for line in (*_rest(result), *_written(folder, exports, seconds))]
+    end = [Text(line) for line in (*_unlisted(result), *_print_files(folder, exports, seconds))]
     words, command = next_step(result, found, folder, exports)
     end.append(Text(f"Next: {words} {command}"))
     taken = sum(1 + len(line.rows) if isinstance(line, Table) else 1 for line in (*lines, *end))
@@ -86,11 +86,11 @@ def _origins(result: RunResult) -> list[str]:
     by_place: dict[str, list[str]] = {}
     for name, place in (origin if isinstance(origin, dict) else {}).items():
         _, _, behind = str(place).partition("(")
-        is_default = str(place).startswith(DEFAULT)
-        by_place.setdefault(DEFAULT if is_default else behind.rstrip(")") or str(place), []).append(
-            name
-        )
-    given = [f"{', '.join(n)} by {p}" for p, n in by_place.items() if p != DEFAULT]
+        is_default = str(place).startswith(DEFAULT_ORIGIN)
+        by_place.setdefault(
+            DEFAULT_ORIGIN if is_default else behind.rstrip(")") or str(place), []
+        ).append(name)
+    given = [f"{', '.join(n)} by {p}" for p, n in by_place.items() if p != DEFAULT_ORIGIN]
     parts = [*given, "all else by default" if given else "all by default"]
     return [shorten(f"Settings: {'; '.join(parts)}.", WIDTH)] if by_place else []
 
@@ -139,7 +139,7 @@ def _coefficients(result: RunResult, room: int) -> list[Text | Table]:
     return lines if rows else []
 
 
-def _rest(result: RunResult) -> list[str]:
+def _unlisted(result: RunResult) -> list[str]:
     """Return a line on what was fixed and one on the terms."""
     from tuner.report.result_texts import nearly_kept
 
@@ -158,7 +158,7 @@ def _rest(result: RunResult) -> list[str]:
     return lines
 
 
-def _written(folder: Path, exports: Sequence[ExportRecord], seconds: float | None) -> list[str]:
+def _print_files(folder: Path, exports: Sequence[ExportRecord], seconds: float | None) -> list[str]:
     files = [one.file for one in exports if one.file]
     refused = [f"{one.format} was refused" for one in exports if one.refused]
     took = "" if seconds is None else f" in {seconds:.0f} s"
@@ -183,7 +183,7 @@ def _print_section(screen: Console, section: Section) -> None:
     for sentence in section.sentences:
         screen.print(Text(sentence))
     for point in section.points:
-        screen.print(Text(f"- {point.text}", STYLES.get(point.look, "")))
+        screen.print(Text(f"- {point.text}", STYLE_OF_LOOK.get(point.look, "")))
     for table in section.tables:
         screen.print(rich_table(table))
     if section.note:
@@ -230,7 +230,7 @@ def estimates_table(estimates: Sequence[PointEstimate]) -> object:
 
 
 def folds_table(folds: Sequence[Refit]) -> object:
-    """Return how well each flight is predicted by the fit to the others."""
+    """Return the table of predictions of each flight by the fit to the others."""
     rows = [
         (
             fold.left_out or "",

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from tuner.cli.options import EVERY
+from tuner.cli.options import MANY_WORDS
 from tuner.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ serve = App(
     help="Run the tuning service: jobs of many people, over HTTP and as pages in a browser.",
     help_epilogue="\n".join(f"Example: {example}" for example in EXAMPLES),
     help_format="plaintext",
-    default_parameter=EVERY,
+    default_parameter=MANY_WORDS,
     result_action="return_value",
     exit_on_error=False,
     print_error=False,
@@ -109,13 +109,7 @@ def _serve(
         hosts=(*LOOPBACK, *map(str.lower, allow_host)) if allow_host or is_loopback(host) else (),
         limits=limits,
     )
-    run(
-        settings,
-        host=host,
-        port=port,
-        say=lambda text: print(text, flush=True),
-        cluster=cluster,
-    )
+    run(settings, host=host, port=port, say=lambda text: print(text, flush=True), cluster=cluster)
 
 
 @token.command

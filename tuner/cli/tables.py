@@ -46,7 +46,7 @@ def console(width: int = WIDTH) -> Console:
     return _Screen(highlight=False, markup=False, width=width)
 
 
-STYLES = {
+STYLE_OF_LOOK = {
     "well": "green",
     "weak": "yellow",
     "not": "red",
@@ -71,7 +71,7 @@ def _cell(of: Cell | str) -> Text:
     if isinstance(of, str):
         return Text(of)
     text = f"{of.text}: {of.small}" if of.look and of.small else of.text
-    return Text(text, STYLES.get(of.look, ""))
+    return Text(text, STYLE_OF_LOOK.get(of.look, ""))
 
 
 def print_flights(summaries: Sequence[Summary], path: Path) -> None:

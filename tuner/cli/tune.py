@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from typing import Annotated
 
-from tuner.cli.options import EACH, TYPED, Quiet, Verbose
+from tuner.cli.options import FLATTENED, TYPED_WORDS, Quiet, Verbose
 from tuner.options import Options
 
 
 def tune(
     *,
-    options: Annotated[Options, EACH],
+    options: Annotated[Options, FLATTENED],
     dry_run: bool = False,
     profile: bool = False,
     quiet: Quiet = False,
@@ -38,7 +38,7 @@ def tune(
 
     with profiling(profile, quiet=quiet) as profile_into:
         with span("import"):
-            from tuner.cli.progress import listening
+            from tuner.cli.progress import progress_on_terminal
             from tuner.cli.results import print_run
             from tuner.core.runtime import configure
 
@@ -49,7 +49,7 @@ def tune(
 
         with span("reading"):
             bare, left_out = read_inertial_flights(resolve_settings(options))
-        told = listening(quiet=quiet, verbose=verbose)
+        told = progress_on_terminal(quiet=quiet, verbose=verbose)
         if bare:
             from tuner.job.without_pose import fit_without_pose
 
@@ -60,7 +60,7 @@ def tune(
                     left_out=left_out,
                     out=options.out,
                     listener=listener,
-                    command=TYPED.get(),
+                    command=TYPED_WORDS.get(),
                 )
             folder, result = measured.folder, measured.result
         else:
@@ -70,7 +70,7 @@ def tune(
                     out=options.out,
                     resume=options.resume,
                     listener=listener,
-                    command=TYPED.get(),
+                    command=TYPED_WORDS.get(),
                 )
         profile_into(folder)
         if not quiet:

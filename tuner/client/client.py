@@ -30,8 +30,8 @@ Event = tuple[str, dict[str, Any]]
 API = "/api/v1"
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 EVENT_STREAM = "text/event-stream"
-PATIENCE = 60.0
-"""s for which a server that answers no more is waited for while a job is followed"""
+MAX_SILENCE_S = 60.0
+"""A followed job's server may be silent for so long."""
 
 
 class Client:
@@ -142,7 +142,7 @@ class Client:
         InputError
             The input cannot be used, or the server cannot be reached.
         """
-        recordings, request = request_of(options)
+        recordings, request = job_request_of(options)
         request["name"] = name
         request["recordings"] = [self.upload(path, on_upload) for path in recordings]
         names = (path.name for path in recordings)
@@ -179,7 +179,7 @@ class Client:
 
     def job(self, job: str) -> dict[str, Any]:
         """Return a job as it stands."""
-        return self._json("GET", _at(job))
+        return self._json("GET", _job_path(job))
 
     def follow(self, job: str) -> Iterator[Event]:
         """Yield kind and content of what happens to a job, to its end, over a server's restarts."""
@@ -187,7 +187,7 @@ class Client:
         while True:
             try:
                 headers = {"Last-Event-ID": last}
-                path = f"{API}{_at(job)}/events"
+                path = f"{API}{_job_path(job)}/events"
                 with self._http.stream("GET", path, headers=headers) as answer:
                     if answer.is_error:
                         answer.read()
@@ -203,7 +203,7 @@ class Client:
                         if kind == "job" and content["ended"] is not None:
                             return
             except self._errors as error:
-                if time.monotonic() - since > PATIENCE:
+                if time.monotonic() - since > MAX_SILENCE_S:
                     raise self._unreachable(error) from None
             time.sleep(1.0)
 
@@ -219,15 +219,15 @@ class Client:
         """
         for _ in self.follow(job):
             pass
-        return ended_well(self.job(job))
+        return is_success(self.job(job))
 
     def cancel(self, job: str) -> dict[str, Any]:
         """Let a job end without a result."""
-        return self._json("POST", f"{_at(job)}/cancel")
+        return self._json("POST", f"{_job_path(job)}/cancel")
 
     def retry(self, job: str) -> dict[str, Any]:
         """Let a job that failed or was cancelled go on."""
-        return self._json("POST", f"{_at(job)}/retry")
+        return self._json("POST", f"{_job_path(job)}/retry")
 
     def fetch(self, job: str, out: Named | None = None) -> Run:
         """Write a job's result into a folder, and read it.
@@ -237,7 +237,7 @@ class Client:
         InputError
             The job is not done, or the folder cannot be written to.
         """
-        found = ended_well(self.job(job))
+        found = is_success(self.job(job))
         if found["state"] != "done":
             raise InputError(f"job {job}", f"is {found['state']}", f"tune watch {job}")
         place = None if out is None else Path(out)
@@ -247,7 +247,7 @@ class Client:
             for name in sorted(found["files"], key=lambda name: name != RunResult.FILE):
                 target = inside(folder, name)
                 with whole_file(target) as unfinished:
-                    self._download(f"{_at(job)}/files/{quote(name)}", unfinished)
+                    self._download(f"{_job_path(job)}/files/{quote(name)}", unfinished)
             return read_run(folder)
 
     def history(self, vehicle: str) -> dict[str, Any]:
@@ -260,10 +260,7 @@ class Client:
 
     def _download(self, path: str, target: Path) -> None:
         try:
-            with (
-                self._http.stream("GET", API + path) as answer,
-                target.open("wb") as file,
-            ):
+            with self._http.stream("GET", API + path) as answer, target.open("wb") as file:
                 if answer.is_error:
                     answer.read()
                     self._check(answer)
@@ -285,9 +282,9 @@ class Client:
         return self._said_in(answer.content)
 
     def _said_in(self, text: str | bytes) -> dict[str, Any]:
-        """Return what a server said in JSON."""
+        """Return the JSON content of a server's answer."""
         try:
-            found = json.loads(text, object_hook=lambda said: _Said(said, self._stranger()))
+            found = json.loads(text, object_hook=lambda said: _AnswerFields(said, self._stranger()))
         except ValueError:
             found = None
         if not isinstance(found, dict):
@@ -324,8 +321,8 @@ class Client:
         return InputError("--server", f"{self.url} is no tuning service", "check the address")
 
 
-class _Said(dict[str, Any]):
-    """What a server said: a key that it left out is no key of a tuning service."""
+class _AnswerFields(dict[str, Any]):
+    """A server's answer; a missing key means that it is no tuning service."""
 
     def __init__(self, content: dict[str, Any], otherwise: InputError) -> None:
         super().__init__(content)
@@ -335,7 +332,7 @@ class _Said(dict[str, Any]):
         raise self._otherwise
 
 
-def ended_well(job: dict[str, Any]) -> dict[str, Any]:
+def is_success(job: dict[str, Any]) -> dict[str, Any]:
     """Return a job unless it failed or was cancelled.
 
     Raises
@@ -364,7 +361,7 @@ class JobRefusedError(InputError):
         self.args = (message,)
 
 
-def _at(job: str) -> str:
+def _job_path(job: str) -> str:
     return f"/jobs/{quote(job, safe='')}"
 
 
@@ -386,7 +383,7 @@ def _events(lines: Iterator[str]) -> Iterator[tuple[str | None, str, str]]:
             data += value
 
 
-def request_of(options: FitOptions) -> tuple[tuple[Path, ...], dict[str, Any]]:
+def job_request_of(options: FitOptions) -> tuple[tuple[Path, ...], dict[str, Any]]:
     """Return the recordings to send and the request that names them, but for their ids.
 
     Raises
@@ -442,7 +439,7 @@ def _settings(settled: Settings) -> dict[str, Any]:
 def _content_of(
     kind: Kind, read: Callable[[Path], Section], named: str | Section | None, base: Path
 ) -> str | dict[str, Any] | None:
-    """Return what a server is told of a file: the name of one that it has, or its content."""
+    """Return the name of a file that the server ships, or else the file's content."""
     if not isinstance(named, str):
         return _content(named)
     path = find_config(kind, named, base)

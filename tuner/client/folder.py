@@ -16,14 +16,14 @@ from tuner.core.files import ResultFile
 from tuner.options import FitOptions
 
 SUFFIXES = (".bag", ".mcap", ".db3", ".ulg", ".csv", ".parquet")
-LOOK = 2.0
-"""s between two looks into the folder"""
+LOOK_INTERVAL_S = 2.0
+"""Between two looks into the folder."""
 Marks = tuple[int, int]
 """bytes, and ns of the last change"""
 
 
 class Submitted(ResultFile):
-    """What was submitted from a folder: name of the recording -> its marks and its job."""
+    """Submitted recordings of a folder: name -> its marks and its job."""
 
     FILE = ".tune-submitted.json"
 
@@ -59,7 +59,7 @@ def watch(
     still_since = time.monotonic()
     refused: Mapping[Path, Marks] = {}
     while True:
-        new = _new(folder)
+        new = _new_recordings(folder)
         if new != seen:
             seen, still_since = new, time.monotonic()
         settled = time.monotonic() - still_since >= settle
@@ -74,10 +74,10 @@ def watch(
                 refused = {} if error.where == "--server" else new
         if once and (not new or settled):
             return
-        time.sleep(min(LOOK, settle) if new else LOOK)
+        time.sleep(min(LOOK_INTERVAL_S, settle) if new else LOOK_INTERVAL_S)
 
 
-def _new(folder: Path) -> dict[Path, Marks]:
+def _new_recordings(folder: Path) -> dict[Path, Marks]:
     """Return the recordings that were not submitted as they are now."""
     before = Submitted.read_if_any(folder) or Submitted()
     found = {}

@@ -21,7 +21,7 @@ from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import replaced, row_of
 from sim_jax.plant import Plant
 from sim_jax.rigid_body import Motion
-from sim_jax.rollout import begun
+from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroMemory
 from sim_jax.state import AIRBORNE, State
@@ -112,7 +112,7 @@ class Observer(eqx.Module):
         start, inlet, environment = beginning_of(
             model, feed.segments, schedule, conditions=conditions
         )
-        plant, state = begun(
+        plant, state = start_simulation(
             model.vehicle,
             model.controller,
             schedule,

@@ -17,11 +17,11 @@ from jax import lax
 
 from lanes import Argument, program_of
 from sim_jax.constants import GRAVITY
-from sim_jax.environment import NOTHING_AROUND
+from sim_jax.environment import STILL_AIR
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import Inlet
 from sim_jax.numeric import Precision
-from sim_jax.rollout import begun
+from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.state import State, hover
 from sim_jax.terms import total
@@ -339,7 +339,7 @@ def _fly_lane(
 ) -> tuple[dict[str, Any], Any]:
     columns, model, inlet, start = inputs
     flown = with_coefficients(model, columns)
-    plant, first = begun(
+    plant, first = start_simulation(
         flown.vehicle,
         flown.controller,
         schedule,
@@ -351,7 +351,7 @@ def _fly_lane(
     def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
         after, row = plant.sample(state, number)
         channels = (SPEEDS, "command", MOTION, TURNED, SETPOINTS)
-        return after, recorded_of(row, flown, NOTHING_AROUND, {}, channels)
+        return after, recorded_of(row, flown, STILL_AIR, {}, channels)
 
     last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))
     return logged, last.crash_time

@@ -22,7 +22,7 @@ from sim_jax.motor import SwitchedLag
 from sim_jax.numeric import replaced
 from sim_jax.plant import Plant
 from sim_jax.rigid_body import Motion
-from sim_jax.rollout import begun
+from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.state import Limits, State
 from tuner.core.numerics import Array
@@ -71,7 +71,7 @@ def flier_of(make: Callable[[float], ExternalBody]) -> Callable[..., Flown]:
         start, inlet, environment = beginning_of(
             model, segments, schedule, states=states, conditions=conditions
         )
-        own, state = begun(
+        own, state = start_simulation(
             model.vehicle,
             model.controller,
             schedule,

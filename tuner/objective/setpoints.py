@@ -19,10 +19,10 @@ from lanes import Argument, program_of
 from sim_jax.control.gains import Controller
 from sim_jax.control.geometric import (
     ReferencePoint,
+    acceleration_setpoint,
     attitude_from_acceleration,
     heading_of,
     rate_setpoint,
-    wanted_acceleration,
 )
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Array as JaxArray
@@ -208,7 +208,7 @@ def _rates(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int
         *(Vec3.of(state[f"reference_{name}"]) for name in ("position", "velocity", "acceleration"))
     )
     heading = heading_of(controller.position, velocity)
-    wanted = wanted_acceleration(controller.position, point, position, velocity, heading)
+    wanted = acceleration_setpoint(controller.position, point, position, velocity, heading)
     goal = attitude_from_acceleration(wanted, heading)
     return rate_setpoint(controller.attitude, estimate, goal).stacked()
 

@@ -28,12 +28,12 @@ from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.numeric import Array as JaxArray
 from sim_jax.plant import Sample
 from sim_jax.rigid_body import Motion
-from sim_jax.rollout import begun
+from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.state import Limits, Start, State
 from sim_jax.terms import total
 from sim_jax.terms.total import total_wrench
-from sim_jax.trim import in_trim
+from sim_jax.trim import trimmed_start
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.core.numerics import Array
 from tuner.objective.battery import relative_log_voltage
@@ -276,7 +276,7 @@ def _flight(
         conditions=given.conditions,
     )
     start, inlet, environment = parts
-    plant, first = begun(
+    plant, first = start_simulation(
         model.vehicle,
         model.controller,
         schedule,
@@ -378,7 +378,7 @@ def beginning_of(
     exponent = model.vehicle.effects.get("battery_exponent")
     factor = environment.speed_factor(exponent, jnp.asarray(0), schedule)
     if segments.resting is not None:
-        start = in_trim(
+        start = trimmed_start(
             model.vehicle, model.controller, start, segments.resting, speed_factor=factor
         )
     if segments.turning is not None:

@@ -35,7 +35,7 @@ from tuner.service.words import over_http
 
 logger = logging.getLogger(__name__)
 
-INSPECTIONS_AT_ONCE = 2
+MAX_INSPECTIONS = 2
 
 
 def create_app(service: Service) -> FastAPI:
@@ -60,7 +60,7 @@ def create_app(service: Service) -> FastAPI:
     app.state.service = service
     app.state.metrics = Metrics(service)
     app.state.uploads = CapacityLimiter(service.settings.limits.uploads_at_once)
-    app.state.inspections = CapacityLimiter(INSPECTIONS_AT_ONCE)
+    app.state.inspections = CapacityLimiter(MAX_INSPECTIONS)
     app.include_router(api)
     app.include_router(watching)
     app.include_router(web)
@@ -75,7 +75,7 @@ def create_app(service: Service) -> FastAPI:
 async def refused(request: Request, error: InputError) -> ASGIApp:
     """Return the answer to a request that cannot be met."""
     status = error.STATUS if isinstance(error, ServiceError) else 422
-    if status == 401 and _is_for_people(request) and request.method == "GET":
+    if status == 401 and _wants_page(request) and request.method == "GET":
         return RedirectResponse("/login", status_code=303)
     return _problem(request, status, error.where, error.what, error.remedy)
 
@@ -100,7 +100,7 @@ async def _invalid(request: Request, error: Exception) -> Response:
 
 
 async def _http(request: Request, error: Exception) -> Response:
-    """Return what the framework refuses: an unknown address or method, a body that is no JSON."""
+    """Return the answer to an unknown address or method, or to a body that is no JSON."""
     assert isinstance(error, HTTPException)
     words = {
         400: ("cannot be understood", "correct it"),
@@ -120,7 +120,7 @@ async def _fault(request: Request, error: Exception) -> Response:
     return _problem(request, 500, "the server", what, "please report it, with its log")
 
 
-def _is_for_people(request: Request) -> bool:
+def _wants_page(request: Request) -> bool:
     """Return whether a request is answered with a page: it is none to the interface."""
     is_call = request.url.path.startswith((API, "/healthz", "/metrics"))
     return not is_call and "text/html" in request.headers.get("accept", "")
@@ -129,7 +129,7 @@ def _is_for_people(request: Request) -> bool:
 def _problem(request: Request, status: int, where: str, what: str, remedy: str) -> Response:
     """Return a refusal as a page, or as JSON."""
     detail = " ".join(f"{where}: {what}; {remedy}".split())
-    if _is_for_people(request):
+    if _wants_page(request):
         return render("problem.html.jinja", status, title="This does not work", sentence=detail)
     where, what, remedy, detail = map(over_http, (where, what, remedy, detail))
     problem = Problem(where=where, what=what, remedy=remedy, detail=detail)
@@ -140,8 +140,8 @@ def _problem(request: Request, status: int, where: str, what: str, remedy: str) 
 
 
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-LAST_ANSWERS = 5
-"""s that answers under way have when the server ends"""
+SHUTDOWN_S = 5
+"""Answers under way get so long when the server ends."""
 
 
 class _Server(uvicorn.Server):
@@ -223,7 +223,7 @@ def _serve(service: Service, *, host: str, port: int, say: Callable[[str], None]
         log_level="warning",
         access_log=False,
         server_header=False,
-        timeout_graceful_shutdown=LAST_ANSWERS,
+        timeout_graceful_shutdown=SHUTDOWN_S,
         h11_max_incomplete_event_size=2**16,
     )
     say(f"Jobs and recordings are kept in {settings.data}.")

@@ -25,12 +25,12 @@ from tuner.service.queue import Claim, Outcome
 from tuner.service.request import FLIGHTS, CheckedRequest
 from tuner.service.settings import Limits
 from tuner.service.tables import State
-from tuner.service.worker import RESULT, Assignment
+from tuner.service.worker import RESULT_FOLDER, Assignment
 
 WORKER = [sys.executable, "-m", "tuner.service.worker"]
-BEAT = 0.5
-"""s between two looks at whether the attempt is still wanted"""
-LONGEST_LINE = 1_000_000
+POLL_INTERVAL_S = 0.5
+"""Between two looks into the job table."""
+MAX_LINE_BYTES = 1_000_000
 
 Events = Sequence[tuple[str, Mapping[str, Any]]]
 Report = Callable[[Events, Mapping[str, Any]], bool]
@@ -79,8 +79,8 @@ def attempt(
     folder, claim, store
         Of the job, and where its recordings are and its result goes.
     report
-        Called with events and the job's progress, at least every `BEAT`; returns whether the
-        attempt still holds its job.
+        Called with events and the job's progress, at least every `POLL_INTERVAL_S`; returns whether
+        the attempt still holds its job.
 
     Raises
     ------
@@ -128,13 +128,13 @@ def attempt(
         reader.join(timeout=5)
         process.stdout.close()
     if last is None:
-        raise DiedError(_cause(process.returncode))
+        raise DiedError(_cause_of_death(process.returncode))
     return _outcome(last, folder, store)
 
 
 def _read(stream: IO[bytes], lines: queue.Queue[bytes | None]) -> None:
     """Pass lines on until the stream ends."""
-    while line := stream.readline(LONGEST_LINE):
+    while line := stream.readline(MAX_LINE_BYTES):
         lines.put(line)
     lines.put(None)
 
@@ -149,7 +149,7 @@ def _follow(
     while True:
         events: list[tuple[str, dict[str, Any]]] = []
         last, ended = None, False
-        until = time.monotonic() + BEAT
+        until = time.monotonic() + POLL_INTERVAL_S
         while (rest := until - time.monotonic()) > 0 and not ended:
             try:
                 line = lines.get(timeout=rest)
@@ -204,7 +204,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _cause(status: int) -> str:
+def _cause_of_death(status: int) -> str:
     """Return why a process died, in words."""
     if status >= 0:
         return f"it ended with status {status}"
@@ -217,19 +217,19 @@ def _cause(status: int) -> str:
 
 
 def _outcome(last: Mapping[str, Any], folder: Path, store: ContentStore) -> Outcome:
-    """Return what an attempt came to, the files of a result put into the store."""
+    """Return the outcome of an attempt, after storing the result's files."""
     if last["kind"] == "refused":
         return Outcome(State.FAILED, error=str(last["error"]), exit_status=2)
     if last["kind"] == "fault":
         error = f"internal error ({last['error']}); please report it"
         return Outcome(State.FAILED, error=error, exit_status=1)
-    result = RunResult.read(folder / RESULT)
-    exports = ExportRecords.read_if_any(folder / RESULT) or ExportRecords()
+    result = RunResult.read(folder / RESULT_FOLDER)
+    exports = ExportRecords.read_if_any(folder / RESULT_FOLDER) or ExportRecords()
     return Outcome(
         State.DONE,
         exit_status=0,
         usability=outcome(result, exports=tuple(exports.exports.values())).usability,
-        files=_stored(folder / RESULT, store),
+        files=_store_files(folder / RESULT_FOLDER, store),
         points=[
             {
                 "coefficient": name,
@@ -246,7 +246,7 @@ def _outcome(last: Mapping[str, Any], folder: Path, store: ContentStore) -> Outc
     )
 
 
-def _stored(result: Path, store: ContentStore) -> list[dict[str, Any]]:
+def _store_files(result: Path, store: ContentStore) -> list[dict[str, Any]]:
     """Put copies of a result's files into the store, and return their rows."""
     rows = []
     for file in sorted(result.rglob("*")):

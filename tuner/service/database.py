@@ -17,10 +17,10 @@ from sqlalchemy.orm import Session
 from tuner.core.errors import InputError
 from tuner.service.errors import UnavailableError
 
-LOCKED_FOR = 5.0
-"""s for which a writer waits for another process."""
-IN_TURN_FOR = 30.0
-"""s for which a writer waits for other threads of this one."""
+MAX_LOCK_WAIT_S = 5.0
+"""A writer waits so long for another process,"""
+MAX_TURN_WAIT_S = 30.0
+"""and so long for other threads of this one."""
 
 
 class Database:
@@ -91,7 +91,7 @@ class Database:
         if self._turn is None:
             yield
             return
-        if not self._turn.acquire(timeout=IN_TURN_FOR):
+        if not self._turn.acquire(timeout=MAX_TURN_WAIT_S):
             raise UnavailableError("the database", "is busy", "try again in a minute")
         try:
             yield
@@ -152,7 +152,7 @@ def _set_up_sqlite(connection: Any, _: object) -> None:
     """Let readers and one writer go side by side, and let us begin transactions ourselves."""
     connection.isolation_level = None
     cursor = connection.cursor()
-    cursor.execute(f"PRAGMA busy_timeout={int(1000 * LOCKED_FOR)}")
+    cursor.execute(f"PRAGMA busy_timeout={int(1000 * MAX_LOCK_WAIT_S)}")
     cursor.execute("PRAGMA journal_mode=WAL")
     cursor.execute("PRAGMA synchronous=FULL")
     cursor.execute("PRAGMA foreign_keys=ON")

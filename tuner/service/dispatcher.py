@@ -29,7 +29,7 @@ from tuner.engine.engine import Engine
 from tuner.engine.engine import Report as Channel
 from tuner.result import CHECKPOINTS
 from tuner.service.attempt import (
-    BEAT,
+    POLL_INTERVAL_S,
     DiedError,
     Events,
     Report,
@@ -41,12 +41,12 @@ from tuner.service.errors import NoSpaceError, UnavailableError
 from tuner.service.queue import Claim, Outcome, Queue
 from tuner.service.settings import Limits, ServiceSettings
 from tuner.service.tables import State
-from tuner.service.worker import RESULT
+from tuner.service.worker import RESULT_FOLDER
 
 
 @dataclass(frozen=True)
 class RemoteTask:
-    """What a machine of the cluster is to do: the claim on a job, and the store's URL."""
+    """The task of a machine of the cluster: the claim on a job, and the store's URL."""
 
     claim: Claim
     store: str
@@ -65,12 +65,12 @@ def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
     kept = dict(claim.checkpoint)
     with tempfile.TemporaryDirectory(prefix="tune-job-") as name:
         folder = Path(name)
-        (folder / RESULT).mkdir()
+        (folder / RESULT_FOLDER).mkdir()
         for file, digest in kept.items():
-            store.fetch(digest, inside(folder / RESULT, file))
+            store.fetch(digest, inside(folder / RESULT_FOLDER, file))
 
         def relay(events: Events, progress: Mapping[str, Any]) -> bool:
-            for file in (folder / RESULT).glob(CHECKPOINTS):
+            for file in (folder / RESULT_FOLDER).glob(CHECKPOINTS):
                 kept[file.name] = put(file, store)
             report({"events": list(events), "progress": dict(progress), "checkpoint": dict(kept)})
             return True
@@ -94,7 +94,7 @@ def run_remotely(
     future = engine.submit(fit_remotely, task, heard.put)
     try:
         while True:
-            has_ended = wait([future], timeout=BEAT).done
+            has_ended = wait([future], timeout=POLL_INTERVAL_S).done
             events, progress = _all(heard)
             if is_unwanted() or not report(events, progress):
                 raise UnwantedError
@@ -107,7 +107,7 @@ def run_remotely(
 
 
 def _all(heard: SimpleQueue[dict[str, Any]]) -> tuple[Events, dict[str, Any]]:
-    """Return what was heard since the last time."""
+    """Return the messages since the last call."""
     events: list[tuple[str, Mapping[str, Any]]] = []
     progress: dict[str, Any] = {}
     while True:
@@ -120,9 +120,6 @@ def _all(heard: SimpleQueue[dict[str, Any]]) -> tuple[Events, dict[str, Any]]:
 
 
 logger = logging.getLogger(__name__)
-
-LOOK = 0.5
-"""s between two looks into the table when nothing calls"""
 
 
 class Dispatcher:
@@ -174,7 +171,7 @@ class Dispatcher:
 
     @property
     def is_alive(self) -> bool:
-        """Whether jobs are being worked off."""
+        """Whether the dispatcher runs."""
         return self._loop.is_alive()
 
     def _run(self) -> None:
@@ -197,7 +194,7 @@ class Dispatcher:
             except Exception:
                 logger.exception("jobs cannot be taken from the table")
                 self._stopping.wait(5.0)
-            self._called.wait(LOOK)
+            self._called.wait(POLL_INTERVAL_S)
             self._called.clear()
 
     def _keep(self) -> None:
@@ -237,7 +234,7 @@ class Dispatcher:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _worked_on(self, claim: Claim, slot: int, folder: Path) -> Outcome:
-        """Return what an attempt comes to, on this machine or another."""
+        """Return the outcome of an attempt, on this machine or another."""
         limits, lease = self._settings.limits, self._settings.lease_seconds
         report = Reporter(self._jobs, claim, lease)
         is_unwanted = self._stopping.is_set

@@ -21,6 +21,7 @@ from tuner.core.disk import file_name
 from tuner.core.errors import InputError
 from tuner.core.runtime import installed
 from tuner.service import jobs, recordings
+from tuner.service.attempt import POLL_INTERVAL_S
 from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
 from tuner.service.jobs import history
 from tuner.service.request import JobRequest
@@ -40,24 +41,21 @@ from tuner.service.shapes import (
     full_job,
 )
 from tuner.service.tables import FINISHED, EventRow, FileRow, JobRow, RecordingRow, State
-from tuner.service.upload import FIELD, Upload, receive
+from tuner.service.upload import FORM_FIELD, Upload, receive
 from tuner.service.words import over_http
 
-LOOK = 0.5
-"""s between two looks into the table"""
 
-
-def _look(service: Service, job: str, after: int) -> tuple[JobRow, Sequence[EventRow]]:
+def _poll(service: Service, job: str, after: int) -> tuple[JobRow, Sequence[EventRow]]:
     row = jobs.job(service.database, job)
     return row, jobs.events(service.database, row, after=after)
 
 
-BLOCK = 1 << 20
+BLOCK_BYTES = 1 << 20
 """bytes that are read at a time"""
 _KINDS = {".json": "application/json", ".csv": "text/csv", ".svg": "image/svg+xml"}
 
 
-def zipped(store: ContentStore, files: Sequence[FileRow], folder: str) -> Iterator[bytes]:
+def zip_stream(store: ContentStore, files: Sequence[FileRow], folder: str) -> Iterator[bytes]:
     """Yield an archive of stored files, in a folder of a name, under plain names.
 
     Parameters
@@ -76,9 +74,9 @@ def zipped(store: ContentStore, files: Sequence[FileRow], folder: str) -> Iterat
                     store.reading(file.sha256) as stream,
                     archive.open(entry, "w", force_zip64=file.size > 2**31 - 1) as target,
                 ):
-                    shutil.copyfileobj(stream, target, BLOCK)
+                    shutil.copyfileobj(stream, target, BLOCK_BYTES)
         whole.seek(0)
-        while block := whole.read(BLOCK):
+        while block := whole.read(BLOCK_BYTES):
             yield block
 
 
@@ -101,7 +99,7 @@ def file_response(store: ContentStore, row: FileRow) -> StreamingResponse:
     async def blocks() -> AsyncIterator[bytes]:
         with store.reading(row.sha256) as file:
             read: Callable[[int], bytes] = file.read
-            while block := await anyio.to_thread.run_sync(read, BLOCK):
+            while block := await anyio.to_thread.run_sync(read, BLOCK_BYTES):
                 yield block
 
     return StreamingResponse(blocks(), media_type=kind, headers=headers)
@@ -134,8 +132,8 @@ _FORM = {
             "multipart/form-data": {
                 "schema": {
                     "type": "object",
-                    "required": [FIELD],
-                    "properties": {FIELD: {"type": "string", "format": "binary"}},
+                    "required": [FORM_FIELD],
+                    "properties": {FORM_FIELD: {"type": "string", "format": "binary"}},
                 }
             }
         },
@@ -158,16 +156,16 @@ def metrics_of(request: Request) -> Metrics:
     return metrics
 
 
-Served = Annotated[Service, Depends(service_of)]
-Counted = Annotated[Metrics, Depends(metrics_of)]
+ServiceOfApp = Annotated[Service, Depends(service_of)]
+MetricsOfApp = Annotated[Metrics, Depends(metrics_of)]
 
 
-def job_of(service: Served, job: str) -> JobRow:
+def job_of(service: ServiceOfApp, job: str) -> JobRow:
     """Return the job that a request is about, with its flights and files."""
     return jobs.job(service.database, job)
 
 
-OfJob = Annotated[JobRow, Depends(job_of)]
+JobOfPath = Annotated[JobRow, Depends(job_of)]
 
 
 async def upload(request: Request) -> tuple[RecordingRow, bool]:
@@ -192,7 +190,7 @@ async def upload(request: Request) -> tuple[RecordingRow, bool]:
         whole = await _received(request)
         metrics.uploaded.inc(whole.size)
         async with request.app.state.inspections:
-            return await anyio.to_thread.run_sync(recordings.take, *parts, whole)
+            return await anyio.to_thread.run_sync(recordings.store_recording, *parts, whole)
     finally:
         uploads.release()
 
@@ -220,14 +218,14 @@ async def post_recording(request: Request, response: Response) -> RecordingAnswe
 
 
 @api.get("/recordings/{recording}", responses=NOT_FOUND)
-def get_recording(service: Served, recording: str) -> RecordingAnswer:
+def get_recording(service: ServiceOfApp, recording: str) -> RecordingAnswer:
     """Return a stored recording, so that it need not be sent again."""
     return RecordingAnswer.model_validate(recordings.recording(service.database, recording))
 
 
 @api.post("/jobs", status_code=202)
 def post_job(
-    service: Served,
+    service: ServiceOfApp,
     request: JobRequest,
     response: Response,
     idempotency_key: Annotated[str | None, Header(max_length=200, pattern="^[!-~]+$")] = None,
@@ -244,7 +242,7 @@ def post_job(
 
 @api.get("/jobs", responses=NOT_FOUND)
 def get_jobs(
-    service: Served,
+    service: ServiceOfApp,
     vehicle: Annotated[str | None, Query(max_length=200)] = None,
     state: State | None = None,
     after: Annotated[str | None, Query(max_length=64)] = None,
@@ -257,7 +255,7 @@ def get_jobs(
 
 
 @api.get("/jobs/{job}", responses=NOT_FOUND)
-def get_job(service: Served, row: OfJob) -> FullJobAnswer:
+def get_job(service: ServiceOfApp, row: JobOfPath) -> FullJobAnswer:
     """Return a job, with what it said."""
     return full_job(row, jobs.events(service.database, row, kind="message"))
 
@@ -270,8 +268,8 @@ class _EventStream(EventSourceResponse):
 
 @api.get("/jobs/{job}/events", response_class=_EventStream, responses=NOT_FOUND)
 async def get_events(
-    service: Served,
-    row: OfJob,
+    service: ServiceOfApp,
+    row: JobOfPath,
     after: Annotated[int, Query(ge=0, le=2**31 - 1)] = 0,
     last_event_id: Annotated[str | None, Header(max_length=20)] = None,
 ) -> AsyncIterator[ServerSentEvent]:
@@ -285,7 +283,7 @@ async def get_events(
     shown = None
     while not service.stopping.is_set():
         try:
-            row, new = await anyio.to_thread.run_sync(_look, service, row.id, after)
+            row, new = await anyio.to_thread.run_sync(_poll, service, row.id, after)
         except ServiceError as error:
             yield ServerSentEvent(event="problem", data={"detail": str(error)})
             return
@@ -302,17 +300,17 @@ async def get_events(
         if row.state in FINISHED and not new:
             return
         if not new:
-            await anyio.sleep(LOOK)
+            await anyio.sleep(POLL_INTERVAL_S)
 
 
 @api.post("/jobs/{job}/cancel", responses={**NOT_FOUND, **CONFLICT})
-def cancel_job(service: Served, job: str) -> FullJobAnswer:
+def cancel_job(service: ServiceOfApp, job: str) -> FullJobAnswer:
     """Let a job end without a result; what its search has found so far is kept for a retry."""
     return _after(service, jobs.cancel(service.database, job))
 
 
 @api.post("/jobs/{job}/retry", responses={**NOT_FOUND, **CONFLICT})
-def retry_job(service: Served, job: str) -> FullJobAnswer:
+def retry_job(service: ServiceOfApp, job: str) -> FullJobAnswer:
     """Put a job that failed or was cancelled back into the queue; its search goes on."""
     return _after(service, jobs.retry(service.database, job))
 
@@ -330,7 +328,7 @@ def _after(service: Service, row: JobRow) -> FullJobAnswer:
         **NOT_FOUND,
     },
 )
-def get_file(service: Served, job: str, name: str) -> StreamingResponse:
+def get_file(service: ServiceOfApp, job: str, name: str) -> StreamingResponse:
     """Return a file of a job's result."""
     return file_response(service.store, jobs.file(service.database, job, name))
 
@@ -338,12 +336,9 @@ def get_file(service: Served, job: str, name: str) -> StreamingResponse:
 @api.get(
     "/jobs/{job}/files.zip",
     response_class=StreamingResponse,
-    responses={
-        200: {"content": {"application/zip": {"schema": {"type": "string"}}}},
-        **NOT_FOUND,
-    },
+    responses={200: {"content": {"application/zip": {"schema": {"type": "string"}}}}, **NOT_FOUND},
 )
-def get_files(service: Served, row: OfJob) -> StreamingResponse:
+def get_files(service: ServiceOfApp, row: JobOfPath) -> StreamingResponse:
     """Return all files of a job's result as one archive."""
     if not row.files:
         raise NotKnownError(f"job {row.id}", "has no files", "wait until the job is done")
@@ -351,18 +346,18 @@ def get_files(service: Served, row: OfJob) -> StreamingResponse:
         if not service.store.has(file.sha256):
             raise NotKnownError(file.name, "is gone from the store", "submit the job again")
     headers = {"content-disposition": f'attachment; filename="{row.id}.zip"'}
-    blocks = zipped(service.store, row.files, row.id)
+    blocks = zip_stream(service.store, row.files, row.id)
     return StreamingResponse(blocks, media_type="application/zip", headers=headers)
 
 
 @api.get("/vehicles/{name}/history", responses=NOT_FOUND)
-def get_history(service: Served, name: str) -> History:
+def get_history(service: ServiceOfApp, name: str) -> History:
     """Return each coefficient over a vehicle's jobs, with intervals."""
     return history(service.database, name)
 
 
 @watching.get("/healthz", responses={503: {"model": Health}})
-def healthz(service: Served) -> Response:
+def healthz(service: ServiceOfApp) -> Response:
     """Say whether the server does its work."""
     database = uploads = "ok"
     try:
@@ -391,6 +386,6 @@ def healthz(service: Served) -> Response:
         **{status: PROBLEMS[status] for status in (401, 403, 429)},
     },
 )
-def metrics(counted: Counted) -> Response:
+def metrics(counted: MetricsOfApp) -> Response:
     """Return counters for Prometheus."""
     return Response(counted.text(), media_type="text/plain; version=0.0.4; charset=utf-8")

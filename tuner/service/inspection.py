@@ -17,13 +17,13 @@ from tuner.core.errors import RecordingError
 from tuner.core.runtime import THREAD_VARIABLES
 from tuner.service.settings import Limits, limit_process, size_in_words
 
-SMALLER = "split the recording, or leave topics out that are not needed (images, point clouds)"
-MOST_JSON = 20_000_000
+SPLIT_REMEDY = "split the recording, or leave topics out that are not needed (images, point clouds)"
+MAX_JSON_BYTES = 20_000_000
 """bytes of an inspection"""
 
 
 def inspect(file: Path, limits: Limits) -> dict[str, Any]:
-    """Return what `tune inspect` finds in a recording, as JSON holds it.
+    """Return the JSON content of `tune inspect` on a recording.
 
     Raises
     ------
@@ -48,11 +48,11 @@ def inspect(file: Path, limits: Limits) -> dict[str, Any]:
         )
     except subprocess.TimeoutExpired:
         what = f"takes more than {limits.inspection_seconds:g} s to read"
-        raise RecordingError(file.name, what, SMALLER) from None
+        raise RecordingError(file.name, what, SPLIT_REMEDY) from None
     if done.returncode == 3:
         what = f"needs more than {size_in_words(limits.inspection_memory_bytes)} of memory to read"
-        raise RecordingError(file.name, what, SMALLER)
-    if done.returncode != 0 or len(done.stdout) > MOST_JSON:
+        raise RecordingError(file.name, what, SPLIT_REMEDY)
+    if done.returncode != 0 or len(done.stdout) > MAX_JSON_BYTES:
         raise RecordingError(
             file.name, "cannot be read: its reader was stopped", "is it a recording of a flight?"
         )

@@ -18,7 +18,7 @@ from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError, TooManyError, unknown_job
 from tuner.service.names import recording_name, shown, stems
 from tuner.service.queue import UNCLAIMED, add_event
-from tuner.service.request import JobRequest, checked
+from tuner.service.request import JobRequest, check_request
 from tuner.service.settings import Limits
 from tuner.service.shapes import CoefficientHistory, History, Point, iso
 from tuner.service.tables import (
@@ -33,7 +33,7 @@ from tuner.service.tables import (
 )
 from tuner.vehicle.registry import mass_factor
 
-PAGE = 50
+PAGE_SIZE = 50
 """Jobs of one page."""
 _ID = re.compile("[0-9a-f]{16}")
 
@@ -66,7 +66,7 @@ def submit(
     if unfinished is not None and unfinished >= limits.unfinished_jobs:
         raise TooManyError("the service", f"has {unfinished} unfinished jobs", "try again later")
     flights = [recording_name(request.names.get(r.sha256) or r.name) for r in recordings]
-    asked, vehicle, holdout = checked(request, flights, earlier)
+    asked, vehicle, holdout = check_request(request, flights, earlier)
     flown = [t for r in recordings if (t := _seconds(r.inspection.get("started"))) is not None]
     row = JobRow(
         id=secrets.token_hex(8),
@@ -163,7 +163,7 @@ def page(
     vehicle: str | None = None,
     state: State | None = None,
     after: str | None = None,
-    limit: int = PAGE,
+    limit: int = PAGE_SIZE,
 ) -> tuple[Sequence[JobRow], str | None]:
     """Return jobs with their files, the newest first, and after which the next page begins.
 
@@ -206,14 +206,9 @@ def job(database: Database, name: str) -> JobRow:
 
 
 def events(
-    database: Database,
-    row: JobRow,
-    *,
-    after: int = 0,
-    most: int = 5_000,
-    kind: str | None = None,
+    database: Database, row: JobRow, *, after: int = 0, most: int = 5_000, kind: str | None = None
 ) -> list[EventRow]:
-    """Return what happened to a job after an event of it, of one kind or of all."""
+    """Return the events of a job after one of them, of one kind or all."""
     with database.reading() as session:
         statement = (
             select(EventRow)
@@ -307,15 +302,15 @@ def _row(session: Session, name: str) -> JobRow:
 
 
 def counts(database: Database) -> dict[str, int]:
-    """Return how many jobs are in each state."""
+    """Return the number of jobs in each state."""
     with database.reading() as session:
         rows = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state)).all()
     found = {state: count for state, count in rows}  # noqa: C416 (rows are no pairs to mypy)
     return {state.value: found.get(state, 0) for state in State}
 
 
-MOST_JOBS = 500
-"""Of a history, the latest."""
+MAX_HISTORY_JOBS = 500
+"""A history has at most so many jobs, the latest."""
 
 
 def history(database: Database, vehicle: str) -> History:
@@ -338,7 +333,7 @@ def history(database: Database, vehicle: str) -> History:
             select(JobRow)
             .where(JobRow.vehicle == vehicle, JobRow.state == State.DONE)
             .order_by(JobRow.number.desc())
-            .limit(MOST_JOBS)
+            .limit(MAX_HISTORY_JOBS)
             .options(selectinload(JobRow.flights))
         ).all()
         by_number = {job.number: job for job in jobs}

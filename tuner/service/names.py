@@ -12,7 +12,7 @@ _SIDE_CARS = (".yaml", ".yml")
 
 
 def last_part(name: str) -> str:
-    """Return what stands behind the last slash of either kind."""
+    """Return the part after the last slash of either kind."""
     return re.split(r"[/\\]", name)[-1]
 
 
@@ -34,7 +34,7 @@ def stems(names: Iterable[str]) -> list[str]:
 
 
 def shown_name(name: str) -> str:
-    """Return what a sender calls a file, as it may be shown: one short line without folders."""
+    """Return a sender's file name for display: one short line without folders."""
     plain = "".join(c if c.isprintable() else "_" for c in last_part(name)).strip()
     return plain[:200] or "recording"
 

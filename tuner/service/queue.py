@@ -19,8 +19,8 @@ from sqlalchemy.orm import Session, undefer
 from tuner.service.database import Database
 from tuner.service.tables import EventRow, FileRow, JobRow, PointRow, State
 
-MOST_EVENTS = 20_000
-"""Of one job; of what comes after, only messages and states are kept, as many again."""
+MAX_EVENTS = 20_000
+"""A job keeps so many events, and afterwards as many messages and states."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an attempt came to.
+    """The outcome of an attempt.
 
     Attributes
     ----------
@@ -122,7 +122,7 @@ class Queue:
         """Note what an attempt does, and renew its lease; False if it holds the job no more."""
         with self._database.writing() as session:
             lease = time.time() + self._lease
-            if not _change(session, claim, {**progress, "lease": lease}):
+            if not _update(session, claim, {**progress, "lease": lease}):
                 return False
             for kind, content in events:
                 add_event(session, claim.number, kind, content)
@@ -140,7 +140,7 @@ class Queue:
                 "seconds_left": 0.0 if outcome.state == State.DONE else None,
                 **UNCLAIMED,
             }
-            if not _change(session, claim, ending):
+            if not _update(session, claim, ending):
                 return False
             for table, rows in ((FileRow, outcome.files), (PointRow, outcome.points)):
                 if rows:
@@ -158,7 +158,7 @@ class Queue:
                 "seconds_left": None,
                 **UNCLAIMED,
             }
-            if not _change(session, claim, waiting):
+            if not _update(session, claim, waiting):
                 return False
             add_event(session, claim.number, "message", {"text": message})
             add_event(session, claim.number, "state", {"state": State.QUEUED})
@@ -190,7 +190,7 @@ class Queue:
 
 
 def _preamble(session: Session, job: int) -> tuple[str, ...]:
-    """Return what the attempts at a job said before their first iterations."""
+    """Return the messages of a job's attempts before their first iterations."""
     begins = {"state": True, "iteration": False}
     events = select(EventRow.kind, EventRow.content).where(
         EventRow.job == job, EventRow.kind.in_((*begins, "message"))
@@ -206,14 +206,12 @@ def _preamble(session: Session, job: int) -> tuple[str, ...]:
 UNCLAIMED = {"claim": None, "owner": None, "lease": None}
 
 
-def _change(session: Session, claim: Claim, values: Mapping[str, Any]) -> bool:
+def _update(session: Session, claim: Claim, values: Mapping[str, Any]) -> bool:
     """Change the row of a job if the claim still holds it."""
     statement = (
         update(JobRow)
         .where(
-            JobRow.number == claim.number,
-            JobRow.claim == claim.word,
-            JobRow.state == State.RUNNING,
+            JobRow.number == claim.number, JobRow.claim == claim.word, JobRow.state == State.RUNNING
         )
         .values(**values)
         .execution_options(synchronize_session=False)
@@ -234,6 +232,6 @@ def add_event(session: Session, job: int, kind: str, content: Mapping[str, Any])
         .execution_options(synchronize_session=False)
     )
     assert number is not None
-    if number <= MOST_EVENTS * (2 if kind in ("message", "state") else 1):
+    if number <= MAX_EVENTS * (2 if kind in ("message", "state") else 1):
         row = {"job": job, "number": number, "kind": kind, "content": dict(content)}
         session.execute(insert(EventRow), [row])

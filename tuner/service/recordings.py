@@ -43,7 +43,7 @@ def check_space(database: Database, store: ContentStore, settings: ServiceSettin
         raise TooManyError("the server", f"keeps {stored} recordings", "ask who runs it for more")
 
 
-def take(
+def store_recording(
     database: Database, store: ContentStore, settings: ServiceSettings, upload: Upload
 ) -> tuple[RecordingRow, bool]:
     """Inspect an upload, store and enter it, and return its row and whether it is new.
@@ -57,17 +57,17 @@ def take(
         with database.reading() as session:
             known = session.get(RecordingRow, upload.sha256)
         if known is not None and store.has(upload.sha256):
-            return _enter(database, upload, known.inspection), False
-        inspection = _inspected(upload, settings)
+            return _insert(database, upload, known.inspection), False
+        inspection = _inspect(upload, settings)
         with full_disk():
             store.take(upload.path, upload.sha256)
-        return _enter(database, upload, inspection), known is None
+        return _insert(database, upload, inspection), known is None
     finally:
         upload.path.unlink(missing_ok=True)
 
 
-def _inspected(upload: Upload, settings: ServiceSettings) -> dict[str, Any]:
-    """Return what an upload holds, read under a name of our own."""
+def _inspect(upload: Upload, settings: ServiceSettings) -> dict[str, Any]:
+    """Return the inspection of an upload, read under a name of our own."""
     with tempfile.TemporaryDirectory(dir=settings.incoming) as folder:
         file = inside(Path(folder), recording_name(upload.name))
         os.link(upload.path, file)
@@ -77,7 +77,7 @@ def _inspected(upload: Upload, settings: ServiceSettings) -> dict[str, Any]:
             raise type(error)(upload.name, error.what, error.remedy) from None
 
 
-def _enter(database: Database, upload: Upload, inspection: dict[str, Any]) -> RecordingRow:
+def _insert(database: Database, upload: Upload, inspection: dict[str, Any]) -> RecordingRow:
     """Enter a recording, and return its row under the upload's name, which the first one keeps."""
     for last in (False, True):
         try:
@@ -97,7 +97,7 @@ def _enter(database: Database, upload: Upload, inspection: dict[str, Any]) -> Re
 
 
 def flight_name(name: str) -> str:
-    """Return what the flight of a recording is called in a job."""
+    """Return the name of a recording's flight in a job."""
     return stems([recording_name(name)])[0]
 
 

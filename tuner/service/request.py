@@ -111,7 +111,7 @@ class CheckedRequest(OptionsOfJob, Section):  # type: ignore[misc, valid-type]
             (folder / "topics.yaml").write_text(dump_yaml(content), encoding="utf-8")
 
     def options(self, folder: Path, flights: Sequence[str]) -> Options:
-        """Return what `tune` would have been called with, for files in ``folder/flights``."""
+        """Return the options of `tune` for files in ``folder/flights``."""
         topics = str(folder / "topics.yaml") if isinstance(self.topics, TopicMap) else self.topics
         return Options(
             [str(folder / FLIGHTS / name) for name in flights],
@@ -123,7 +123,7 @@ class CheckedRequest(OptionsOfJob, Section):  # type: ignore[misc, valid-type]
         )
 
 
-def checked(
+def check_request(
     request: JobRequest, flights: Sequence[str], earlier: Mapping[str, Mapping[str, Any]]
 ) -> tuple[CheckedRequest, str, frozenset[str]]:
     """Check a request, and return it with its vehicle's name and the held-out flights.
@@ -155,8 +155,8 @@ def checked(
     options = {option: getattr(request, option) for option in OptionsOfJob.model_fields}
     asked = CheckedRequest(
         **options | {"holdout": _holdout(options["holdout"], flights)},
-        vehicle=_named("vehicle", named["vehicle"], VehicleFile, earlier),
-        controller=_named("controller", named["controller"], ControllerFile),
+        vehicle=_parameter_file("vehicle", named["vehicle"], VehicleFile, earlier),
+        controller=_parameter_file("controller", named["controller"], ControllerFile),
         topics=_topics(named["topics"]),
         settings=settings,
     )
@@ -175,7 +175,7 @@ def checked(
             settled = resolve_settings(asked.options(folder, flights))
         except InputError as error:
             raise type(error)(
-                *(_without(folder, text) for text in (error.where, error.what, error.remedy))
+                *(_remove_keys(folder, text) for text in (error.where, error.what, error.remedy))
             ) from None
     name = settled.vehicle.name
     if not (name.strip() and name.isprintable() and len(name) <= 100):
@@ -202,7 +202,7 @@ def _shipped(kind: Kind) -> list[str]:
     return sorted(file.stem for file in (configs_folder() / kind).glob("*.yaml"))
 
 
-def _named(
+def _parameter_file(
     key: str, given: Any, model: type[M], earlier: Mapping[str, object] | None = None
 ) -> str | M | None:
     """Return a shipped file's name, or what is given as the content of such a file."""
@@ -219,7 +219,7 @@ def _named(
 
 
 def _topics(given: Any) -> str | TopicMap | None:
-    topics = _named("topics", given, TopicMap)
+    topics = _parameter_file("topics", given, TopicMap)
     if isinstance(topics, TopicMap):
         if topics.messages:
             what = "messages names files, and the service has only what it is sent"
@@ -230,7 +230,7 @@ def _topics(given: Any) -> str | TopicMap | None:
     return topics
 
 
-def _without(folder: Path, text: str) -> str:
+def _remove_keys(folder: Path, text: str) -> str:
     """Return a message without the folder that the check was made in."""
     for place in (folder.resolve() / FLIGHTS, folder / FLIGHTS, folder):
         text = text.replace(f"{place}/", "")

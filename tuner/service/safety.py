@@ -31,14 +31,14 @@ from tuner.service.service import Metrics, Service
 from tuner.service.settings import size_in_words
 
 COOKIE = "tune_session"
-OPEN_TO_ALL = ("/healthz", "/login", "/static/")
-FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+PUBLIC_PATHS = ("/healthz", "/login", "/static/")
+PROXY_HEADERS = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
 """Headers by which a request shows that it came through a proxy."""
-READING = ("GET", "HEAD", "OPTIONS")
-UPLOADS = ("/api/v1/recordings", "/recordings")
-VISITOR: ContextVar[str | None] = ContextVar("VISITOR", default=None)
-"""Whose session the request under way is of."""
-MOST_VISITORS = 10_000
+SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
+UPLOAD_PATHS = ("/api/v1/recordings", "/recordings")
+CURRENT_VISITOR: ContextVar[str | None] = ContextVar("VISITOR", default=None)
+"""The owner of the current request's session."""
+MAX_VISITORS = 10_000
 #: Pages run the service's own script and style, and load nothing from elsewhere.
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -103,21 +103,21 @@ class Guard:
         if settings.hosts and _host_name(request.headers) not in settings.hosts:
             remedy = "open the server's own URL, or start it with --allow-host"
             raise NotAllowedError("the request", "names another host", remedy)
-        if not settings.demands_tokens and any(name in request.headers for name in FORWARDED):
+        if not settings.demands_tokens and any(name in request.headers for name in PROXY_HEADERS):
             raise NotAllowedError(
                 "the request",
                 "came through a proxy, and this server asks nobody for a token",
                 "start it with --tokens always",
             )
-        if request.method not in READING:
+        if request.method not in SAFE_METHODS:
             _check_origin(request.headers)
         visitor = request.client.host if request.client else "unknown"
         if settings.demands_tokens:
             name = await anyio.to_thread.run_sync(self._owner, request)
-            VISITOR.set(name if COOKIE in request.cookies else None)
+            CURRENT_VISITOR.set(name if COOKIE in request.cookies else None)
             if name is not None:
                 visitor = f"token {name}"
-            elif not request.url.path.startswith(OPEN_TO_ALL):
+            elif not request.url.path.startswith(PUBLIC_PATHS):
                 raise NoTokenError("the request", "shows no token of this server", "log in with it")
         if not self._rates.allows(visitor):
             raise TooManyError("the server", "is asked too often by you", "wait some seconds")
@@ -128,12 +128,14 @@ class Guard:
         if kind.lower() == "bearer":
             return tokens.owner(database, word.strip())
         session = request.cookies.get(COOKIE, "")
-        is_ours = request.method in READING or "origin" in headers or "sec-fetch-site" in headers
+        is_ours = (
+            request.method in SAFE_METHODS or "origin" in headers or "sec-fetch-site" in headers
+        )
         return tokens.logged_in(database, session) if session and is_ours else None
 
     async def _body(self, request: Request, receive: Receive) -> Receive:
-        """Return what gives a body on, once it has arrived whole and is not too large."""
-        if request.url.path in UPLOADS or request.method in READING:
+        """Return a function that passes on a body of limited size once it is complete."""
+        if request.url.path in UPLOAD_PATHS or request.method in SAFE_METHODS:
             return receive  # a file is counted as it is taken apart
         most, body, more = self._service.settings.limits.body_bytes, b"", True
         while more:
@@ -192,6 +194,6 @@ class RateLimit:
         left = min(self._burst, left + (now - seen) * self._per_second)
         allowed = left >= 1.0
         self._buckets[visitor] = (left - float(allowed), now)
-        while len(self._buckets) > MOST_VISITORS:
+        while len(self._buckets) > MAX_VISITORS:
             self._buckets.popitem(last=False)
         return allowed

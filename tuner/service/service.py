@@ -58,7 +58,7 @@ class Service:
             A folder, a URL or a database cannot be used, or another server uses the folder.
         """
         make_folder(settings.work)
-        lock = _only_server(settings.data)
+        lock = _lock_data_folder(settings.data)
         shutil.rmtree(settings.incoming, ignore_errors=True)
         make_folder(settings.incoming)
         store = ContentStore(settings.store_url)
@@ -84,7 +84,7 @@ def _identity(data: Path) -> str:
     return file.read_text(encoding="utf-8").strip()
 
 
-def _only_server(data: Path) -> IO[str]:
+def _lock_data_folder(data: Path) -> IO[str]:
     """Take the lock of a data folder, which the system lets go when the process ends."""
     file = (data / "server.lock").open("w")
     try:
@@ -123,7 +123,7 @@ class Metrics:
 
 
 class _Table(Collector):
-    """What the job table and the dispatcher say."""
+    """Metrics of the job table and the dispatcher."""
 
     def __init__(self, service: Service) -> None:
         self._service = service

@@ -13,7 +13,7 @@ GIB = 2**30
 
 @dataclass(frozen=True)
 class Limits:
-    """How much one visitor, one recording and one job may take.
+    """Limits of one visitor, one recording and one job.
 
     Attributes
     ----------

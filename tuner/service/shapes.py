@@ -154,7 +154,7 @@ class History(BaseModel):
 
 
 class Health(BaseModel):
-    """Whether the parts of the server do their work."""
+    """The health of the server's parts."""
 
     status: str
     database: str

@@ -16,7 +16,7 @@ Number = BigInteger().with_variant(Integer(), "sqlite")
 
 
 class State(StrEnum):
-    """Of a job."""
+    """The state of a job."""
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -134,7 +134,7 @@ class FlightRow(Base):
 
 
 class EventRow(Base):
-    """What happened to a job: a message, an iteration of the search, a change of state."""
+    """An event of a job: a message, an iteration of the search, a change of state."""
 
     __tablename__ = "events"
 

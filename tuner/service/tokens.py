@@ -13,10 +13,10 @@ from tuner.core.errors import InputError
 from tuner.service.database import Database
 from tuner.service.tables import SessionRow, TokenRow
 
-PREFIX = "tune_"
-"""What a token begins with, so that one that leaks is recognised."""
-SESSION = 7 * 86400
-"""s for which a browser stays logged in"""
+TOKEN_PREFIX = "tune_"
+"""The prefix of tokens, by which a leaked one is recognised."""
+SESSION_S = 7 * 86400
+"""The duration of a browser's session."""
 
 
 def add(database: Database, name: str) -> str:
@@ -29,13 +29,13 @@ def add(database: Database, name: str) -> str:
     """
     if not (name.strip() and name.isprintable() and len(name) <= 100):
         raise InputError("token", "needs a plain name of up to 100 letters", "say whose it is")
-    token = PREFIX + secrets.token_urlsafe(32)
+    token = TOKEN_PREFIX + secrets.token_urlsafe(32)
     with database.writing() as session:
         if session.get(TokenRow, name) is not None:
             raise InputError(
                 "token", f"'{name}' has one already", f"tune serve token remove {name}"
             )
-        session.add(TokenRow(name=name, sha256=_hash(token), added=time.time()))
+        session.add(TokenRow(name=name, sha256=_digest(token), added=time.time()))
     return token
 
 
@@ -63,7 +63,7 @@ def names(database: Database) -> list[str]:
 
 def owner(database: Database, token: str) -> str | None:
     """Return whose token it is, None if nobody's; all are compared, each in constant time."""
-    given, found = _hash(token), None
+    given, found = _digest(token), None
     with database.reading() as session:
         for row in session.scalars(select(TokenRow)):
             if hmac.compare_digest(row.sha256, given):
@@ -78,23 +78,23 @@ def log_in(database: Database, token: str) -> str | None:
     word, now = secrets.token_urlsafe(32), time.time()
     with database.writing() as session:
         session.execute(delete(SessionRow).where(SessionRow.expires < now))
-        session.add(SessionRow(sha256=_hash(word), token=name, expires=now + SESSION))
+        session.add(SessionRow(sha256=_digest(word), token=name, expires=now + SESSION_S))
     return word
 
 
 def logged_in(database: Database, word: str) -> str | None:
     """Return whose session goes by a word, None if there is none."""
     with database.reading() as session:
-        row = session.get(SessionRow, _hash(word))
+        row = session.get(SessionRow, _digest(word))
     return None if row is None or row.expires < time.time() else row.token
 
 
 def log_out(database: Database, word: str) -> None:
     """End the session that goes by a word."""
     with database.writing() as session:
-        session.execute(delete(SessionRow).where(SessionRow.sha256 == _hash(word)))
+        session.execute(delete(SessionRow).where(SessionRow.sha256 == _digest(word)))
 
 
-def _hash(token: str) -> str:
+def _digest(token: str) -> str:
     """Return the SHA-256 of a secret: it has 256 random bits, so that no salt is needed."""
     return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()

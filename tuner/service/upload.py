@@ -18,10 +18,10 @@ from tuner.service.errors import TooLargeError, full_disk
 from tuner.service.names import shown_name
 from tuner.service.settings import Limits, size_in_words
 
-BUFFER = 2**20
+BUFFER_BYTES = 2**20
 """bytes that are gathered before they are hashed and written"""
-FIELD = "file"
-REMEDY = f"send it as multipart/form-data with a field '{FIELD}'"
+FORM_FIELD = "file"
+REMEDY = f"send it as multipart/form-data with a field '{FORM_FIELD}'"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Upload:
 
 
 class _Receiver:
-    """What the parser of a request calls; the first file of the field is written."""
+    """Callbacks of a request's parser, which write the first file of the field."""
 
     def __init__(self, path: Path, most: int) -> None:
         self.name: str | None = None
@@ -60,7 +60,7 @@ class _Receiver:
         self._is_ours = False
 
     def callbacks(self) -> dict[str, object]:
-        """Return what the parser is to call."""
+        """Return the parser's callbacks."""
         return {
             "on_part_begin": self._on_part_begin,
             "on_header_field": lambda data, start, end: self._header.extend(data[start:end]),
@@ -82,7 +82,7 @@ class _Receiver:
 
     def _on_headers_finished(self) -> None:
         _, options = parse_options_header(self._disposition)
-        wanted = options.get(b"name") == FIELD.encode() and b"filename" in options
+        wanted = options.get(b"name") == FORM_FIELD.encode() and b"filename" in options
         self._is_ours = wanted and self.name is None
         if self._is_ours:
             self.name = options[b"filename"].decode("utf-8", "replace")
@@ -145,7 +145,7 @@ async def receive(
             parser = MultipartParser(boundary, receiver.callbacks())  # type: ignore[arg-type]
             async for chunk in stream:
                 parser.write(chunk)
-                if len(receiver.buffer) >= BUFFER:
+                if len(receiver.buffer) >= BUFFER_BYTES:
                     await anyio.to_thread.run_sync(receiver.flush)
             await anyio.to_thread.run_sync(receiver.flush)
         except FormParserError:

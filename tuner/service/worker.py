@@ -25,12 +25,12 @@ from tuner.core.shipped import configs_folder
 from tuner.service.request import CheckedRequest
 from tuner.service.settings import Limits, limit_process, size_in_words
 
-RESULT = Path("result")
-LOCK = ".lock"
+RESULT_FOLDER = Path("result")
+LOCK_FILE = ".lock"
 
 
 class Assignment(BaseModel):
-    """What a worker is to do.
+    """The task of a worker.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ def main() -> None:
     assignment = Assignment.model_validate_json(sys.stdin.readline())
     threading.Thread(target=_end_with_server, daemon=True).start()
     os.chdir(assignment.folder)
-    with Path(LOCK).open("w") as lock:
+    with Path(LOCK_FILE).open("w") as lock:
         _wait_for(lock)
         channel.write(json.dumps(_fit(assignment, channel)) + "\n")
 
@@ -97,8 +97,8 @@ def _fit(assignment: Assignment, channel: IO[str]) -> dict[str, Any]:
 
         run(
             asked.options(Path(), assignment.flights),
-            out=RESULT,
-            resume=(RESULT / "checkpoint.npz").exists(),
+            out=RESULT_FOLDER,
+            resume=(RESULT_FOLDER / "checkpoint.npz").exists(),
             listener=_listener(channel),
             command=f"job {assignment.job} of a tuning service",
         )

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 from rich.console import Console
 
-from tuner.cli.progress import DOING, _MovingLine, listening
+from tuner.cli.progress import STAGE_PHRASES, _LiveLine, progress_on_terminal
 from tuner.core.spans import span, watching
 from tuner.findings.findings import Code, Finding
 from tuner.search.iteration import Iteration, PointEstimate
@@ -36,7 +36,7 @@ def lines_of(capsys):
 
 
 def test_a_stage_is_one_line_and_a_search_ends_with_its_last_iteration(capsys):
-    with listening(quiet=False) as listener:
+    with progress_on_terminal(quiet=False) as listener:
         listener.on_settings(SimpleNamespace(origin={"mass": "--mass"}))
         with span("reading"):
             pass
@@ -56,7 +56,7 @@ def test_a_stage_is_one_line_and_a_search_ends_with_its_last_iteration(capsys):
 
 def test_verbose_shows_settings_messages_and_where_the_search_ended(capsys):
     estimate = PointEstimate(name="inertia_xx", unit="kg m²", initial=0.021, estimate=0.0265)
-    with listening(quiet=False, verbose=True) as listener:
+    with progress_on_terminal(quiet=False, verbose=True) as listener:
         listener.on_settings(SimpleNamespace(origin={"mass": "--mass"}))
         listener.on_iteration(iterations("polish", 1)[0], 1.0)
         listener.on_estimates([estimate])
@@ -71,7 +71,7 @@ def test_verbose_shows_settings_messages_and_where_the_search_ended(capsys):
 
 
 def test_an_interrupted_search_still_gets_its_line_and_says_how_to_go_on(capsys):
-    with listening(quiet=False) as listener:
+    with progress_on_terminal(quiet=False) as listener:
         for iteration in iterations("2 s", 3):
             listener.on_iteration(iteration, 12.0)
         listener.on_stop("Continue with --resume.")
@@ -81,7 +81,7 @@ def test_an_interrupted_search_still_gets_its_line_and_says_how_to_go_on(capsys)
 
 
 def test_another_vehicle_than_the_one_that_flew_is_named_before_the_search(capsys):
-    with listening(quiet=False) as listener:
+    with progress_on_terminal(quiet=False) as listener:
         listener.on_doubt(Finding(Code.MASS_NOT_GIVEN, "warning", "quad", {"mass": 2.0}))
     (line,) = lines_of(capsys)
     assert (
@@ -91,7 +91,7 @@ def test_another_vehicle_than_the_one_that_flew_is_named_before_the_search(capsy
 
 
 def test_quiet_shows_nothing(capsys):
-    with listening(quiet=True) as listener:
+    with progress_on_terminal(quiet=True) as listener:
         listener.on_iteration(iterations("2 s", 1)[0], 1.0)
         listener.on_message("Examining.")
     assert capsys.readouterr().out == ""
@@ -99,7 +99,7 @@ def test_quiet_shows_nothing(capsys):
 
 def test_a_terminal_names_the_stage_that_runs_and_promises_nothing():
     shown = Console(file=io.StringIO(), force_terminal=True, width=120)
-    line = _MovingLine(shown)
+    line = _LiveLine(shown)
 
     def now():
         return line.__rich__().plain
@@ -130,4 +130,4 @@ def test_every_stage_of_a_run_has_its_words():
         for name in re.findall(r'(?:span|explanation\.part)\(\s*"([^"]+)"', path.read_text())
     }
     assert len(named) > 10
-    assert named <= set(DOING)
+    assert named <= set(STAGE_PHRASES)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim_jax.rollout import begun
+from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from tests.sim_jax.support import controller, moving_start, vehicle, wobble
 from tuner.disturbances.disturbances import COUNT, USUAL, processes_of
@@ -39,7 +39,7 @@ def begun_with(**effects):
         (jnp.asarray(1.4 * SCHEDULE.step), {n: jnp.asarray(value) for n, value in effects.items()}),
     )
     start = jax.tree.map(lambda leaf: jnp.asarray(leaf, float)[None], moving_start(craft))
-    plant, state = begun(craft, controller(), SCHEDULE, wobble(craft, 200), start)
+    plant, state = start_simulation(craft, controller(), SCHEDULE, wobble(craft, 200), start)
     return Observer(plant, None, None, (), 400.0), state
 
 

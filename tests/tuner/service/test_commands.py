@@ -15,7 +15,7 @@ import tuner
 from tests.tuner.service.conftest import submit, upload
 from tuner.cli import main
 from tuner.client import folder as folder_module
-from tuner.client.client import request_of
+from tuner.client.client import job_request_of
 from tuner.config import Options
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.result import Run
@@ -145,14 +145,14 @@ def test_files_that_options_name_travel_as_their_contents(table, tmp_path, updat
         (lab / name).write_bytes(table.read_bytes())
     write_vehicle(updated, lab / "own.yaml")
     (lab / "tune.yaml").write_text("vehicle: own.yaml\ncontroller: hovergames_sitl\nholdout: [b]\n")
-    flights, request = request_of(Options([str(lab / "*.csv")], mass=2.2))
+    flights, request = job_request_of(Options([str(lab / "*.csv")], mass=2.2))
     assert [path.name for path in flights] == ["a.csv", "b.csv"]
     assert request["mass"] == 2.2
     assert request["settings"]["vehicle"]["mass"] == updated.mass
     assert request["settings"]["controller"] == "hovergames_sitl"
     assert request["settings"]["holdout"] == ["b"]
     assert "holdout" not in request
-    _, request = request_of(Options([str(lab / "a.csv")], holdout=[str(lab / "b.csv")]))
+    _, request = job_request_of(Options([str(lab / "a.csv")], holdout=[str(lab / "b.csv")]))
     assert request["holdout"] == ["b"]
 
 
@@ -175,10 +175,10 @@ def test_a_folder_s_new_recordings_become_one_job_once(client, table, tmp_path, 
 
 def test_a_recording_that_still_grows_is_waited_for(tmp_path, table):
     (tmp_path / "a.csv").write_bytes(b"time")
-    first = folder_module._new(tmp_path)
+    first = folder_module._new_recordings(tmp_path)
     time.sleep(0.01)
     (tmp_path / "a.csv").write_bytes(table.read_bytes())
-    assert folder_module._new(tmp_path) != first
+    assert folder_module._new_recordings(tmp_path) != first
 
 
 def test_a_recording_that_is_moved_away_is_passed_over(tmp_path, table, monkeypatch):
@@ -193,9 +193,9 @@ def test_a_recording_that_is_moved_away_is_passed_over(tmp_path, table, monkeypa
         return there
 
     monkeypatch.setattr(Path, "is_file", then_moved)
-    assert [path.name for path in folder_module._new(tmp_path)] == ["b.csv"]
+    assert [path.name for path in folder_module._new_recordings(tmp_path)] == ["b.csv"]
     with pytest.raises(InputError, match=r"gone: cannot be read any more \(No such file"):
-        folder_module._new(tmp_path / "gone")
+        folder_module._new_recordings(tmp_path / "gone")
 
 
 STREAM = {"Content-Type": "text/event-stream"}
@@ -228,7 +228,7 @@ def test_what_is_no_tuning_service_is_one_line(command, answer, table, capsys, m
         return made(**given, transport=httpx.MockTransport(answered))
 
     monkeypatch.setattr(httpx, "Client", answering)
-    monkeypatch.setattr("tuner.client.client.PATIENCE", -1.0)
+    monkeypatch.setattr("tuner.client.client.MAX_SILENCE_S", -1.0)
     if command == ["submit", "--flights"]:
         command = [*command, str(table)]
     assert main([*command, "--server", "http://other"]) == 2

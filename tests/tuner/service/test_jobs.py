@@ -252,7 +252,7 @@ def test_what_goes_with_the_mass_is_compared_at_one_mass(client, recording):
 
 
 def test_what_is_found_after_a_long_search_reaches_the_log(idle, monkeypatch):
-    monkeypatch.setattr(queue, "MOST_EVENTS", 10)
+    monkeypatch.setattr(queue, "MAX_EVENTS", 10)
     with idle.database.writing() as session:
         row = JobRow(id="0" * 16, name="x", vehicle="x", request={}, submitted=0.0)
         session.add(row)
@@ -323,13 +323,13 @@ def test_all_files_come_as_one_archive_under_plain_names(client, recording):
 
 
 def test_an_archive_unpacks_nowhere_else_and_is_made_block_by_block(idle, tmp_path, monkeypatch):
-    monkeypatch.setattr(http, "BLOCK", 1000)
+    monkeypatch.setattr(http, "BLOCK_BYTES", 1000)
     content = random.Random(1).randbytes(50_000)
     (tmp_path / "x").write_bytes(content)
     digest = put(tmp_path / "x", idle.store)
     names = ("../../x", "/etc/x", "a/../x", "C:\\x", "plots/\0.svg")
     rows = [FileRow(name=name, sha256=digest, size=50_000) for name in names]
-    blocks = list(http.zipped(idle.store, rows, "job"))
+    blocks = list(http.zip_stream(idle.store, rows, "job"))
     assert max(map(len, blocks)) < 40_000  # compression's window; a file at once has more
     with zipfile.ZipFile(io.BytesIO(b"".join(blocks))) as opened:
         made = opened.namelist()

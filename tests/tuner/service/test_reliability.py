@@ -193,13 +193,13 @@ def test_a_lease_that_is_renewed_is_not_taken_away(idle):
 def test_a_result_that_takes_longer_to_store_than_a_lease_holds_is_not_fitted_again(
     settings, table, monkeypatch
 ):
-    store = attempt._stored
+    store = attempt._store_files
 
     def slowly(*arguments):
         time.sleep(2.5)
         return store(*arguments)
 
-    monkeypatch.setattr(attempt, "_stored", slowly)
+    monkeypatch.setattr(attempt, "_store_files", slowly)
     service = Service.open(replace(settings, lease_seconds=1.5))
     with listening(service) as client:
         done = ended(client, submit(client, upload(client, table.read_bytes())))
@@ -223,7 +223,7 @@ def test_the_migrations_make_the_tables_of_this_program(idle):
 
 def test_a_locked_database_is_told_and_nothing_is_lost(client, service, table, monkeypatch):
     recording = upload(client, table.read_bytes())
-    monkeypatch.setattr(database_module, "LOCKED_FOR", 0.1)
+    monkeypatch.setattr(database_module, "MAX_LOCK_WAIT_S", 0.1)
     job = submit(client, recording, namespace="slow")
     while not client.get(f"/api/v1/jobs/{job}").json()["iteration"]:
         time.sleep(0.02)

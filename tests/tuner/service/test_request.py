@@ -3,7 +3,7 @@
 import pytest
 
 from tests.tuner.service.conftest import LIMITS, listening, submit, upload
-from tuner.service.request import FLIGHTS, JobRequest, checked
+from tuner.service.request import FLIGHTS, JobRequest, check_request
 from tuner.service.service import Service
 from tuner.service.settings import ServiceSettings
 from tuner.vehicle import ControllerFile, VehicleFile
@@ -95,7 +95,7 @@ def test_what_is_asked_becomes_what_tune_would_have_been_called_with(tmp_path, u
         settings={"mass": 2.3, "topics": {"name": "t", "format": "ros", "signals": {}}},
         seed=3,
     )
-    asked, vehicle, holdout = checked(request, FLIGHT, {})
+    asked, vehicle, holdout = check_request(request, FLIGHT, {})
     assert (vehicle, holdout) == (updated.name, {"circle_4"})
     (tmp_path / FLIGHTS).mkdir()
     asked.lay_out(tmp_path)

@@ -18,7 +18,7 @@ from tuner.service import errors, inspection, recordings
 from tuner.service import upload as upload_module
 from tuner.service.service import Service
 from tuner.service.settings import MIB
-from tuner.service.words import FIELDS, on_the_web, over_http
+from tuner.service.words import FIELD_PHRASES, on_the_web, over_http
 
 BAG = FLIGHTS / "yaw_spin_3rps.bag"
 
@@ -276,4 +276,4 @@ def test_over_http_a_message_names_the_keys_of_a_request():
 
 
 def test_every_option_that_becomes_a_field_is_one():
-    assert set(FIELDS) <= set(Options.__dataclass_fields__)
+    assert set(FIELD_PHRASES) <= set(Options.__dataclass_fields__)

@@ -74,7 +74,7 @@ def result_of(store: ContentStore, row: JobRow) -> RunResult:
 
 
 def exports_of(store: ContentStore, row: JobRow) -> tuple[ExportRecord, ...]:
-    """Return what a job exported, with the conditions that were checked."""
+    """Return the exports of a job, with their gates."""
     content = _content(row, store, ExportRecords.FILE)
     try:
         records = ExportRecords.model_validate_json(content or b"{}")
@@ -140,7 +140,7 @@ def flight_pairs(a: RunResult, b: RunResult) -> list[FlightPair]:
 
 WIDTH, HEIGHT = 640.0, 270.0
 LEFT, RIGHT, TOP, BOTTOM = 116.0, 12.0, 28.0, 46.0
-MOST_POINTS = 600
+MAX_POINTS = 600
 """Points of a curve: more would not be seen."""
 
 
@@ -187,7 +187,7 @@ def rmse_curve(rmse: Sequence[float]) -> Canvas | None:
     ]
     if not known:
         return None
-    step = -(-len(known) // MOST_POINTS)
+    step = -(-len(known) // MAX_POINTS)
     shown = [*known[:-1:step], known[-1]]
     low, high = min(y for _, y in shown), max(y for _, y in shown)
     if high - low < 0.3:
@@ -198,7 +198,7 @@ def rmse_curve(rmse: Sequence[float]) -> Canvas | None:
         across=(first, last),
         up=(low, high),
         x_ticks=[(n, str(n)) for n in whole],
-        y_ticks=[(math.log10(v), f"{v:g}") for v in _decades(low, high)],
+        y_ticks=[(math.log10(v), f"{v:g}") for v in _decade_ticks(low, high)],
         points=shown,
     )
 
@@ -233,7 +233,7 @@ def _round_numbers(low: float, high: float) -> list[tuple[float, str]]:
     return [(number * step, f"{number * step:.{max(digits, 1)}g}") for number in numbers]
 
 
-def _decades(low: float, high: float) -> list[float]:
+def _decade_ticks(low: float, high: float) -> list[float]:
     """Return round numbers between two powers of ten."""
     factors = (1.0,) if high - low > 2 else (1.0, 2.0, 5.0)
     found = [

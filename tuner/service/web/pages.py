@@ -29,12 +29,12 @@ from tuner.report.outcome import STYLE_OF, flights_table, outcome, warnings_of
 from tuner.report.section import figures
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
-from tuner.service.http import OfJob, Served, service_of, upload
+from tuner.service.http import JobOfPath, ServiceOfApp, service_of, upload
 from tuner.service.jobs import history, vehicles
-from tuner.service.queue import MOST_EVENTS
+from tuner.service.queue import MAX_EVENTS
 from tuner.service.recordings import flight_name
 from tuner.service.request import JobRequest
-from tuner.service.safety import COOKIE, VISITOR
+from tuner.service.safety import COOKIE, CURRENT_VISITOR
 from tuner.service.service import Service
 from tuner.service.settings import size_in_words
 from tuner.service.shapes import API, iso
@@ -69,16 +69,16 @@ def environment() -> Environment:
         "percent": lambda value: "–" if value is None else f"{100 * value:+.2f} %",
         "mm": lambda value: "" if value is None else f"{1000 * value:.2f} mm",
         "megabytes": lambda size: f"{size / 1e6:.1f} MB",
-        "ago": _ago,
+        "ago": _age_in_words,
         "moment": lambda value: "" if value is None else iso(value),
-        "lasting": _lasting,
+        "lasting": _duration_in_words,
         "flight": flight_name,
         "web": on_the_web,
         "note": lambda raw: note_in_words(TypeAdapter(Note).validate_python(raw)),
         "damage": lambda raw: damage_sentence(TypeAdapter(Damage).validate_python(raw)),
     }
     made.filters |= filters
-    made.globals |= {"states": STATES, "looks": STYLE_OF, "visitor": VISITOR.get}
+    made.globals |= {"states": STATES, "looks": STYLE_OF, "visitor": CURRENT_VISITOR.get}
     return made
 
 
@@ -88,8 +88,8 @@ def render(template: str, status: int = 200, /, **values: object) -> HTMLRespons
     return HTMLResponse(text, status_code=status)
 
 
-def _ago(seconds: float | None) -> str:
-    """Return how long ago a time was, in words."""
+def _age_in_words(seconds: float | None) -> str:
+    """Return the age of a time in words."""
     if seconds is None:
         return ""
     passed = max(0.0, time.time() - seconds)
@@ -100,7 +100,7 @@ def _ago(seconds: float | None) -> str:
     return "just now"
 
 
-def _lasting(seconds: float | None) -> str:
+def _duration_in_words(seconds: float | None) -> str:
     """Return a duration in words."""
     if seconds is None:
         return ""
@@ -111,12 +111,12 @@ def _lasting(seconds: float | None) -> str:
 
 web = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
-KEPT = 60
-"""s for which a browser keeps style and script"""
-LATEST = 30
-"""Recordings and jobs that are offered to choose from."""
-LOG_LINES = 400
-USES = ("fit", "holdout", "leave out")
+STATIC_MAX_AGE_S = 60
+"""A browser caches style and script for so long."""
+MAX_LATEST = 30
+"""The pages offer so many recordings and jobs."""
+MAX_LOG_LINES = 400
+FLIGHT_USES = ("fit", "holdout", "leave out")
 _STATIC = {
     "style.css": ("tuner.report:templates/page.css", "tuner.service.web:static/style.css"),
     "page.js": ("tuner.service.web:static/page.js",),
@@ -133,12 +133,12 @@ def static(name: str) -> Response:
     parts = (place.split(":") for place in _STATIC[name])
     text = "\n".join((files(package) / path).read_text("utf-8") for package, path in parts)
     kind = "text/css" if name.endswith(".css") else "text/javascript"
-    return Response(text, media_type=kind, headers={"cache-control": f"max-age={KEPT}"})
+    return Response(text, media_type=kind, headers={"cache-control": f"max-age={STATIC_MAX_AGE_S}"})
 
 
 @web.get("/")
 def start(
-    service: Served, r: Annotated[list[str] | None, Query(max_length=1000)] = None
+    service: ServiceOfApp, r: Annotated[list[str] | None, Query(max_length=1000)] = None
 ) -> Response:
     """Show where recordings are dropped and a job begins."""
     chosen = [recordings.recording(service.database, digest) for digest in dict.fromkeys(r or ())]
@@ -159,7 +159,9 @@ def _start(
     blank = dict.fromkeys(("name", "vehicle", "mass", "settings", "holdout"), "")
     shipped = [file.stem for file in (configs_folder() / "vehicles").glob("*.yaml")]
     names = sorted({*shipped, *vehicles(service.database)})
-    latest = [row for row in recordings.latest(service.database, LATEST) if row.sha256 not in ids]
+    latest = [
+        row for row in recordings.latest(service.database, MAX_LATEST) if row.sha256 not in ids
+    ]
     return render(
         "start.html.jinja",
         status,
@@ -193,8 +195,8 @@ async def add_recording(request: Request) -> Response:
 
 
 @web.get("/recordings/{recording}/card")
-def show_card(service: Served, recording: str) -> Response:
-    """Return what a stored recording holds, and how to use it."""
+def show_card(service: ServiceOfApp, recording: str) -> Response:
+    """Return the card of a stored recording."""
     row = recordings.recording(service.database, recording)
     return render("card.html.jinja", row=row, use="")
 
@@ -212,7 +214,7 @@ def _submit(service: Service, form: FormData) -> Response:
     uses = {
         key.removeprefix("use-"): use
         for key, use in text.items()
-        if key.startswith("use-") and use in USES
+        if key.startswith("use-") and use in FLIGHT_USES
     }
     chosen = [(recordings.recording(service.database, d), use) for d, use in uses.items()]
     for recording, _ in chosen:
@@ -220,7 +222,7 @@ def _submit(service: Service, form: FormData) -> Response:
     used = [(row, use) for row, use in chosen if use != "leave out"]
     try:
         settings = typed_settings(text.get("settings", ""))
-        if (held := _held(settings)) and " ".join(held) != text.get("holdout", ""):
+        if (held := _form_values(settings)) and " ".join(held) != text.get("holdout", ""):
             chosen = [(r, "holdout" if flight_name(r.name) in held else use) for r, use in chosen]
             text["holdout"] = " ".join(held)
             what = f"hold out {', '.join(held)}"
@@ -240,24 +242,22 @@ def _submit(service: Service, form: FormData) -> Response:
 
 @web.post("/settings")
 def read_settings(settings: Annotated[str, Form()] = "") -> Response:
-    """Return what typed or dropped settings hold out, for the script, or what is wrong in them."""
+    """Return the held-out flights of typed or dropped settings, or the error in them."""
     try:
-        held = _held(typed_settings(settings))
+        held = _form_values(typed_settings(settings))
     except InputError as error:
         return JSONResponse({"holdout": [], "problem": on_the_web(str(error))})
     return JSONResponse({"holdout": held, "problem": ""})
 
 
-def _held(settings: Mapping[str, Any]) -> list[str]:
+def _form_values(settings: Mapping[str, Any]) -> list[str]:
     """Return the flights that some settings hold out."""
     held = settings.get("holdout")
     return [str(name) for name in held] if isinstance(held, list) else []
 
 
 def _request(
-    text: Mapping[str, str],
-    settings: dict[str, Any],
-    used: Sequence[tuple[RecordingRow, str]],
+    text: Mapping[str, str], settings: dict[str, Any], used: Sequence[tuple[RecordingRow, str]]
 ) -> JobRequest:
     """Return the request that a form makes."""
     if not used:
@@ -269,7 +269,7 @@ def _request(
         "name": text.get("name", "").strip(),
     }
     held = [flight_name(row.name) for row, use in used if use == "holdout"]
-    if held or _held(settings):  # which the page has shown
+    if held or _form_values(settings):  # which the page has shown
         values["holdout"] = held
     if vehicle := text.get("vehicle", "").strip():
         values["vehicle"] = vehicle
@@ -286,7 +286,7 @@ def _request(
 
 @web.get("/jobs")
 def list_jobs(
-    service: Served,
+    service: ServiceOfApp,
     vehicle: Annotated[str, Query(max_length=200)] = "",
     state: str = "",
     after: str = "",
@@ -309,7 +309,7 @@ def list_jobs(
 
 
 @web.get("/jobs/{job}")
-def show_job(service: Served, row: OfJob) -> Response:
+def show_job(service: ServiceOfApp, row: JobOfPath) -> Response:
     """Show a job: live until it ends, then with its report."""
     done, _ = jobs.page(service.database, vehicle=row.vehicle, state=State.DONE)
     others = [other for other in done if other.id != row.id]
@@ -332,13 +332,13 @@ def show_job(service: Served, row: OfJob) -> Response:
 
 
 @web.get("/jobs/{job}/live")
-def show_live(service: Served, row: OfJob) -> Response:
+def show_live(service: ServiceOfApp, row: JobOfPath) -> Response:
     """Return the part of a job's page that moves."""
     return render("live.html.jinja", **_live(service, row))
 
 
 def _live(service: Service, row: JobRow) -> dict[str, object]:
-    events = jobs.events(service.database, row, most=2 * MOST_EVENTS)
+    events = jobs.events(service.database, row, most=2 * MAX_EVENTS)
     iterations = [
         float(event.content["position_rmse"])
         for event in events
@@ -349,7 +349,7 @@ def _live(service: Service, row: JobRow) -> dict[str, object]:
         "job": row,
         "curve": rmse_curve(iterations),
         "iterations": len(iterations),
-        "log": log[-LOG_LINES:],
+        "log": log[-MAX_LOG_LINES:],
         "event": row.events,
         "files": f"{API}/jobs/{row.id}/files",
         "ended": row.state in FINISHED,
@@ -357,13 +357,13 @@ def _live(service: Service, row: JobRow) -> dict[str, object]:
 
 
 @web.post("/jobs/{job}/cancel")
-def cancel_job(service: Served, job: str) -> Response:
+def cancel_job(service: ServiceOfApp, job: str) -> Response:
     """Cancel a job, and show it."""
     return RedirectResponse(f"/jobs/{jobs.cancel(service.database, job).id}", status_code=303)
 
 
 @web.post("/jobs/{job}/retry")
-def retry_job(service: Served, job: str) -> Response:
+def retry_job(service: ServiceOfApp, job: str) -> Response:
     """Try a job again, and show it."""
     row = jobs.retry(service.database, job)
     service.dispatcher.call()
@@ -371,13 +371,13 @@ def retry_job(service: Served, job: str) -> Response:
 
 
 @web.get("/vehicles")
-def list_vehicles(service: Served) -> Response:
+def list_vehicles(service: ServiceOfApp) -> Response:
     """List the vehicles that have jobs."""
     return render("vehicles.html.jinja", vehicles=vehicles(service.database))
 
 
 @web.get("/vehicles/{name}")
-def show_vehicle(service: Served, name: str) -> Response:
+def show_vehicle(service: ServiceOfApp, name: str) -> Response:
     """Show every coefficient of a vehicle over time."""
     found = history(service.database, name)
     charts = [(key, of, history_canvas(of)) for key, of in found.coefficients.items()]
@@ -385,7 +385,7 @@ def show_vehicle(service: Served, name: str) -> Response:
 
 
 @web.get("/compare")
-def compare(service: Served, a: str = "", b: str = "") -> Response:
+def compare(service: ServiceOfApp, a: str = "", b: str = "") -> Response:
     """Show two jobs side by side."""
     rows = [jobs.job(service.database, job) for job in (a, b)]
     first, second = (comparison.result_of(service.store, row) for row in rows)
@@ -424,7 +424,7 @@ def login_page() -> Response:
 
 @web.post("/login")
 def login(
-    service: Served, request: Request, token: Annotated[str, Form(max_length=1000)] = ""
+    service: ServiceOfApp, request: Request, token: Annotated[str, Form(max_length=1000)] = ""
 ) -> Response:
     """Open a session, which a cookie names that no script reads and no other site sends."""
     word = tokens.log_in(service.database, token.strip())
@@ -438,13 +438,13 @@ def login(
         httponly=True,
         samesite="strict",
         secure=request.url.scheme == "https",
-        max_age=tokens.SESSION,
+        max_age=tokens.SESSION_S,
     )
     return answer
 
 
 @web.post("/logout")
-def logout(service: Served, request: Request) -> Response:
+def logout(service: ServiceOfApp, request: Request) -> Response:
     """End the browser's session, here and there."""
     tokens.log_out(service.database, request.cookies.get(COOKIE, ""))
     answer = RedirectResponse("/login", status_code=303)

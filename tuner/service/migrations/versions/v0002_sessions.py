@@ -15,10 +15,7 @@ def upgrade() -> None:
         sa.Column("token", sa.String(length=100), nullable=False),
         sa.Column("expires", sa.Double(), nullable=False),
         sa.ForeignKeyConstraint(
-            ["token"],
-            ["tokens.name"],
-            name=op.f("fk_sessions_token"),
-            ondelete="CASCADE",
+            ["token"], ["tokens.name"], name=op.f("fk_sessions_token"), ondelete="CASCADE"
         ),
         sa.PrimaryKeyConstraint("sha256", name=op.f("pk_sessions")),
     )
