@@ -368,6 +368,14 @@ class Code(Worded):
         ),
         "",
     )
+    STAMPED_LATE = (
+        "stamped_late",  # seconds; names: the signal
+        (
+            "The {first} is stamped {milliseconds:+.0f} ms late against the gyro: moved by that, "
+            "it turns the vehicle as was recorded."
+        ),
+        "Stamp it when it is measured, or move its column, or leave it out (channels).",
+    )
     GYRO_OFFSET = (
         "gyro_offset",  # rate (rad/s); names: the axis
         "The {first} reads {rate:+.4f} rad/s at rest, which the fit takes into account.",

@@ -255,11 +255,14 @@ def _motor_orders(job: Job) -> Iterator[Finding]:
     """Warn of commands or rotor speeds that turn the vehicle as those of other rotors would."""
     for flight, inlet in zip(job.fitted, job.inlets, strict=True):
         speeds = inlet == "rotor_speed" or "command" not in flight.series
-        source: Source = "rotor_speed" if speeds else "command"
-        if not {source, "body_rate"} <= set(flight.series):
-            continue
-        span = (0.0, flight.duration)
-        yield from order_findings(flight.name, flight.series, job.settings.vehicle, span, source)
+        sources: list[Source] = ["rotor_speed", "command"] if speeds else ["command", "rotor_speed"]
+        span, vehicle = (0.0, flight.duration), job.settings.vehicle
+        found = (
+            order_findings(flight.name, flight.series, vehicle, span, source)
+            for source in sources
+            if {source, "body_rate"} <= set(flight.series)
+        )
+        yield from next(filter(None, found), ())
 
 
 def _controllers(job: Job) -> Iterator[Finding]:

@@ -143,6 +143,8 @@ def _correlations(turning: Array, torque: Array) -> Array:
 
 LAGS = (0.005, 0.015, 0.03, 0.06)
 """s of the rotors' lag that are tried."""
+LATEST_STAMP = 0.4
+"""s by which stamps may be late or early."""
 SLOW = 2.0
 """Hz below which turns are left out."""
 ENOUGH = 0.4
@@ -198,14 +200,10 @@ def motor_order(
     span
         s of the flight.
     """
-    read = _turning(series, vehicle, source, span)
-    if read is None or len(vehicle.rotors) != 4:
+    read = _quick_turning(series, vehicle, source, span)
+    if read is None:
         return None
-    step, turning, squares = read
-    if 0.5 / step < 4.0 * SLOW:
-        return None
-    turning = _without_slow(turning, step)
-    lagged = [_without_slow(_lagged(squares, step, lag), step) for lag in LAGS]
+    _, turning, lagged = read
     arms = levers(vehicle)
     alike_of = {
         order: max(min(_correlations(turning, x @ arms[list(order)])[:2]) for x in lagged)
@@ -218,6 +216,57 @@ def motor_order(
     return MotorOrder(best, bool(yaw < 0.0) if abs(yaw) > ENOUGH else None)
 
 
+def lateness(
+    series: Mapping[str, Series],
+    vehicle: VehicleFile,
+    source: Source,
+    span: tuple[float, float],
+) -> float:
+    """Return by how many s a signal of the rotors is stamped later than the turning it makes.
+
+    Zero where it follows as rotors do, or where that is not seen: the correlation has to rise by
+    `CLEARER` above that without a delay, and above that of any delay with the opposite sign, which
+    of a periodic motion is as large. Parameters as of `motor_order`.
+    """
+    read = _quick_turning(series, vehicle, source, span)
+    if read is None:
+        return 0.0
+    step, turning, lagged = read
+    torques, count = [squares @ levers(vehicle) for squares in lagged], len(turning)
+
+    def alike(delay: int) -> float:
+        behind, before = max(0, delay), max(0, -delay)
+        of_lags = (
+            _correlations(turning[before : count - behind], torque[behind : count - before])
+            for torque in torques
+        )
+        return float(max(min(axes[:2]) for axes in of_lags))
+
+    most = min(round(LATEST_STAMP / step), count // 4)
+    found = np.array([alike(delay) for delay in range(-most, most + 1)])
+    best, rival = int(found.argmax()), max(found[most], -found.min())
+    clear = found[best] > max(ENOUGH, rival + CLEARER)
+    return float((best - most) * step) if clear and abs(best - most) * step > LATEST else 0.0
+
+
+def _quick_turning(
+    series: Mapping[str, Series],
+    vehicle: VehicleFile,
+    source: Source,
+    span: tuple[float, float],
+) -> tuple[float, Array, list[Array]] | None:
+    """Return the s between samples, and the quick part of turning (n, 3) and squared speeds.
+
+    The latter (n, 4) for each of `LAGS`; None where too little was recorded.
+    """
+    read = _turning(series, vehicle, source, span)
+    if read is None or len(vehicle.rotors) != 4 or 0.5 / read[0] < 4.0 * SLOW:
+        return None
+    step, turning, squares = read
+    lagged = [_without_slow(_lagged(squares, step, lag), step) for lag in LAGS]
+    return step, _without_slow(turning, step), lagged
+
+
 def order_findings(
     name: str,
     series: Mapping[str, Series],
@@ -225,7 +274,9 @@ def order_findings(
     span: tuple[float, float],
     source: Source = "command",
 ) -> tuple[Finding, ...]:
-    """Return what is wrong with the order of a flight's commands or speeds, and with the spins."""
+    """Return what is wrong with a flight's commands or speeds: stamps, order, or the spins."""
+    if late := lateness(series, vehicle, source, span):
+        return (Finding(Code.STAMPED_LATE, "warning", name, {"seconds": late}, (source,)),)
     order = motor_order(series, vehicle, source, span)
     if order is None or order.is_right:
         return ()

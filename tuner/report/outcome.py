@@ -45,6 +45,7 @@ WRONG_INPUT_CODES = WRONG_VEHICLE_CODES | {
     Code.SAME_RECORDING,
     Code.LIFTS_OTHERWISE,
     Code.DSHOT_OR_PULSES,
+    Code.STAMPED_LATE,
 }
 """Warnings of inputs other than the flown ones: all numbers depend on them."""
 CONFLICT_CODES = WRONG_INPUT_CODES | {Code.GROUND_CONFLICT, Code.BENCH_CONFLICT}

@@ -169,6 +169,7 @@ MADE = {
         {"soonest": 0.1, "seconds": 0.1, "body_rate": 1.2, "body_rate_held": 0.9},
         ("body_rate",),
     ),
+    Code.STAMPED_LATE: Finding(Code.STAMPED_LATE, "warning", "a", {"seconds": 0.19}, ("command",)),
     Code.INPUT_LATE: Finding(Code.INPUT_LATE, "info", "a", {"seconds": 0.012}),
     Code.GYRO_OFFSET: Finding(Code.GYRO_OFFSET, "info", "a", {"rate": 0.01}, ("gyro_x",)),
     Code.FLIGHT_NOT_FLOWN: Finding(

@@ -124,6 +124,17 @@ def test_what_commands_are_late_by_together_is_the_vehicles_own_lag(broadband, u
     assert second.input_late - first.input_late == pytest.approx(0.012, abs=0.002)
 
 
+@pytest.mark.parametrize("source", ["command", "rotor_speed"])
+@pytest.mark.parametrize("late", [-0.2, 0.0, 0.1, 0.3])
+def test_a_signal_that_is_stamped_late_is_named(source, late, broadband, updated):
+    of, span = broadband.series[source], (0.0, broadband.duration)
+    series = dict(broadband.series) | {source: Series(of.time + late, of.values)}
+    found = order_findings("a", series, updated, span, source)
+    assert [(one.code, one.names) for one in found] == [(Code.STAMPED_LATE, (source,))] * bool(late)
+    for one in found:
+        assert one.numbers["seconds"] == pytest.approx(late, abs=0.03)
+
+
 def test_the_order_of_measured_speeds_is_seen_in_how_they_turn_the_vehicle(broadband, updated):
     speed, span = broadband.series["rotor_speed"], (0.0, broadband.duration)
     assert order_findings("a", broadband.series, updated, span, "rotor_speed") == ()
