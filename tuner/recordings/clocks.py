@@ -37,6 +37,8 @@ MAX_TICK_DEVIATION = 0.2
 MAX_CLOCK_DRIFT = 0.01
 #: A smaller offset is left to the fit, which estimates a time offset and latencies.
 MIN_POSE_OFFSET_S = 0.02
+#: Signals of motion capture, which a table may have beside those of the autopilot.
+POSE_SIGNALS = ("position", "attitude", "velocity")
 #: The search range of the offset, to either side.
 MAX_POSE_OFFSET_S = 0.6
 #: 1 - correlation at the offset over that without it, at most.
@@ -286,19 +288,21 @@ def align_pose(
     Parameters
     ----------
     topics
-        Signal -> topic; signals of the attitude's topic are moved with it.
+        Signal -> topic; signals of the attitude's topic are moved with it, of a table those of
+        `POSE_SIGNALS`.
     """
     aligned = dict(series)
     topic = topics.get("attitude", "")
-    if topic == topics.get("body_rate"):
-        return aligned, ()
+    is_table = topic == topics.get("body_rate")
     offset = pose_offset(series)
     if offset is None:
         return aligned, ()
     if abs(offset) < MIN_POSE_OFFSET_S:
+        if is_table:
+            return aligned, ()
         return aligned, (Note(NoteCode.POSE_ON_TIME, "info", topic, numbers={"seconds": offset}),)
     for signal, samples in series.items():
-        if topics.get(signal) == topic:
+        if topics.get(signal) == topic and (signal in POSE_SIGNALS or not is_table):
             aligned[signal] = Series(samples.time - offset, samples.values)
     count = len(series["attitude"].time)
     moved = Note(NoteCode.POSE_MOVED, topic=topic, count=count, numbers={"seconds": offset})

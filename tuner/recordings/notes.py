@@ -61,7 +61,7 @@ class NoteCode(Worded):
     )
     POSE_MOVED = (
         "pose_moved",
-        "its clock is {milliseconds:+.1f} ms late against the gyro, by correlation: moved",
+        "the pose is stamped {milliseconds:+.1f} ms late against the gyro, by correlation: moved",
     )
     CLOCK_DRIFTS = (
         "clock_drifts",

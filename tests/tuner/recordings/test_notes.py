@@ -37,7 +37,7 @@ def test_signals_of_one_topic_are_listed_and_a_clock_is_in_milliseconds():
         "31 position and attitude samples with a stamp seen before dropped"
     )
     late = Note(NoteCode.POSE_MOVED, numbers={"seconds": 0.08})
-    assert note_in_words(late).startswith("its clock is +80.0 ms late")
+    assert note_in_words(late).startswith("the pose is stamped +80.0 ms late")
 
 
 @pytest.mark.parametrize("code", REJECTED_SOURCE_CODES)

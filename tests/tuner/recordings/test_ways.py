@@ -152,6 +152,26 @@ def test_values_of(way: str, tmp_path: Path) -> None:
         assert flight.series[signal].values[0] == pytest.approx(16.4)
 
 
+@pytest.mark.parametrize("late", [-0.1, 0.0, 0.3])
+def test_a_pose_that_is_late_in_its_table_is_moved_and_nothing_else(
+    late: float, tmp_path: Path
+) -> None:
+    table = dict(ways.flown())
+    time = table["time"]
+    for name in (*ways.POSE[1:], "vx", "vy", "vz"):
+        table[name] = np.interp(time - late, time, table[name])
+    flight = read(tmp_path, ways.text(table))
+    moved = [n.numbers["seconds"] for n in flight.notes if n.code is NoteCode.POSE_MOVED]
+    assert moved == ([pytest.approx(late, abs=2e-3)] if late else [])
+    middle = flight.time[len(flight.time) // 4 : -len(flight.time) // 4]
+    for name, prefix, allowed in (("position", "", 0.01), ("velocity", "v", 0.05)):
+        series = flight.series[name]
+        flown = ways.flown()[f"{prefix}x"]
+        there = np.interp(middle, series.time, series.values[:, 0])
+        begin = flight.series["command"].time[0]
+        assert there == pytest.approx(np.interp(middle - begin, time, flown), abs=allowed)
+
+
 @pytest.mark.parametrize("unit", [1.0, 0.3048, 0.01])
 def test_a_reference_is_read_in_the_unit_of_the_position(unit: float, tmp_path: Path) -> None:
     """Where it was written in the same unit; a planner's may be in metres beside it."""
