@@ -63,8 +63,8 @@ class Series:
 
     def between(self, start: float, end: float) -> Series:
         """Return the samples from one time to another, in s, both included."""
-        inside = (self.time >= start) & (self.time <= end)
-        return Series(self.time[inside], self.values[inside])
+        inside = slice(self.time.searchsorted(start), self.time.searchsorted(end, "right"))
+        return Series(self.time[inside].copy(), self.values[inside].copy())
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
@@ -105,17 +106,9 @@ def render(folder: str | Path, *, plots: bool = False) -> Path:
 
 
 def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
-    environment = Environment(
-        loader=PackageLoader("tuner.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = _environment()
     script = _source(environment, "page.js")
-    library = "\n".join(
-        (files("tuner.report") / "assets" / name).read_text("utf-8") for name in LIBRARIES
-    )
+    library, compressed = _library()
     run = contents.run
     found = None if run is None else outcome(run.result, contents.bench, contents.exports)
     return environment.get_template("page.html.jinja").render(
@@ -133,8 +126,28 @@ def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
         style=Markup(_source(environment, "page.css")),
         script=Markup(script),
         figures=Markup(_compressed(figures)),
-        library=Markup(_compressed(library)),
+        library=Markup(compressed),
     )
+
+
+@cache
+def _environment() -> Environment:
+    """Return what renders templates, each compiled once."""
+    return Environment(
+        loader=PackageLoader("tuner.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+@cache
+def _library() -> tuple[str, str]:
+    """Return the plotting library, and it compressed."""
+    folder = files("tuner.report") / "assets"
+    text = "\n".join((folder / name).read_text("utf-8") for name in LIBRARIES)
+    return text, _compressed(text)
 
 
 def _examination_sentences(contents: Contents) -> list[str]:
