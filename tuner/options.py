@@ -11,7 +11,7 @@ from dataclasses import KW_ONLY, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
-from annotated_types import Ge, Gt, Interval
+from annotated_types import Ge, Gt, Interval, Le
 
 from tuner.core.errors import ConfigError, did_you_mean
 
@@ -89,7 +89,7 @@ class VehicleOptions(RecordingOptions):
 
     vehicle: Vehicle | None = None
     """Start from this vehicle (file or shipped). Default: the job file's, else hovergames."""
-    mass: Annotated[float, Gt(0)] | None = None
+    mass: Annotated[float, Gt(0), Le(500)] | None = None
     """Use this weighed take-off mass in kg instead of the vehicle file's."""
     fit: Names | None = None
     """Fit, or judge, exactly these coefficients."""

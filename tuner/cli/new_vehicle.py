@@ -61,21 +61,21 @@ def new_vehicle(
     out
         Write this vehicle file, and beside it a job file that ends in .job.yaml.
     mass
-        Ready to fly, kg.
+        Give the mass ready to fly, in kg.
     wheelbase
-        Distance between opposite motors, m.
+        Give the distance between opposite motors, in m.
     layout
-        Of the rotors; the simulated mixer is that of the X.
+        Arrange the rotors so; the simulated mixer is that of the X.
     propeller
-        Diameter and pitch in inch, as 11x4.7.
+        Give diameter and pitch in inch, as 11x4.7.
     cells
-        Of the battery, in series; 1 is taken for coreless motors.
+        Give the battery's cells in series; 1 is taken for coreless motors.
     motor_kv
-        Speed per voltage, unloaded, rpm/V.
+        Give the motors' speed per voltage without load, in rpm/V.
     hover_throttle
-        Command in hover, 0 to 1, from any log.
+        Give the command in hover, 0 to 1, of any log.
     rotor_height
-        Of the rotors above the centre of mass, m. Default: 0.
+        Give the rotors' height above the centre of mass, in m. Default: 0.
     like
         Scale from this known vehicle, and take from it what is not given.
     """

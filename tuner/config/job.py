@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from annotated_types import Ge, Interval, Len
+from annotated_types import Ge, Interval, Le, Len
 from pydantic import AfterValidator, Field, model_validator
 
 from tuner.core.errors import ConfigError, did_you_mean
@@ -255,7 +255,7 @@ class JobFile(Section):
     controller: Path | None = None
     topics: Path | None = None
     namespace: str = ""
-    mass: Positive | None = None
+    mass: Annotated[Positive, Le(500)] | None = None
     simulated: Flag = False
     holdout: tuple[str, ...] = ()
     free: Annotated[tuple[CoefficientName, ...], Len(min_length=1)] | None = None

@@ -17,6 +17,8 @@ from tuner.core.validation import Place
 
 MAX_BYTES = 1_000_000
 MAX_NODES = 100_000
+MAX_DIGITS = 4000
+"""Python refuses an integer of more than 4300."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,11 @@ for _tag, _pattern, _first in _CORE_SCHEMA:
 
 
 def _decimal(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:
-    return int(loader.construct_scalar(node))
+    digits = str(loader.construct_scalar(node))
+    if len(digits) > MAX_DIGITS:
+        what = f"a number has {len(digits)} digits"
+        raise yaml.constructor.ConstructorError(None, None, what, node.start_mark)
+    return int(digits)
 
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _decimal)

@@ -61,6 +61,7 @@ def test_paths_count_from_the_job_file_and_bare_names_are_shipped_files(tmp_path
         ("vehicel: x.yaml", "unknown key 'vehicel'; did you mean 'vehicle'?"),
         ("vehicle: hovergame", "did you mean 'hovergames'?"),
         ("free: [motor_constan]", "unknown coefficient 'motor_constan'; did you mean"),
+        ("mass: 2243", "mass is 2243; it should be at most 500"),
         ("free: [mass]\nfixed: [mass]", "both 'free' and 'fixed' are given"),
         ("terms: [linear_drag]\nfixed: [linear_drag_y]", "'linear_drag_y' is both among terms and"),
         ("free: []", "free is []"),

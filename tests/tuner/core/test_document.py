@@ -81,7 +81,7 @@ def test_sections_have_a_line_for_each_key_and_deeper_values_one_line():
         ("a: !!python/object/apply:os.system [ls]\n", "line 1"),
         ("a: 1\n---\nb: 2\n", "line 2"),
         ("{[1, 2]: 3}\n", "a key is not a word"),
-        ("a: " + "9" * 5000, "not YAML"),
+        ("a: " + "9" * 5000, "line 1: a number has 5000 digits; correct the YAML"),
         ("a: 1\n" + "#" * MAX_BYTES, "larger than 1 MB"),
         ("a\x00b: 1", "not YAML"),
     ],
