@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+import anyio
 import anyio.to_thread
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
@@ -143,13 +144,21 @@ async def receive(
     try:
         try:
             parser = MultipartParser(boundary, receiver.callbacks())  # type: ignore[arg-type]
-            async for chunk in stream:
+            chunks = aiter(stream)
+            while True:
+                with anyio.fail_after(limits.stall_seconds):
+                    chunk = await anext(chunks, None)
+                if chunk is None:
+                    break
                 parser.write(chunk)
                 if len(receiver.buffer) >= BUFFER_BYTES:
                     await anyio.to_thread.run_sync(receiver.flush)
             await anyio.to_thread.run_sync(receiver.flush)
         except FormParserError:
             raise InputError("upload", "is no form that can be read", REMEDY) from None
+        except TimeoutError:
+            what = f"stopped: nothing arrived for {limits.stall_seconds:g} s"
+            raise InputError("upload", what, "upload the recording again") from None
         finally:
             receiver.close()
         if receiver.name is None:

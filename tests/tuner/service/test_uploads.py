@@ -6,6 +6,7 @@ import socket
 import sys
 import threading
 from dataclasses import replace
+from http.client import HTTPResponse
 from urllib.parse import urlsplit
 
 import httpx
@@ -176,16 +177,32 @@ def test_a_body_that_is_no_upload_is_refused_in_words(client, service, body, kin
     assert left(service) == []
 
 
+BEGINNING = (
+    b"POST /api/v1/recordings HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-length: 9000000\r\n"
+    b"content-type: multipart/form-data; boundary=x\r\n\r\n"
+    b'--x\r\ncontent-disposition: form-data; name="file"; filename="a.bag"\r\n\r\n'
+)
+
+
+def test_an_upload_that_stalls_is_cut_off_and_makes_room(settings, table):
+    limits = replace(LIMITS, uploads_at_once=1, stall_seconds=0.2)
+    service = Service.open(replace(settings, limits=limits, workers=0))
+    with listening(service) as client:
+        url = urlsplit(str(client.base_url))
+        with socket.create_connection((url.hostname, url.port), timeout=20.0) as connection:
+            connection.sendall(BEGINNING + bytes(4_000_000))
+            answer = HTTPResponse(connection)
+            answer.begin()
+            assert (answer.status, b"nothing arrived for 0.2 s" in answer.read()) == (422, True)
+        assert left(service) == []
+        upload(client, table.read_bytes())
+
+
 def test_an_upload_whose_sender_goes_away_leaves_nothing(client, service, table):
     url = urlsplit(str(client.base_url))
-    head = (
-        "POST /api/v1/recordings HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-length: 9000000\r\n"
-        "content-type: multipart/form-data; boundary=x\r\n\r\n"
-        '--x\r\ncontent-disposition: form-data; name="file"; filename="a.bag"\r\n\r\n'
-    )
     for _ in range(3):
         with socket.create_connection((url.hostname, url.port)) as connection:
-            connection.sendall(head.encode() + bytes(4_000_000))
+            connection.sendall(BEGINNING + bytes(4_000_000))
     waited = threading.Event()
     for _ in range(100):
         if not left(service):
