@@ -1,1 +1,1 @@
-"""What measures speed: each module hands back a table, `python -m benchmarks` writes them all."""
+"""Benchmarks: each module returns a table, `python -m benchmarks` writes them all."""

@@ -17,8 +17,8 @@ import time
 import tomllib
 from pathlib import Path
 
-from benchmarks.history import remembered
-from benchmarks.table import Section, sections_of, table, updated, with_bars
+from benchmarks.history import updated_history
+from benchmarks.table import Section, sections_of, table, update_bars, update_section
 from benchmarks.timing import ROOT, machine
 from tuner.core import runtime
 
@@ -78,7 +78,7 @@ def main() -> None:
         print(section.markdown(), *bars, sep="\n", flush=True)
         if target is None:
             continue
-        past = remembered(
+        past = updated_history(
             before,
             [bar for section in sections for bar in section.bars],
             when=datetime.datetime.now(datetime.UTC),
@@ -86,7 +86,7 @@ def main() -> None:
             whole=not arguments.parts,
         )
         if arguments.update:
-            text = updated(with_bars(updated(text, section), section.bars), past)
+            text = update_section(update_bars(update_section(text, section), section.bars), past)
         else:
             text = page([past, *sections], where, (time.perf_counter() - began) / 60, before)
         target.write_text(text, encoding="utf-8")

@@ -17,7 +17,7 @@ WANDER, WANDER_TIME = 0.004, 0.02
 """Share by which each rotor's thrust wanders, and s in which it forgets."""
 
 
-def wandering(
+def gauss_markov(
     random: np.random.Generator,
     shape: tuple[int, ...],
     *,
@@ -60,10 +60,12 @@ def air(
         m, a rotor's torque over its thrust.
     """
     ticks, flights = shape
-    wind = wandering(random, (ticks, 3, flights), deviation=GUST, seconds=GUST_TIME, rate=rate)
+    wind = gauss_markov(random, (ticks, 3, flights), deviation=GUST, seconds=GUST_TIME, rate=rate)
     wind *= np.array([1.0, 1.0, 0.5])[:, None]
     share = WANDER * mass * GRAVITY / 4.0
-    thrust = wandering(random, (ticks, 4, flights), deviation=share, seconds=WANDER_TIME, rate=rate)
+    thrust = gauss_markov(
+        random, (ticks, 4, flights), deviation=share, seconds=WANDER_TIME, rate=rate
+    )
     places, spins = np.asarray(places, float), np.asarray(spins, float)
     arms = (places[:, 1], -places[:, 0], -spins * moment_constant)
     return Disturbance(

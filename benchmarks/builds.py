@@ -13,7 +13,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from benchmarks.contest import STRIDE, Contest, rivals, simple
+from benchmarks.contest import STRIDE_S, Contest, rivals, simple_predictors
 from tuner.config import Options, resolve_settings
 from tuner.config.job import InletName, JobFile
 from tuner.core.errors import InputError
@@ -28,7 +28,7 @@ from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.uncertainty.identifiability import hold_undetermined
 
 INLET: InletName = "actuator"
-"""What the commanded thrust and torque ask of the motors."""
+"""Motor commands follow from commanded thrust and torque."""
 
 
 def contest_of(folder: Path) -> Contest:
@@ -89,13 +89,13 @@ def _predicted(path: Path, mass: float) -> dict[str, list[Predictions]]:
     best = vehicle_fitted(selected.job, fitted)
     controller = controller_flown(selected.job, fitted)
     predictions = {
-        label: [predict(vehicle, controller, second, INLET, stride=STRIDE, observer=observer)]
+        label: [predict(vehicle, controller, second, INLET, stride=STRIDE_S, observer=observer)]
         for label, vehicle, observer in rivals(
             settings.vehicle, best, controller, [(first, INLET, 0.0)]
         )
     }
     signal = INLETS[INLET].needs[0]
-    return simple([first], [second], signal, predictions["fitted"]) | predictions
+    return simple_predictors([first], [second], signal, predictions["fitted"]) | predictions
 
 
 def cut(flight: Flight, begin: float, end: float) -> Flight:

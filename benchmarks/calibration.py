@@ -1,4 +1,4 @@
-"""How often intervals hold the truth: simulation-based calibration on the reference flights' plan.
+"""Coverage of intervals: simulation-based calibration on the plan of the reference flights.
 
 Truths are drawn from a prior, and flown with measurement noise; depending on the kind of flight
 with gusts, and with a random half of some terms beyond the motor model. Each set is fitted from the
@@ -26,7 +26,7 @@ import numpy as np
 from scipy.stats import binom, norm
 
 from benchmarks.oracle import oracle_error
-from benchmarks.simulated_recordings import recorded
+from benchmarks.simulated_recordings import simulate_like
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from sim_jax.inlet import ReferenceInlet
@@ -50,9 +50,9 @@ from tuner.vehicle.model import with_terms_computed
 DRAWS = int(os.environ.get("TUNE_CALIBRATION_DRAWS", "20"))
 WORKERS = int(os.environ.get("TUNE_CALIBRATION_WORKERS", "0")) or None
 
-FIRST = 20
-"""Seed of the first set: on those before, the rules' parameters were chosen."""
-NARROWED = 0.25
+FIRST_SEED = 20
+"""Sets with smaller seeds served to choose the rules' parameters."""
+PRIOR_SHARE = 0.25
 """The prior that truths are drawn from and fits are steadied by, over the usual one: with that,
 half of the vehicles could not fly."""
 TERMS = (
@@ -63,15 +63,15 @@ TERMS = (
     "center_of_mass_x",
     "center_of_mass_y",
 )
-FLOWN = 0.5
+P_TERM = 0.5
 """Probability that a vehicle has a term."""
-INSIDE = 0.01
+BOUND_MARGIN = 0.01
 """Share of its range by which a truth keeps away from a coefficient's bounds."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What flights have beside measurement noise."""
+    """The disturbances of a kind of flights."""
 
     name: str
     gusts: bool
@@ -86,7 +86,7 @@ KINDS = (
 
 
 @dataclass(frozen=True)
-class Ranked:
+class RankedSet:
     """A set of flights, its truth ranked.
 
     Attributes
@@ -108,21 +108,21 @@ class Ranked:
 
 def measure() -> Section:
     """Draw, fly, fit and rank every kind of flight; keep what is found for the report's page."""
-    seeds = range(FIRST, FIRST + DRAWS)
+    seeds = range(FIRST_SEED, FIRST_SEED + DRAWS)
     tasks = [(number, seed) for number in range(len(KINDS)) for seed in seeds]
-    found: dict[str, list[Ranked]] = {kind.name: [] for kind in KINDS}
+    found: dict[str, list[RankedSet]] = {kind.name: [] for kind in KINDS}
     with engine_for(WORKERS) as engine:
         for (number, seed), ranked in zip(tasks, engine.stream(_task, tasks), strict=True):
             found[KINDS[number].name].append(ranked)
             print(_line(KINDS[number], seed, ranked), flush=True)
-    kinds = tuple(_held(name, _converged(sets)) for name, sets in found.items())
+    kinds = tuple(_coverage(name, _converged(sets)) for name, sets in found.items())
     today = datetime.date.today().isoformat()
     text = Calibration(date=today, kinds=kinds).model_dump_json(indent=2)
     CALIBRATION.write_text(f"{text}\n", encoding="utf-8")
     return section(found, today)
 
 
-def section(found: Mapping[str, Sequence[Ranked]], date: str) -> Section:
+def section(found: Mapping[str, Sequence[RankedSet]], date: str) -> Section:
     """Return the table of what was found of each kind of flight."""
     rows = [row for name, sets in found.items() for row in _rows(name, _converged(sets))]
     left = [sum(not ranked.converged for ranked in sets) for sets in found.values()]
@@ -131,8 +131,8 @@ def section(found: Mapping[str, Sequence[Ranked]], date: str) -> Section:
     text = (
         f"Measured in simulation, {date}: {' to '.join(map(str, draws))} sets of flights of each "
         "kind, on the plan of the four fitted reference flights, at truths drawn from a prior "
-        f"{figure(NARROWED)} times as wide as the usual one, each of {len(TERMS)} terms there or "
-        "not. Fitted from the prior's mean with what may have flown in the model. The share of "
+        f"{figure(PRIOR_SHARE)} times as wide as the usual one, each of {len(TERMS)} terms there "
+        "or not. Fitted from the prior's mean with what may have flown in the model. The share of "
         "intervals that hold the truth: of all coefficients with twice its standard error, by the "
         "scatter from set to set; of each, beside it the range in which the share of so many sets "
         "would lie 19 times of 20, were the intervals what they say. Estimate minus truth is in "
@@ -148,19 +148,19 @@ def section(found: Mapping[str, Sequence[Ranked]], date: str) -> Section:
     return Section("Calibration of the intervals", text, head, rows)
 
 
-def _task(task: tuple[int, int], _: Report) -> Ranked:
+def _task(task: tuple[int, int], _: Report) -> RankedSet:
     return ranked_set(KINDS[task[0]], task[1])
 
 
-def ranked_set(kind: Kind, seed: int) -> Ranked:
+def ranked_set(kind: Kind, seed: int) -> RankedSet:
     """Draw a truth, fly and fit it."""
     clock = time.process_time()
     random = np.random.default_rng([seed, KINDS.index(kind)])
     objective = problem(terms=kind.terms)
     flown = None
     while flown is None:
-        truth = drawn(objective.space, random)
-        flown = recorded(objective, truth, random, gusts=kind.gusts)
+        truth = draw_truth(objective.space, random)
+        flown = simulate_like(objective, truth, random, gusts=kind.gusts)
     found = fitted(flown.objective)
     error = uncertainty_of(found).covariance.error
     space = objective.space
@@ -168,12 +168,9 @@ def ranked_set(kind: Kind, seed: int) -> Ranked:
     off = dict(zip(space.names, ((best - true) / error).tolist(), strict=True))
     errors = dict(zip(space.names, error.tolist(), strict=True))
     oracle = oracle_error(
-        found,
-        truth,
-        gusts=kind.gusts,
-        random=np.random.default_rng([seed, KINDS.index(kind), 1]),
+        found, truth, gusts=kind.gusts, random=np.random.default_rng([seed, KINDS.index(kind), 1])
     )
-    return Ranked(off, errors, oracle, time.process_time() - clock, found.converged)
+    return RankedSet(off, errors, oracle, time.process_time() - clock, found.converged)
 
 
 @lru_cache(maxsize=1)
@@ -187,7 +184,7 @@ def reference_job() -> Job:
 
 
 @lru_cache(maxsize=2)
-def problem(*, terms: bool, more: tuple[str, ...] = (), narrowed: float = NARROWED) -> Objective:
+def problem(*, terms: bool, more: tuple[str, ...] = (), narrowed: float = PRIOR_SHARE) -> Objective:
     """Return the reference flights' problem with the prior of the truths.
 
     With terms, these are `TERMS` and ``more``. A spin is held level: nothing else holds a vehicle
@@ -211,16 +208,16 @@ def problem(*, terms: bool, more: tuple[str, ...] = (), narrowed: float = NARROW
     )
 
 
-def drawn(space: Space, random: np.random.Generator) -> Array:
+def draw_truth(space: Space, random: np.random.Generator) -> Array:
     """Return the search vector (K,) of a truth from the prior; a term is there or not.
 
     None is next to a bound, where an interval would be one-sided.
     """
     while True:
-        there = np.array([n not in TERMS or random.random() < FLOWN for n in space.names])
+        there = np.array([n not in TERMS or random.random() < P_TERM for n in space.names])
         scaled = space.prior_mean + there * space.prior_sd * random.normal(size=len(space))
         share = (scaled - space.lower) / space.width
-        if np.all((share > INSIDE) & (share < 1.0 - INSIDE)):
+        if np.all((share > BOUND_MARGIN) & (share < 1.0 - BOUND_MARGIN)):
             return space.at_share(share)
 
 
@@ -275,17 +272,17 @@ def band(level: str, sets: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def scatter(sets: Sequence[Ranked], level: str) -> float:
+def scatter(sets: Sequence[RankedSet], level: str) -> float:
     """Return the standard error of the share of all coefficients, whose errors go together."""
     shares = [share_within(ranked.off.values(), level) for ranked in sets]
     return float(np.std(shares, ddof=1) / np.sqrt(len(shares))) if len(shares) > 1 else float("nan")
 
 
-def _converged(sets: Sequence[Ranked]) -> list[Ranked]:
+def _converged(sets: Sequence[RankedSet]) -> list[RankedSet]:
     return [ranked for ranked in sets if ranked.converged]
 
 
-def _held(name: str, sets: Sequence[Ranked]) -> CoverageRecord:
+def _coverage(name: str, sets: Sequence[RankedSet]) -> CoverageRecord:
     shares = {c: share_within((r.off[c] for r in sets), "95") for c in sets[0].off}
     return CoverageRecord(
         flights=name,
@@ -296,18 +293,18 @@ def _held(name: str, sets: Sequence[Ranked]) -> CoverageRecord:
     )
 
 
-def _share_of_all(sets: Sequence[Ranked], level: str) -> float:
+def _share_of_all(sets: Sequence[RankedSet], level: str) -> float:
     return share_within([off for ranked in sets for off in ranked.off.values()], level)
 
 
-def _rows(name: str, sets: Sequence[Ranked]) -> list[list[str]]:
+def _rows(name: str, sets: Sequence[RankedSet]) -> list[list[str]]:
     """Return a kind's rows, all coefficients together first."""
     together = [
         f"{_percent(_share_of_all(sets, level))} ± {figure(200 * scatter(sets, level))} %"
         for level in COVERAGE_LEVELS
     ]
     moments = _moments(off for ranked in sets for off in ranked.off.values())
-    rows = [[name, "all", str(len(sets)), *together, *moments, _wider(sets, list(sets[0].off))]]
+    rows = [[name, "all", str(len(sets)), *together, *moments, _ratio(sets, list(sets[0].off))]]
     for coefficient in sets[0].off:
         off = [ranked.off[coefficient] for ranked in sets]
         shares = []
@@ -316,13 +313,13 @@ def _rows(name: str, sets: Sequence[Ranked]) -> list[list[str]]:
             shares.append(
                 f"{_percent(share_within(off, level))} ({100 * low:.0f}–{100 * high:.0f})"
             )
-        wider = _wider(sets, [coefficient])
+        wider = _ratio(sets, [coefficient])
         rows.append([name, coefficient, str(len(sets)), *shares, *_moments(off), wider])
     return rows
 
 
-def _wider(sets: Sequence[Ranked], names: Sequence[str]) -> str:
-    """Return how many times as large as an oracle's the quoted errors are, in the median."""
+def _ratio(sets: Sequence[RankedSet], names: Sequence[str]) -> str:
+    """Return the median ratio of quoted errors to an oracle's."""
     times = [r.error[name] / r.oracle[name] for r in sets for name in names if name in r.oracle]
     return f"{figure(float(np.median(times)))} ×" if times else ""
 
@@ -336,7 +333,7 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %"
 
 
-def _line(kind: Kind, seed: int, ranked: Ranked) -> str:
+def _line(kind: Kind, seed: int, ranked: RankedSet) -> str:
     """Return a set in a line, as soon as it is there."""
     worst = sorted(ranked.off, key=lambda name: -abs(ranked.off[name]))[:4]
     off = ", ".join(f"{name} {ranked.off[name]:+.1f}" for name in worst)

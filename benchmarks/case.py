@@ -122,7 +122,7 @@ def factors(vehicles: int) -> Array:
 
 
 def _arguments(factor: Array, points: ReferencePoint) -> tuple[Any, ...]:
-    """Return what a rollout takes; the factors are (12, \\*batch)."""
+    """Return the arguments of a rollout; the factors are (12, \\*batch)."""
     vehicle = _vehicle()
     numbers = [
         value.astype(factor.dtype) * factor[i] for i, value in enumerate(_coefficients(vehicle))

@@ -11,9 +11,9 @@ from tuner.evaluate.torque_observer import FedFlight, TorqueObserver
 from tuner.recordings.flight import Flight
 from tuner.vehicle import ControllerFile, VehicleFile
 
-STEPS = (10, 50)
+COMPARED_STEPS = (10, 50)
 """Samples of 10 ms after which predictions are compared."""
-STRIDE = 0.02
+STRIDE_S = 0.02
 """s from one prediction to the next."""
 
 
@@ -52,7 +52,7 @@ def rivals(
     )
 
 
-def simple(
+def simple_predictors(
     fitted: Sequence[Flight], held_out: Sequence[Flight], signal: str, like: Sequence[Predictions]
 ) -> dict[str, list[Predictions]]:
     """Return what predictors without physics make of the same starts.

@@ -29,8 +29,7 @@ def measure() -> Section:
     loss, jacobian = (
         _time(contestant.rate)
         for contestant in compete(
-            [Contestant(what, (*OURS, "fit", what), {}) for what in ("loss", JACOBIAN)],
-            ROUNDS,
+            [Contestant(what, (*OURS, "fit", what), {}) for what in ("loss", JACOBIAN)], ROUNDS
         )
     )
     times = {name: _time(contestant.rate) for name, contestant in measured.items()}

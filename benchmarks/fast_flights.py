@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.air import wandering
+from benchmarks.air import gauss_markov
 from sim_jax.constants import GRAVITY
 from tuner.core.disk import write_text
 from tuner.vehicle.scaling_laws import INCH, Airframe, new_vehicle
@@ -182,8 +182,8 @@ def fly(racer: Racer, *, seed: int, seconds: float = 12.0) -> dict[str, Numbers]
     speeds = np.gradient(path, 1.0 / PHYSICS, axis=0)
     pulls = np.gradient(speeds, 1.0 / PHYSICS, axis=0)
     shape = (len(path), 3, path.shape[1])
-    wind = wandering(random, shape, deviation=0.6, seconds=0.7, rate=PHYSICS)
-    pushed = wandering(random, shape, deviation=1.0, seconds=0.08, rate=PHYSICS)
+    wind = gauss_markov(random, shape, deviation=0.6, seconds=0.7, rate=PHYSICS)
+    pushed = gauss_markov(random, shape, deviation=1.0, seconds=0.08, rate=PHYSICS)
     rest = np.zeros_like(path[0])
     state = [path[0], speeds[0], np.tile([0.0, 0.0, 0.0, 1.0], (path.shape[1], 1)), rest]
     weight = racer.values["mass"] * GRAVITY

@@ -1,4 +1,4 @@
-"""How far gusts scatter a fit: many draws of gusts, one vehicle, the right model.
+"""The scatter of fits in gusts: many draws of gusts, one vehicle, the right model.
 
 The reference flights' plan is flown by this project's own simulator at the reference truth, in
 gusts, with measurement noise; fitted by least squares of the simulated flights and, from there,
@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 
 from benchmarks.calibration import fitted, problem, reference_job
-from benchmarks.simulated_recordings import Flown, recorded
+from benchmarks.simulated_recordings import SimulatedFlights, simulate_like
 from benchmarks.table import Bar, Section, figure
 from benchmarks.timing import ROOT
 from tuner.engine import Report, engine_for
@@ -42,7 +42,7 @@ BARS = {
 
 @dataclass(frozen=True)
 class Draw:
-    """What was estimated of a set of flights.
+    """The estimates from a set of flights.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ def measure() -> Section:
 
 
 def _task(seed: int, _: Report) -> Draw:
-    return drawn(seed)
+    return fly_and_fit(seed)
 
 
 def truth() -> dict[str, float]:
@@ -86,12 +86,12 @@ def truth() -> dict[str, float]:
     return {name: float(value) for name, value in yaml.safe_load(text).items()}
 
 
-def drawn(seed: int) -> Draw:
+def fly_and_fit(seed: int) -> Draw:
     """Fly the reference vehicle in the gusts of a seed, and fit it."""
     clock = [time.process_time()]
     objective = problem(terms=False, narrowed=1.0)
     vector = objective.space.vector_of(truth())
-    flown = recorded(objective, vector, np.random.default_rng([seed, 7]), gusts=True)
+    flown = simulate_like(objective, vector, np.random.default_rng([seed, 7]), gusts=True)
     if flown is None:
         raise SystemExit(f"the vehicle crashed in the gusts of seed {seed}")
     found = fitted(flown.objective)
@@ -105,7 +105,7 @@ def drawn(seed: int) -> Draw:
     )
 
 
-def _job(flown: Flown) -> Job:
+def _job(flown: SimulatedFlights) -> Job:
     """Return the reference flights' job with set-points as they were flown."""
     job = reference_job()
     flights = iter(flown.with_setpoints(job.fitted))

@@ -1,4 +1,4 @@
-"""What the bars came to, measure by measure: a line each on the page, so that a regression shows.
+"""The history of the bars, a line per measurement, so that a regression shows.
 
 The page itself is the record: its lines are read, one is added, and all are written again.
 """
@@ -11,7 +11,7 @@ from datetime import datetime
 from benchmarks.table import Bar, Section, figure
 
 TITLE = "History"
-WORSE = 1.2
+MAX_WORSE_RATIO = 1.2
 """Factor beyond which a figure counts as worse than the best before it, and not as chance."""
 MARK = " ↓"
 _WHEN, _VERSION, _NONE = "measured", "version", "–"
@@ -36,7 +36,7 @@ def lines_of(page: str) -> list[Line]:
     ]
 
 
-def remembered(
+def updated_history(
     page: str, bars: Sequence[Bar], *, when: datetime, version: str, whole: bool
 ) -> Section:
     """Return a page's history with what was measured now.
@@ -61,8 +61,9 @@ def remembered(
     return Section(
         TITLE,
         "A line a measure, the newest last; times in UTC. Figures are those of the bars, in their "
-        f"units; one that is worse than the best above it by more than a factor {WORSE:g} is "
-        f"marked{MARK}. Machines and what else they do differ: ratios are worth more than seconds.",
+        "units; one that is worse than the best above it by more than a factor "
+        f"{MAX_WORSE_RATIO:g} is marked{MARK}. Machines and their load differ: ratios are worth "
+        "more than seconds.",
         head,
         [[line.get(name, _NONE) for name in head] for line in lines],
     )
@@ -77,5 +78,5 @@ def _is_worse(bar: Bar, lines: Sequence[Line]) -> bool:
     if not known or bar.measured is None:
         return False
     if bar.sense == "at least":
-        return bar.measured * WORSE < max(known)
-    return bar.measured > WORSE * min(known)
+        return bar.measured * MAX_WORSE_RATIO < max(known)
+    return bar.measured > MAX_WORSE_RATIO * min(known)

@@ -23,7 +23,7 @@ SMALL = 60
 
 
 def counts(root: Path) -> dict[str, float]:
-    """Return what is counted of a checkout's packages."""
+    """Return the counts of a checkout's packages."""
     files = [f for p in PACKAGES for f in sorted((root / p).rglob("*.py"))]
     lines = {f: len(f.read_text(encoding="utf-8").splitlines()) for f in files}
     nodes = [n for f in files for n in statements(f)]

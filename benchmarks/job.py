@@ -24,7 +24,7 @@ FLIGHTS = [
 ]
 TUNE = (sys.executable, "-c", "import sys; from tuner.cli import main; sys.exit(main())")
 WARM, STARTS = 2, 5
-SEARCHED = " s  Searched: "
+SEARCH_LINE = " s  Searched: "
 """In the line that a pipe gets when the search has ended, and a terminal its first table."""
 SEEDS = 0, 1
 """Of laboratories, every other one of which has gusts."""
@@ -32,7 +32,7 @@ SEEDS = 0, 1
 
 @dataclass(frozen=True)
 class Cost:
-    """What a command costs: s to its end, of processor time, to its first results (NaN without).
+    """The cost of a command: s to its end, of processor time, to its first results (or NaN).
 
     And bytes at most.
     """
@@ -59,7 +59,7 @@ def command(*arguments: str | Path, cache: Path) -> Cost:
     ) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            if SEARCHED in line:
+            if SEARCH_LINE in line:
                 first = time.perf_counter() - began
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)

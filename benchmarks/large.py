@@ -1,4 +1,4 @@
-"""What an iteration of a fit to many flights takes, in time and memory, and the picture of it."""
+"""Time and memory of an iteration of a fit to many flights, with a figure."""
 
 from __future__ import annotations
 

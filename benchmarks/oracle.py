@@ -1,4 +1,4 @@
-"""What someone would quote who knows the truth and the law of what disturbed the flights."""
+"""Errors of an oracle that knows the truth and the law of the disturbances."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.simulated_recordings import recorded
+from benchmarks.simulated_recordings import simulate_like
 from tuner.core.numerics import Array, Inverse
 from tuner.objective.information import information_at
 from tuner.search.progress import Fitted
@@ -48,7 +48,7 @@ def oracle_error(
     steps: list[Array] = []
     while len(steps) < DRAWS:
         volts = log_voltage(random)
-        flown = recorded(fitted.objective, truth, random, gusts=gusts, log_voltage=volts)
+        flown = simulate_like(fitted.objective, truth, random, gusts=gusts, log_voltage=volts)
         if flown is None:
             continue
         at_truth = flown.objective.start(truth)

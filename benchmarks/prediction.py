@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import builds, without_pose
-from benchmarks.contest import STEPS, STRIDE, Contest, rivals, simple
+from benchmarks.contest import COMPARED_STEPS, STRIDE_S, Contest, rivals, simple_predictors
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from tuner.config import Options, resolve_settings
@@ -61,9 +61,9 @@ def measure() -> Section:
         rows += list(_rows(folder.name, contest))
     text = (
         "Mean error of open-loop predictions of held-out flights, so many samples of 10 ms ahead, "
-        f"begun every {1e3 * STRIDE:.0f} ms at the recorded state (filtered within 30 ms on either "
-        "side): Euclidean distances, and for the attitude the angle between both. Nothing is "
-        "fitted to these flights. *hold* lets the state be; *linear regression* fits "
+        f"begun every {1e3 * STRIDE_S:.0f} ms at the recorded state (filtered within 30 ms on "
+        "either side): Euclidean distances, and for the attitude the angle between both. Nothing "
+        "is fitted to these flights. *hold* lets the state be; *linear regression* fits "
         "accelerations to state and inputs of the fitted flights; *unfitted* is the vehicle file "
         "that the fit starts from; *observed* knows besides what turned the vehicle unseen in the "
         "last sample before. "
@@ -73,7 +73,7 @@ def measure() -> Section:
 
 def _rows(name: str, contest: Contest) -> Iterator[list[str]]:
     for predictor, predictions in contest.predictions.items():
-        for steps in STEPS:
+        for steps in COMPARED_STEPS:
             means = summary(predictions, steps / 100.0)
             yield [name, predictor, str(steps), *(_cell(means[key]) for key in PREDICTED_UNITS)]
 
@@ -100,7 +100,7 @@ def contest_of(folder: Path) -> Contest:
     InputError
         Its recordings cannot be fitted.
     """
-    options = options_of(folder)
+    options = options_for_set(folder)
     recordings, _ = read_recordings(resolve_settings(options))
     fitted = [recording.flight for recording in recordings if not recording.holdout]
     held_out = [recording for recording in recordings if recording.holdout]
@@ -123,7 +123,7 @@ def contest_of(folder: Path) -> Contest:
                 controller,
                 recording.flight,
                 recording.inlet,
-                stride=STRIDE,
+                stride=STRIDE_S,
                 input_late=late[recording.flight.name],
                 observer=observer,
             )
@@ -135,7 +135,7 @@ def contest_of(folder: Path) -> Contest:
         tuple(recording.flight.name for recording in held_out),
         f"{len(fitted)} flights",
         seconds,
-        {**simple(fitted, [r.flight for r in held_out], signal, predictions["fitted"])}
+        {**simple_predictors(fitted, [r.flight for r in held_out], signal, predictions["fitted"])}
         | predictions,
     )
 
@@ -152,8 +152,8 @@ def controller_of(result: RunResult) -> ControllerFile:
     return ControllerFile.model_validate(result.settings["controller"])
 
 
-def options_of(folder: Path) -> Options:
-    """Return what ``tune`` is given for a set."""
+def options_for_set(folder: Path) -> Options:
+    """Return the options of ``tune`` for a set."""
     files = sorted(
         path
         for path in folder.iterdir()

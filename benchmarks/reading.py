@@ -1,4 +1,4 @@
-"""How quickly recordings are read, beside rosbags' own deserialisation of the same topics.
+"""The speed of reading recordings, beside rosbags' deserialisation of the same topics.
 
 The circle that ships with the project is repeated until the recording is a few minutes long, as
 ROS 1 bag, SQLite and MCAP. Seconds of one processor, the best of three.
@@ -61,7 +61,7 @@ def to_ros2(bag: Path, folder: Path, storage: StoragePlugin) -> Path:
 
 
 def wanted(path: Path) -> dict[str, Request]:
-    """Return what a flight takes from a recording."""
+    """Return the requests of a flight to a recording."""
     recording = open_recording(path)
     places, _ = locate(recording, choose_map(recording, shipped_maps(recording.format)))
     fields: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""How the time grows with flights, with their length, and with a population of coefficients."""
+"""Time by the number of flights, their length, and the size of a population."""
 
 from __future__ import annotations
 

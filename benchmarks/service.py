@@ -31,7 +31,7 @@ from tuner.service.settings import GIB, MIB, Limits, ServiceSettings
 from tuner.service.tables import JobRow, RecordingRow, State
 
 JOBS = 10_000
-AT_ONCE = 100
+CLIENTS = 100
 UPLOAD = 2 * GIB
 LIMITS = Limits(free_bytes=0, requests_in_a_burst=10**9, inspection_seconds=300.0)
 PAGES = ("/api/v1/jobs", "/api/v1/jobs?state=done", "/api/v1/jobs?vehicle=quad%203", "/jobs")
@@ -92,7 +92,7 @@ def median_ms(client: httpx.Client, path: str) -> float:
 
 
 def submissions(client: httpx.Client) -> tuple[int, float]:
-    """Return how many of many simultaneous submissions are found again, and the s they took."""
+    """Return the number of simultaneous submissions that are found again, and their time in s."""
     began = time.perf_counter()
 
     def submit(number: int) -> str:
@@ -101,8 +101,8 @@ def submissions(client: httpx.Client) -> tuple[int, float]:
         assert answer.status_code == 202, answer.text
         return str(answer.json()["id"])
 
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        ids = set(pool.map(submit, range(AT_ONCE)))
+    with ThreadPoolExecutor(CLIENTS) as pool:
+        ids = set(pool.map(submit, range(CLIENTS)))
     took = time.perf_counter() - began
     return sum(client.get(f"/api/v1/jobs/{job}").status_code == 200 for job in ids), took
 
@@ -158,13 +158,16 @@ def measure() -> Section:
             found, seconds = submissions(client)
         service.close()
         memory, took, status = upload(folder)
-    rows.append([f"{AT_ONCE} submissions at once: found again {found}, s", f"{seconds:.2f}"])
+    rows.append([f"{CLIENTS} submissions at once: found again {found}, s", f"{seconds:.2f}"])
     rows.append([f"upload of {UPLOAD // GIB} GiB, answered {status}, s", f"{took:.1f}"])
     rows.append(["largest memory of the server meanwhile, MiB", f"{memory:.0f}"])
     bars = [
         Bar(f"page of 50 of {JOBS} jobs, slowest, ms", slowest, 50.0, "at most"),
         Bar(
-            f"{AT_ONCE} submissions at once, found again", float(found), float(AT_ONCE), "at least"
+            f"{CLIENTS} submissions at once, found again",
+            float(found),
+            float(CLIENTS),
+            "at least",
         ),
         Bar("memory of an upload of 2 GiB, MiB", memory, 300.0, "at most"),
     ]

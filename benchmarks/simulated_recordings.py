@@ -26,7 +26,7 @@ from tuner.vehicle.model import Model
 
 
 @dataclass(frozen=True)
-class Flown:
+class SimulatedFlights:
     """Flights of a problem.
 
     Attributes
@@ -55,14 +55,14 @@ class Flown:
         return again
 
 
-def recorded(
+def simulate_like(
     objective: Objective,
     vector: Array,
     random: np.random.Generator,
     *,
     gusts: bool,
     log_voltage: Array | None = None,
-) -> Flown | None:
+) -> SimulatedFlights | None:
     """Return a problem with recordings of its flights at a truth, stamped and noisy as its own.
 
     Parameters
@@ -97,10 +97,10 @@ def recorded(
         clean = np.moveaxis(read, 0, -1)
         known = np.asarray(old.weight)
         noise = random.normal(size=known.shape) / np.where(known > 0.0, known, np.inf)
-        noisy = _turned(clean, noise) if channel == "attitude" else clean + noise
+        noisy = _rotate(clean, noise) if channel == "attitude" else clean + noise
         measured[channel] = Measured(old.time, jnp.asarray(noisy), old.weight)
     segments = replace(objective.segments, measured=measured)
-    return Flown(replace(objective, segments=segments), setpoints)
+    return SimulatedFlights(replace(objective, segments=segments), setpoints)
 
 
 def _air(objective: Objective, model: Model, random: np.random.Generator) -> Disturbance:
@@ -139,7 +139,7 @@ def _flown(
     return channels, flown.crash_time, flown.log.setpoints
 
 
-def _turned(attitude: Array, by: Array) -> Array:
+def _rotate(attitude: Array, by: Array) -> Array:
     """Turn attitudes (n, 4, F), w first, by rotation vectors (n, 3, F)."""
     true, noise = (np.moveaxis(part, 1, 2).reshape(-1, part.shape[1]) for part in (attitude, by))
     turned = Rotation.from_quat(true, scalar_first=True) * Rotation.from_rotvec(noise)

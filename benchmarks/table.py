@@ -1,4 +1,4 @@
-"""What a benchmark hands back, and how the page of results is written."""
+"""The tables of benchmarks, and the page of results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from benchmarks.timing import Spread
 
 @dataclass(frozen=True)
 class Bar:
-    """What is asked for."""
+    """A required limit."""
 
     what: str
     measured: float | None
@@ -23,9 +23,8 @@ class Bar:
     def verdict(self) -> str:
         if self.measured is None:
             return "not measured"
-        good = (
-            self.measured >= self.limit if self.sense == "at least" else self.measured <= self.limit
-        )
+        excess = self.measured - self.limit
+        good = excess >= 0 if self.sense == "at least" else excess <= 0
         return "met" if good else "missed"
 
     def row(self) -> list[str]:
@@ -58,14 +57,14 @@ def sections_of(page: str) -> dict[str, str]:
     return {part.partition("\n")[0]: f"## {part.strip()}\n" for part in parts}
 
 
-def updated(page: str, section: Section) -> str:
+def update_section(page: str, section: Section) -> str:
     """Return a page with a section in the place of the one of its title, or at its end."""
     before, heading, rest = page.partition(f"## {section.title}\n")
     _, following, after = rest.partition("\n## ") if heading else ("", "", "")
     return f"{before.rstrip()}\n\n{section.markdown()}{following}{after}"
 
 
-def with_bars(page: str, bars: Sequence[Bar]) -> str:
+def update_bars(page: str, bars: Sequence[Bar]) -> str:
     """Return a page whose first table has these bars, in the place of those of their name."""
     head, heading, rest = page.partition("\n## ")
     rows = {bar.what: "| " + " | ".join(bar.row()) + " |" for bar in bars}
@@ -78,9 +77,7 @@ def with_bars(page: str, bars: Sequence[Bar]) -> str:
 
 def figure(value: float) -> str:
     """Return a number in three digits."""
-    if value == 0 or not 1e-3 <= abs(value) < 1e5:
-        return f"{value:.3g}"
-    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e5 else f"{value:.3g}"
 
 
 def millions(rate: Spread | None) -> str:

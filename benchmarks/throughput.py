@@ -17,7 +17,7 @@ BATCHES = (1, 256, 4096)
 ROUNDS = 11
 HERE = Path(__file__).parent / "contestants"
 ONE_THREAD = {"NPROC": "1"}
-"""What makes the jax peers fastest: XLA's own threads slow their small kernels down."""
+"""The fastest setting of the jax peers: XLA's threads slow small kernels down."""
 
 
 def _yardstick(folder: Path) -> Path | None:

@@ -1,4 +1,4 @@
-"""How things are timed: contestants in processes of their own, one run of each in turn."""
+"""Timing of contestants in processes of their own, one run of each in turn."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Contestant:
 
 @dataclass(frozen=True)
 class Measured:
-    """What a contestant did: amount per second, or why it could not take part."""
+    """A contestant's result: amount per second, or why it could not take part."""
 
     name: str
     rate: Spread | None

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.contest import STRIDE, Contest, rivals, simple
+from benchmarks.contest import STRIDE_S, Contest, rivals, simple_predictors
 from tuner.config import Options, resolve_settings
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
@@ -56,23 +56,23 @@ def contest_of(folder: Path) -> Contest:
         fit = fit_without_pose(settings, flights[-1:], out=Path(name) / "run")
         best = read_vehicle(fit.folder / BEST_FIT_FILE)
     seconds = time.perf_counter() - began
-    fitted, held_out = posed(flights[-1]), [posed(flight) for flight in flights[:-1]]
+    fitted, held_out = with_pose(flights[-1]), [with_pose(flight) for flight in flights[:-1]]
     controller = ControllerFile()
     predictions = {
         label: [
-            _of_rate(predict(vehicle, controller, flight, INLET, stride=STRIDE, observer=observer))
+            _rates(predict(vehicle, controller, flight, INLET, stride=STRIDE_S, observer=observer))
             for flight in held_out
         ]
         for label, vehicle, observer in rivals(
             settings.vehicle, best, controller, [(fitted, INLET, 0.0)]
         )
     }
-    others = simple([fitted], held_out, "command", predictions["fitted"])
+    others = simple_predictors([fitted], held_out, "command", predictions["fitted"])
     return Contest(
         tuple(flight.name for flight in held_out),
         flights[-1].name,
         seconds,
-        {label: [_of_rate(p) for p in each] for label, each in others.items()} | predictions,
+        {label: [_rates(p) for p in each] for label, each in others.items()} | predictions,
         REMARK,
     )
 
@@ -81,11 +81,11 @@ def _flown(flight: InertialFlight) -> float:
     return max(end - begin for begin, end in flight.flying)
 
 
-def _of_rate(predictions: Predictions) -> Predictions:
+def _rates(predictions: Predictions) -> Predictions:
     return replace(predictions, errors={"body_rate": predictions.errors["body_rate"]})
 
 
-def posed(flight: InertialFlight) -> Flight:
+def with_pose(flight: InertialFlight) -> Flight:
     """Return the longest stretch in the air with an attitude that the gyro integrates to."""
     begin, end = max(flight.flying, key=lambda span: span[1] - span[0])
     gyro = flight.series["body_rate"]

@@ -1,4 +1,4 @@
-"""What workers are given in `benchmarks.workers`: found there by its name."""
+"""The tasks of `benchmarks.workers`, which workers import by name."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from tuner.core import runtime
 from tuner.engine import Engine, engine_for
 
 FOLDER = ROOT / "reference_flights"
-TRIVIAL = 10_000
+TRIVIAL_TASKS = 10_000
 JOBS, JOB = 400, 0.3
 """Of the simulated night: so many jobs, s of each on average."""
 REPEATS = 3
@@ -38,7 +38,7 @@ def measure() -> Section:
             for n, (s, model, _) in nights.items()
         ),
         *(
-            [f"{TRIVIAL} trivial tasks, {n} workers", figure(s), "", "", ""]
+            [f"{TRIVIAL_TASKS} trivial tasks, {n} workers", figure(s), "", "", ""]
             for n, (*_, s) in nights.items()
         ),
     ]
@@ -57,7 +57,7 @@ def measure() -> Section:
             Bar("threads of a worker", folds["two workers"].threads, 40, "at most"),
             Bar(
                 "trivial tasks in a second, two workers",
-                TRIVIAL / nights[2][2],
+                TRIVIAL_TASKS / nights[2][2],
                 100,
                 "at least",
             ),
@@ -127,7 +127,7 @@ def _nights() -> dict[int, tuple[float, float, float]]:
             engine.map(work.wait, [float(seconds) for seconds in drawn])
             night = time.perf_counter() - began
             began = time.perf_counter()
-            engine.map(work.nothing, range(TRIVIAL))
+            engine.map(work.nothing, range(TRIVIAL_TASKS))
             trivial = time.perf_counter() - began
         found[workers] = (night, float(drawn.sum()) / workers, trivial)
     return found

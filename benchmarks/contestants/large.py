@@ -15,7 +15,7 @@ import jax  # noqa: E402 (after the set-up)
 import numpy as np  # noqa: E402
 
 from benchmarks.calibration import problem  # noqa: E402
-from benchmarks.simulated_recordings import recorded  # noqa: E402
+from benchmarks.simulated_recordings import simulate_like  # noqa: E402
 from tuner.objective.criterion import Point  # noqa: E402
 from tuner.objective.normal_equations import Objective  # noqa: E402
 from tuner.search.levenberg_marquardt import advance, initial_step  # noqa: E402
@@ -26,8 +26,8 @@ DURATION = 40.0
 """s of each flight."""
 COEFFICIENTS = 20
 MORE_TERMS = ("center_of_mass_z", "flapping_moment_coefficient")
-NEARBY = 1e-3
-"""How far from the truth the search begins, in its own coordinates."""
+START_DISTANCE = 1e-3
+"""Of the search from the truth, in its own coordinates."""
 ITERATIONS = 3
 """The first is warmed up by."""
 
@@ -41,7 +41,7 @@ def flights(count: int) -> Objective:
     segments = replace(segments, flight=np.arange(count))
     samples = round(DURATION * objective.schedule.log_rate)
     many = replace(objective, segments=segments, samples=samples)
-    flown = recorded(many, many.space.initial, np.random.default_rng(0), gusts=False)
+    flown = simulate_like(many, many.space.initial, np.random.default_rng(0), gusts=False)
     if flown is None:
         raise SystemExit("a flight at the initial coefficients crashed")
     return flown.objective
@@ -57,7 +57,7 @@ def main(count: int) -> None:
         robust=True,
         steps=ITERATIONS,
     )[-1]
-    progress = initial_progress(objective, objective.space.initial[None] + NEARBY)
+    progress = initial_progress(objective, objective.space.initial[None] + START_DISTANCE)
     criterion = criterion_of(stage, progress.scales, np.asarray(progress.points.offsets[0]), None)
     points: Point = progress.points
     free = np.ones(len(objective.space) + points.offsets[0].size, bool)

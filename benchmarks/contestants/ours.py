@@ -33,7 +33,7 @@ from tuner.search.progress import criterion_of, initial_progress  # noqa: E402
 from tuner.search.stages import plan  # noqa: E402
 from tuner.vehicle import ControllerFile, read_vehicle  # noqa: E402
 
-WORK = 8_000_000
+STEPS_PER_RUN = 8_000_000
 """vehicle-steps a run, at least a tenth of a second."""
 DURATION = 40.0
 """s that one vehicle flies."""
@@ -41,7 +41,7 @@ DURATION = 40.0
 
 def kernel(precision: str, batch: str) -> None:
     vehicles = int(batch)
-    samples = max(100, min(20_000, WORK // (vehicles * STEPS)))
+    samples = max(100, min(20_000, STEPS_PER_RUN // (vehicles * STEPS)))
     flight, factor = Kernel(precision), np.asarray(factors(vehicles))
     answer(
         lambda: flight(factor, samples=samples),

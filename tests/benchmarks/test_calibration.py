@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from benchmarks import calibration as cal
-from benchmarks.air import wandering
-from benchmarks.simulated_recordings import recorded
+from benchmarks.air import gauss_markov
+from benchmarks.simulated_recordings import simulate_like
 from tuner.search.progress import criterion_of
 from tuner.search.stages import plan
 
@@ -16,7 +16,7 @@ NOISE, GUSTS, *_ = cal.KINDS
 def ranked(*off, converged=True):
     names = [f"c{i}" for i in range(len(off))]
     quoted, oracle = dict.fromkeys(names, 3.0), dict.fromkeys(names, 2.0)
-    return cal.Ranked(dict(zip(names, off, strict=True)), quoted, oracle, 1.0, converged)
+    return cal.RankedSet(dict(zip(names, off, strict=True)), quoted, oracle, 1.0, converged)
 
 
 def test_of_truths_that_are_where_the_interval_says_the_level_lies_inside():
@@ -52,7 +52,7 @@ def test_a_search_that_did_not_converge_is_counted_and_not_ranked():
 
 
 def test_what_wanders_has_its_size_and_forgets_in_its_time():
-    series = wandering(
+    series = gauss_markov(
         np.random.default_rng(3), (100_000, 1), deviation=2.0, seconds=0.5, rate=10.0
     )[:, 0]
     assert series.std() == pytest.approx(2.0, rel=0.03)
@@ -64,8 +64,8 @@ def test_what_wanders_has_its_size_and_forgets_in_its_time():
 def test_a_truth_meets_its_recordings_to_within_noise_and_is_found():
     """Fitted flights with noise alone: white residuals at the truth, which the intervals hold."""
     objective = cal.problem(terms=False)
-    truth = cal.drawn(objective.space, np.random.default_rng(4))
-    found = recorded(objective, truth, np.random.default_rng(5), gusts=False)
+    truth = cal.draw_truth(objective.space, np.random.default_rng(4))
+    found = simulate_like(objective, truth, np.random.default_rng(5), gusts=False)
     assert found is not None
     flown = found.objective
     stage = plan("gradient", flown.samples, 100.0, windows=False, robust=False, steps=8)[-1]

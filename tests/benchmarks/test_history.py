@@ -7,8 +7,8 @@ import pytest
 
 from benchmarks import __main__ as command
 from benchmarks import derivatives, reading
-from benchmarks.history import TITLE, lines_of, remembered
-from benchmarks.table import Bar, Section, sections_of, updated, with_bars
+from benchmarks.history import TITLE, lines_of, updated_history
+from benchmarks.table import Bar, Section, sections_of, update_bars, update_section
 
 MORNING = datetime(2026, 11, 21, 9, 5, tzinfo=UTC)
 EVENING = datetime(2026, 11, 21, 21, 0, tzinfo=UTC)
@@ -24,7 +24,9 @@ def wait(measured):
 
 
 def with_line(page, bars, when=MORNING, version="1.0", *, whole=True):
-    return updated(page, remembered(page, bars, when=when, version=version, whole=whole))
+    return update_section(
+        page, updated_history(page, bars, when=when, version=version, whole=whole)
+    )
 
 
 def test_every_whole_measure_is_a_line_and_none_is_lost():
@@ -72,7 +74,7 @@ def test_what_could_not_be_measured_leaves_a_gap_and_no_mark():
 def test_bars_of_a_part_take_their_rows_in_the_first_table_and_new_ones_follow():
     other = "\n## One\n\n| rate | 7 |\n"
     page = f"# Page\n\n| bar |\n| --- |\n| rate | 1 M | at least 1 M | met |\n{other}"
-    new = with_bars(page, [rate(0.5), wait(30.0)])
+    new = update_bars(page, [rate(0.5), wait(30.0)])
     assert "| rate | 0.5 M | at least 1 M | missed |\n| wait, warm | 30 s |" in new
     assert new.endswith(f"\n{other}")
 
@@ -80,7 +82,7 @@ def test_bars_of_a_part_take_their_rows_in_the_first_table_and_new_ones_follow()
 def test_the_command_writes_lines_and_keeps_what_it_does_not_measure(tmp_path, monkeypatch):
     results = tmp_path / "RESULTS.md"
     kept = Section("Calibration", "Of another day.", ["a"], [["1"]])
-    results.write_text(updated(with_line("# Page\n", [rate(2.0)]), kept), encoding="utf-8")
+    results.write_text(update_section(with_line("# Page\n", [rate(2.0)]), kept), encoding="utf-8")
     monkeypatch.setattr(command, "RESULTS", results)
     monkeypatch.setattr(command, "PARTS", ("derivatives", "reading"))
     speed = Section("Derivatives", "Now.", ["a"], [["2"]], [rate(1.0)])

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from benchmarks.__main__ import page
-from benchmarks.table import Bar, Section, figure, millions, updated
+from benchmarks.table import Bar, Section, figure, millions, update_section
 from benchmarks.timing import Contestant, Spread, compete
 
 ANSWERS = """
@@ -56,11 +56,11 @@ def test_the_page_begins_with_the_bars_and_holds_every_table():
 
 def test_a_part_takes_the_place_that_it_had_on_the_page():
     one, two, three = (Section(t, "Old.", ["a"], [["1"]]) for t in ("One", "Two", "Three"))
-    old = updated(updated("# Page\n", one), two)
-    assert updated(old, two) == old
-    new = updated(old, Section("One", "New.", ["a"], [["2"]]))
+    old = update_section(update_section("# Page\n", one), two)
+    assert update_section(old, two) == old
+    new = update_section(old, Section("One", "New.", ["a"], [["2"]]))
     assert new == old.replace("Old.", "New.", 1).replace("| 1 |", "| 2 |", 1)
-    assert updated(old, three).index("## Three") > old.index("## Two")
+    assert update_section(old, three).index("## Three") > old.index("## Two")
 
 
 def test_figures_have_three_digits():

@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.builds import cut, weighed_mass
-from benchmarks.prediction import HELD_OUT, options_of
+from benchmarks.prediction import HELD_OUT, options_for_set
 from benchmarks.regression import Regression
-from benchmarks.without_pose import posed
+from benchmarks.without_pose import with_pose
 from tuner.core.errors import InputError
 from tuner.evaluate.prediction import hold_state
 from tuner.recordings.loader import InertialFlight
@@ -27,21 +27,21 @@ def test_a_set_brings_its_own_job_or_two_flights_are_held_out(tmp_path):
     folder = tmp_path / "lab"
     folder.mkdir()
     with pytest.raises(InputError, match="holds no recording"):
-        options_of(folder)
+        options_for_set(folder)
     for name in ("a.csv", "b.csv", "c.csv", "d.csv", "README.md", "LICENSE"):
         (folder / name).write_text("")
-    options = options_of(folder)
+    options = options_for_set(folder)
     assert [path.rsplit("/", 1)[1] for path in options.flights] == [f"{n}.csv" for n in "abcd"]
     assert options.holdout == ["c", "d"]
     assert options.config is None
     (folder / "tune.yaml").write_text("holdout: [a]")
-    assert options_of(folder).holdout is None
-    assert options_of(folder).config == str(folder / "tune.yaml")
+    assert options_for_set(folder).holdout is None
+    assert options_for_set(folder).config == str(folder / "tune.yaml")
     known = tmp_path / "nanobench"
     folder.rename(known)
     (known / "tune.yaml").unlink()
-    assert options_of(known).config.endswith("configs/jobs/crazyflie.yaml")
-    assert options_of(known).holdout == list(HELD_OUT["nanobench"])
+    assert options_for_set(known).config.endswith("configs/jobs/crazyflie.yaml")
+    assert options_for_set(known).holdout == list(HELD_OUT["nanobench"])
 
 
 def test_the_second_half_of_a_flight_is_that_half(full_flight):
@@ -70,7 +70,7 @@ def test_the_mass_beside_a_flight_is_read(tmp_path):
 def test_the_attitude_of_a_flight_without_a_pose_is_that_of_its_gyro(full_flight):
     series = {name: full_flight.series[name] for name in ("body_rate", "command")}
     begin, end = 1.0, full_flight.duration - 1.0
-    flight = posed(InertialFlight("a", "a", series, ((begin, end),), ()))
+    flight = with_pose(InertialFlight("a", "a", series, ((begin, end),), ()))
     assert flight.duration == pytest.approx(end - begin, abs=0.02)
     recorded = full_flight.signals["attitude"]
     turned = Rotation.from_quat(
