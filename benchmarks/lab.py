@@ -312,13 +312,13 @@ def _voltages(
     def drawn_voltage(random: np.random.Generator) -> Array | None:
         if known is None:
             return None
-        read_again = []
+        with_readings_redrawn = []
         for flight in flights:
             readings = flight.series[VOLTAGE]
             noise = METER * random.normal(size=readings.values.shape)
             other = replace(readings, values=readings.values + noise)
-            read_again.append(replace(flight, series={**flight.series, VOLTAGE: other}))
-        return np.asarray(log_voltage_of(read_again, whole, schedule))
+            with_readings_redrawn.append(replace(flight, series={**flight.series, VOLTAGE: other}))
+        return np.asarray(log_voltage_of(with_readings_redrawn, whole, schedule))
 
     return drawn_voltage
 

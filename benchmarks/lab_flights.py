@@ -59,8 +59,8 @@ NOISE = {
     "rotor_speed": 2.0,
     "acceleration": 0.15,
 }
-"""White, in each signal's unit; poses are turned by `TURNED` rad about each axis."""
-TURNED = 1e-3
+"""White, in each signal's unit; poses are turned by `BODY_ATTITUDE` rad about each axis."""
+BODY_ATTITUDE = 1e-3
 VOLTS, CURRENT = 16.4, 5.0
 """V of the fresh battery, and A of a rotor in hover; the current goes with the speed's cube."""
 METER, READ_EVERY = 0.02, 10
@@ -307,7 +307,7 @@ def _measured(
     true = Rotation.from_quat(signals["attitude"], scalar_first=True)
     turning = true.apply(np.cross(signals["body_rate"], offset))
     gyro = gyro_of(vehicle_of(lab.vehicle)).reading(Vec3.of(jnp.asarray(signals["body_rate"].T)))
-    noise = Rotation.from_rotvec(TURNED * random.normal(size=(len(signals["lap"]), 3)))
+    noise = Rotation.from_rotvec(BODY_ATTITUDE * random.normal(size=(len(signals["lap"]), 3)))
     measured = {
         **signals,
         "position": signals["position"] + true.apply(offset),

@@ -61,7 +61,7 @@ def signals_to_add(
         A fit, and the information (K, K) about its coefficients, priors included.
     """
     objective = fitted.objective
-    silent = set.intersection(*(set(INLETS[inlet].silences) for inlet in inlets))
+    silent = set.intersection(*(set(INLETS[inlet].not_compared) for inlet in inlets))
     fed = {name for inlet in inlets for name in INLETS[inlet].needs}
     noise = {"rotor_speed": TACHOMETER_NOISE * float(hover_speed(vehicle_of(vehicle))), **NOISE}
     missing = [n for n in noise if n not in objective.segments.measured and n not in silent | fed]

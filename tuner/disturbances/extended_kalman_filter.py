@@ -44,7 +44,7 @@ from tuner.disturbances.observer import (
     commands_in_flight,
     first_errors,
 )
-from tuner.objective.criterion import Either
+from tuner.objective.criterion import AnyArray
 from tuner.objective.simulation import CODE, flown_part, laid_out
 
 GATE = 4.0
@@ -97,8 +97,8 @@ class Gains(eqx.Module):
         commands are on their way to the motors: each stands for those of its time.
     """
 
-    gain: Float[Either, "F T m n"]
-    factors: Float[Either, "F T m m"]
+    gain: Float[AnyArray, "F T m n"]
+    factors: Float[AnyArray, "F T m m"]
     rate: int = eqx.field(static=True)
 
     def among(self, flights: NDArray[np.intp]) -> Gains:
@@ -120,9 +120,9 @@ class Filtered(eqx.Module):
         See `Gains`; None where they were not asked for.
     """
 
-    white: Float[Either, "T m F"]
-    root: Float[Either, "T m F"]
-    loss: Float[Either, "T F"]
+    white: Float[AnyArray, "T m F"]
+    root: Float[AnyArray, "T m F"]
+    loss: Float[AnyArray, "T F"]
     gains: Gains | None
 
     def first(self, ticks: int, segments: slice = slice(None)) -> Filtered:

@@ -27,7 +27,7 @@ from tuner.disturbances.predictor import Predictor, unscaled
 from tuner.disturbances.ticks import gathered
 from tuner.objective.criterion import OFFSET_SD, OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal_equations import Objective, normal_equations
-from tuner.objective.residuals import gauss_newton, robust
+from tuner.objective.residuals import gauss_newton, huber_loss
 from tuner.objective.segments import CLOCKS
 from tuner.objective.space import Space
 from tuner.recordings.flight import Flight
@@ -166,7 +166,7 @@ def _equations(
         along, bend = gauss_newton(np.concatenate(columns, axis=-1), errors, scale, huber)
         gradient += along
         hessian += bend
-        loss += 0.5 * robust(errors, huber).sum(axis=(1, 2))
+        loss += 0.5 * huber_loss(errors, huber).sum(axis=(1, 2))
     gradient, hessian = np.moveaxis(gradient, 0, -1), np.moveaxis(hessian, 0, -1)
     sums = SegmentSums(
         loss=loss,

@@ -31,7 +31,7 @@ from tuner.disturbances.disturbances import (
     processes_of,
 )
 from tuner.disturbances.ticks import Sampled
-from tuner.objective.criterion import OFFSET_UNIT, Either, units_of
+from tuner.objective.criterion import OFFSET_UNIT, AnyArray, units_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
 from tuner.objective.simulation import beginning_of
 from tuner.vehicle.model import Model, with_coefficients
@@ -56,7 +56,7 @@ class Feed(eqx.Module):
     """
 
     segments: Segments
-    offsets: Float[Either, "O F"]
+    offsets: Float[AnyArray, "O F"]
     samples: dict[str, Sampled]
     conditions: tuple[str, ...] = eqx.field(static=True, default=())
 
@@ -86,9 +86,9 @@ class Expected(eqx.Module):
     """
 
     model: Model
-    coefficients: dict[str, Either]
-    strengths: Float[Either, "7 F"]
-    noise: Float[Either, "m F"]
+    coefficients: dict[str, AnyArray]
+    strengths: Float[AnyArray, "7 F"]
+    noise: Float[AnyArray, "m F"]
 
 
 class Observer(eqx.Module):

@@ -14,8 +14,8 @@ from sim_jax.geometry import Vec3
 from sim_jax.inlet import BodyRateInlet
 from sim_jax.schedule import Schedule
 from tuner.core.numerics import Array
-from tuner.objective.criterion import Either
-from tuner.objective.noise import repeats
+from tuner.objective.criterion import AnyArray
+from tuner.objective.noise import repeat_counts
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured
 from tuner.recordings.flight import Flight
 
@@ -40,9 +40,9 @@ class Sampled(eqx.Module):
         (T, F) where between both ticks it was taken, 0..1, were its clock right.
     """
 
-    values: Float[Either, "T c F"]
-    weight: Float[Either, "T k F"]
-    place: Float[Either, "T F"]
+    values: Float[AnyArray, "T c F"]
+    weight: Float[AnyArray, "T k F"]
+    place: Float[AnyArray, "T F"]
 
 
 def sampled(
@@ -92,12 +92,12 @@ def sampled(
 def each_reading(commands: Measured) -> Measured:
     """Return commands each of which weighs as one reading, however long it rests.
 
-    Simulated flights take a value that rests for one reading (`repeats`). Whether it will rest
+    Simulated flights take equal values in a row for one reading (`repeat_counts`). Whether it rests
     depends on what comes after it, and innovations that are weighed by that are no longer chance:
     a filter takes all alike, and learns how noisy they are.
     """
     values = np.asarray(commands.values)
-    rests = np.stack([repeats(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
+    rests = np.stack([repeat_counts(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
     return replace(commands, weight=np.asarray(commands.weight) * np.sqrt(rests))
 
 

@@ -13,9 +13,9 @@ from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
-from tuner.objective.inlets import MISSED, linear_interpolation, zero_order_hold
+from tuner.objective.inlets import MAX_PERIODS, linear_interpolation, zero_order_hold
 from tuner.objective.noise import white_noise
-from tuner.objective.rotor_response import Lags, rotor_speeds
+from tuner.objective.rotor_response import MotorLags, rotor_speeds
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import local_parabolas, states_at
 from tuner.vehicle.model import Model
@@ -227,7 +227,7 @@ def steps_fed(
 def rotor_response(model: Model, command: Series) -> Series:
     """Return the rotor speeds (n, 4) that follow commands on a clock."""
     motor, late = model.vehicle.motor, float(model.vehicle.setup.actuator_latency)
-    lags = Lags(float(motor.time_constant_up), float(motor.time_constant_down), late)
+    lags = MotorLags(float(motor.time_constant_up), float(motor.time_constant_down), late)
     step = float(command.time[1] - command.time[0])
     return Series(command.time, rotor_speeds(command.values, step, motor, lags))
 
@@ -235,7 +235,7 @@ def rotor_response(model: Model, command: Series) -> Series:
 def _held(flight: Flight, recorded: Series, rate: float, every: int) -> Series:
     """Return one of so many recorded commands of a flight, on the loop's clock or their own."""
     taken = Series(recorded.time[::every], recorded.values[::every])
-    read = zero_order_hold if taken.rate * MISSED > rate else linear_interpolation
+    read = zero_order_hold if taken.rate * MAX_PERIODS > rate else linear_interpolation
     rate = max(rate, recorded.rate)
     clock = np.arange(int(flight.duration * rate)) / rate
     return Series(clock, read(taken, clock))

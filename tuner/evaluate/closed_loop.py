@@ -33,7 +33,14 @@ from tuner.core.shipped import find_config
 from tuner.core.yaml_section import Number, Section, build
 from tuner.engine import Here, Report, current
 from tuner.evaluate.forces import Forces, forces_of
-from tuner.objective.simulation import CODE, MOTION, SETPOINTS, SPEEDS, TURNED, recorded_of
+from tuner.objective.simulation import (
+    BODY_ATTITUDE,
+    CODE,
+    MOTION,
+    SETPOINTS,
+    TRUE_ROTOR_SPEED,
+    recorded_of,
+)
 from tuner.objective.trajectory import Published, at_speed, published
 from tuner.options import SimulationOptions
 from tuner.recordings.flight import Series
@@ -324,9 +331,9 @@ def _run_flights(
     logged = {
         "position": motion[..., 0:3],
         "velocity": motion[..., 3:6],
-        "attitude": rows_of[TURNED],
+        "attitude": rows_of[BODY_ATTITUDE],
         "body_rate": motion[..., 6:9],
-        "rotor_speed": rows_of[SPEEDS],
+        "rotor_speed": rows_of[TRUE_ROTOR_SPEED],
         "command": rows_of["command"],
         "rate_setpoint": setpoints[..., 0:3],
         "thrust_setpoint": setpoints[..., 3:],
@@ -350,7 +357,7 @@ def _fly_lane(
 
     def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
         after, row = plant.sample(state, number)
-        channels = (SPEEDS, "command", MOTION, TURNED, SETPOINTS)
+        channels = (TRUE_ROTOR_SPEED, "command", MOTION, BODY_ATTITUDE, SETPOINTS)
         return after, recorded_of(row, flown, STILL_AIR, {}, channels)
 
     last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))

@@ -45,13 +45,13 @@ from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import (
     CLOCKS,
     OFFSETS,
-    Piece,
+    FlightWindow,
     Segments,
-    pieces_of,
+    cut_windows,
     segments_of,
     window_segments,
 )
-from tuner.objective.simulation import MOTION, SPEEDS, TURNED, Flown, fly
+from tuner.objective.simulation import BODY_ATTITUDE, MOTION, TRUE_ROTOR_SPEED, Flown, fly
 from tuner.objective.space import Space
 from tuner.objective.windows import Window
 from tuner.options import RecordingOptions
@@ -177,11 +177,11 @@ class _Group:
             for name in names
         }
 
-    def _window_segments(self, *, free_starts: bool) -> tuple[Segments, list[Piece]]:
+    def _window_segments(self, *, free_starts: bool) -> tuple[Segments, list[FlightWindow]]:
         """Return the windows, with starts as recorded or, if free, near them."""
         flights = [recording.flight for recording in self._recordings]
         inlets = [self._inlet] * len(flights)
-        pieces = pieces_of(
+        pieces = cut_windows(
             flights,
             inlets=inlets,
             seconds=self._seconds,
@@ -261,20 +261,20 @@ class _Group:
             limits=self._limits,
             states=states,
             conditions=conditions,
-            channels=(*POSE, SPEEDS, MOTION, TURNED),
+            channels=(*POSE, TRUE_ROTOR_SPEED, MOTION, BODY_ATTITUDE),
         )
         rate, calm = float(self._schedule.log_rate), np.zeros(segments.count)
         acted = forces_of_terms(
             model.vehicle,
             flown.channels[MOTION],
-            flown.channels[TURNED],
-            flown.channels[SPEEDS],
+            flown.channels[BODY_ATTITUDE],
+            flown.channels[TRUE_ROTOR_SPEED],
             rate=rate,
             wind=(conditions.get("wind_x", calm), conditions.get("wind_y", calm)),
             stride=self._stride,
         )
-        on_time = np.zeros((len(OFFSETS), segments.count))
-        reading = Reading(on_time, on_time[: len(CLOCKS)], rate, self._samples)
+        no_offsets = np.zeros((len(OFFSETS), segments.count))
+        reading = Reading(no_offsets, no_offsets[: len(CLOCKS)], rate, self._samples)
         simulated = {}
         for signal in POSE:
             time = np.asarray(segments.measured[signal].time)

@@ -24,7 +24,7 @@ from tuner.evaluate.torque_observer import TorqueObserver
 from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.inlets import INLETS
-from tuner.objective.segments import Segments, pieces_of, window_segments
+from tuner.objective.segments import Segments, cut_windows, window_segments
 from tuner.objective.simulation import MOTION, fly
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import States, states_at
@@ -144,7 +144,7 @@ class FlightPredictor:
     ) -> None:
         self.flight, self.inlet, self.seconds = flight, inlet, seconds
         self.input_late = input_late
-        self._pieces = pieces_of(
+        self._pieces = cut_windows(
             [flight],
             inlets=[inlet],
             seconds=seconds,
@@ -187,7 +187,7 @@ class FlightPredictor:
         model = model_of(with_reference_voltage(vehicle, [self.flight]), controller)
         reached = _simulated(model, segments, schedule, self.ahead)
         errors = errors_of(reached, self.recorded, (len(self.ahead), len(self.begins)))
-        followed = INLETS[self.inlet].silences
+        followed = INLETS[self.inlet].not_compared
         predicted = {name: distances for name, distances in errors.items() if name not in followed}
         return Predictions(self.begins, self.ahead, predicted)
 

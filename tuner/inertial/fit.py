@@ -34,7 +34,7 @@ from sim_jax.constants import GRAVITY
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Array, Inverse, scaled_solve
 from tuner.inertial.signals import Stretch, blocks_of, low_pass
-from tuner.objective.rotor_response import Lags, rotor_speeds
+from tuner.objective.rotor_response import MotorLags, rotor_speeds
 from tuner.objective.rotor_signals import levers
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
 from tuner.vehicle.model import model_of
@@ -108,7 +108,7 @@ class Response:
         (n,) s of those.
     """
 
-    lags: Lags
+    lags: MotorLags
     gains: Mapping[str, float]
     steady: Mapping[str, float]
     covariance: Array
@@ -159,7 +159,7 @@ class _Problem:
         """The lags' coordinates (3,) in the vehicle file."""
         value = values_of(self.vehicle)
         late = value.get("actuator_latency") or 0.0
-        return Lags(value["time_constant_up"], value["time_constant_down"], late).coordinates
+        return MotorLags(value["time_constant_up"], value["time_constant_down"], late).coordinates
 
 
 @dataclass(frozen=True)
@@ -282,7 +282,7 @@ def _lag_columns(problem: _Problem, place: Array) -> Tables:
     height = places[:, 2].mean()
     tables: Tables = {name: [] for name in OUTPUTS}
     for stretch, shared in zip(problem.stretches, problem.shared, strict=True):
-        speed = rotor_speeds(stretch.command, step, problem.motor, Lags.at(place))
+        speed = rotor_speeds(stretch.command, step, problem.motor, MotorLags.at(place))
         inside = stretch.inside[:-1]
         square = 0.5 * (speed[1:] ** 2 + speed[:-1] ** 2)
         lift, torque = square.sum(axis=1), square @ arms
@@ -416,7 +416,7 @@ def _response(problem: _Problem, place: Array, weighings: Mapping[str, _Whitenin
     covariance = _covariance(problem, weighings, tables, errors)
     covariance += _air_covariance(problem, moving, found)
     return Response(
-        lags=Lags.at(place),
+        lags=MotorLags.at(place),
         gains={name: float(solution[0]) for name, solution in found.items()},
         steady={
             name: float(found[output][moving[output][0].shape[1] + CONSTANT_COLUMN])

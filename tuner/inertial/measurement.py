@@ -117,7 +117,7 @@ def _measurement(
     values = {
         "up": math.log(lags.up),
         "down": math.log(lags.down),
-        "late": lags.late,
+        "late": lags.delay,
         "roll": math.log(max(gains["roll"] / vehicle.mass, 1e-300)),
         "pitch": math.log(max(gains["pitch"] / vehicle.mass, 1e-300)),
         "yaw": curve + math.log(max(gains["yaw"] * vehicle.aerodynamics.moment_constant, 1e-300)),

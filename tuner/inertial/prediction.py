@@ -19,7 +19,7 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.inertial.signals import Stretch, low_pass
-from tuner.objective.rotor_response import Lags, rotor_speeds
+from tuner.objective.rotor_response import MotorLags, rotor_speeds
 from tuner.objective.rotor_signals import levers
 from tuner.vehicle import ControllerFile, VehicleFile, values_of
 from tuner.vehicle.model import model_of
@@ -85,5 +85,7 @@ def _prediction_errors(stretch: Stretch, vehicle: VehicleFile | None) -> Array:
 
 def _squared_speeds(stretch: Stretch, vehicle: VehicleFile) -> Array:
     motor, value = model_of(vehicle, ControllerFile()).vehicle.motor, values_of(vehicle)
-    lags = Lags(value["time_constant_up"], value["time_constant_down"], value["actuator_latency"])
+    lags = MotorLags(
+        value["time_constant_up"], value["time_constant_down"], value["actuator_latency"]
+    )
     return np.square(rotor_speeds(stretch.command, stretch.step, motor, lags))

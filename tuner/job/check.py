@@ -15,8 +15,8 @@ from tuner.core.numerics import Array, symmetric_eigen, unit_diagonal
 from tuner.equation_error.recorded_accelerations import MIN_SAMPLES, rows_of, steps_with
 from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import VOLTAGE
-from tuner.objective.inlets import INLETS, bypassed_by, sparse
-from tuner.objective.rotor_signals import Source, lifts_as_dshot, order_findings, squared_speed
+from tuner.objective.inlets import INLETS, bypassed_by, is_sparse
+from tuner.objective.rotor_signals import Source, dshot_lift, order_findings, squared_speed
 from tuner.objective.setpoints import setpoint_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.search.problem import Job
@@ -123,7 +123,7 @@ def _sparse_inputs(job: Job) -> Iterator[Finding]:
     for flight, inlet in zip(job.fitted, job.inlets, strict=True):
         signal, *_ = INLETS[inlet].needs
         rate = INLETS[inlet].update_rate(job.objective.schedule)
-        if rate is not None and sparse([flight], signal, rate):
+        if rate is not None and is_sparse([flight], signal, rate):
             numbers = {"recorded": round(flight.series[signal].rate), "needed": float(rate)}
             yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
 
@@ -171,7 +171,7 @@ def _wrong_vehicle(job: Job) -> Iterator[Finding]:
 def _commands_as_dshot(job: Job) -> Iterator[Finding]:
     """Warn of commands that were taken for pulses and carry the vehicle better as DShot."""
     for flight in job.flights:
-        if lifts := lifts_as_dshot(flight, job.settings.vehicle):
+        if lifts := dshot_lift(flight, job.settings.vehicle):
             numbers = dict(zip(("pulses", "dshot"), lifts, strict=True))
             yield Finding(Code.DSHOT_OR_PULSES, "warning", flight.name, numbers)
 

@@ -1,1 +1,1 @@
-"""Where simulation meets data: flights as arrays, residuals, normal equations, the RMSE table."""
+"""The loss of a fit: flights as arrays, residuals, normal equations, Fisher information."""

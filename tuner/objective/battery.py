@@ -20,19 +20,19 @@ from tuner.recordings.flight import Flight, Series
 from tuner.vehicle import VehicleFile
 
 VOLTAGE = "battery_voltage"
-OFTEN = 20.0
-"""Hz to which faster readings are averaged first."""
-FEWEST = 5
+MAX_READING_RATE_HZ = 20.0
+"""Rate to which faster readings are averaged: the voltage varies more slowly."""
+MIN_SPLINE_READINGS = 5
 """Readings that a smoothing spline needs; fewer are joined by lines."""
-TREND = 10.0
-"""s, the load's sag is what varies faster than such a polynomial trend follows."""
-IDLE = 0.1
-"""Rotor speed at no command over that at full command, as armed motors idle (thesis 5.2)."""
-LAG = 0.03
-"""s by which rotors follow their commands, about; the sag follows the rotors."""
-SPIKE = 3.0
-"""Robust standard deviations of a load that commands tell beyond which a reading does not speak of
-the resistance: rotors do not follow a saturated command as they follow others."""
+TREND_PERIOD_S = 10.0
+"""Period of the polynomial trend of the discharge: faster variations are the load's sag."""
+IDLE_SPEED_RATIO = 0.1
+"""Rotor speed at no command over that at full command, of armed motors (thesis 5.2)."""
+ROTOR_LAG_S = 0.03
+"""Approximate time constant of rotors, which the sag follows."""
+SPIKE_SD = 3.0
+"""Robust standard deviations of a load from commands beyond which a reading is left out of the
+resistance: rotors do not follow a saturated command as they follow others."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Voltage:
     time
         (n,) s.
     volts, without_load
-        (n,) V at the terminals, and what they would be if no rotor turned.
+        (n,) V at the terminals, and without load.
     """
 
     time: Numbers
@@ -55,8 +55,8 @@ class Voltage:
 def voltages_of(flights: Sequence[Flight]) -> list[Voltage | None]:
     """Return each flight's voltage, None where it was not recorded.
 
-    All flights share one resistance, in V per unit of load; where the voltage does not fall with
-    the load by more than chance lets it, the decline alone is smoothed.
+    All flights share one resistance, in V per unit of load. Where the voltage does not fall
+    significantly with the load, only the discharge is modelled.
     """
     readings = [
         _averaged(flight.series[VOLTAGE]) if flight.has(VOLTAGE) else None for flight in flights
@@ -76,12 +76,11 @@ def voltages_of(flights: Sequence[Flight]) -> list[Voltage | None]:
     ]
 
 
-def read_again(flights: Sequence[Flight], random: np.random.Generator) -> list[Flight]:
-    """Return flights whose voltmeter was read once more, with errors like those that it made.
+def with_readings_redrawn(flights: Sequence[Flight], random: np.random.Generator) -> list[Flight]:
+    """Return flights with the errors of the voltmeter drawn anew.
 
-    What a reading is off from `voltages_of` it is off again, to one side or the other (the wild
-    bootstrap: Wu, "Jackknife, bootstrap and other resampling methods in regression analysis",
-    1986).
+    Each deviation from `voltages_of` gets a random sign (the wild bootstrap: Wu, "Jackknife,
+    bootstrap and other resampling methods in regression analysis", 1986).
     """
     others = []
     for flight, curve in zip(flights, voltages_of(flights), strict=True):
@@ -97,12 +96,10 @@ def read_again(flights: Sequence[Flight], random: np.random.Generator) -> list[F
 
 
 def _loads(flights: Sequence[Flight]) -> tuple[str, list[Series | None]]:
-    """Return the mean cube of each flight's rotor speeds, or of its motor commands, over time.
+    """Return the signal that loads come from, and each flight's load (n, 1), about one.
 
-    And of which.
-
-    Rotor speeds where all rotors of all flights were recorded. Over the mean of all flights, so
-    that a load (n, 1) is about one; None where a flight holds neither.
+    A load is the mean cube of rotor speeds over the mean of all flights, or of motor commands if
+    not all rotors of all flights were recorded; None where a flight has neither.
     """
     for signal in ("rotor_speed", "command"):
         cubes = [_mean_cube(flight, signal) for flight in flights]
@@ -114,56 +111,51 @@ def _loads(flights: Sequence[Flight]) -> tuple[str, list[Series | None]]:
 
 
 def _mean_cube(flight: Flight, signal: str) -> Series | None:
-    """Return the mean over the rotors (n, 1) of the cube of speeds, where all were recorded.
-
-    Motor commands are followed as rotors follow them.
-    """
+    """Return the mean over the rotors (n, 1) of cubed speeds, or of lagged commands."""
     if not flight.has(signal):
         return None
     series = flight.series[signal]
     known = np.isfinite(series.values).all(axis=1)
     time, speeds = series.time[known], np.abs(series.values[known])
     if signal == "command" and len(time):
-        speeds = _followed(time, speeds + IDLE)
+        speeds = _lagged(time, speeds + IDLE_SPEED_RATIO)
     cubes = np.mean(speeds**3, axis=1, keepdims=True)
     return Series(time, cubes) if cubes.sum() > 0.0 else None
 
 
-def _followed(time: Numbers, values: Numbers) -> Numbers:
-    """Return values (n, k) that move steadily between stamps, after a first-order lag of `LAG`.
+def _lagged(time: Numbers, values: Numbers) -> Numbers:
+    """Return values (n, k), linear between stamps, after a first-order lag of `ROTOR_LAG_S`.
 
-    Recorders take what was sent last: held from one stamp to the next, the values would be half a
-    gap late.
+    Recorders take the last value sent: a zero-order hold would be half a gap late.
     """
     gaps = np.diff(time)
-    keep, slope = np.exp(-gaps / LAG)[:, None], np.diff(values, axis=0) / gaps[:, None]
+    keep, slope = np.exp(-gaps / ROTOR_LAG_S)[:, None], np.diff(values, axis=0) / gaps[:, None]
     behind = np.zeros_like(values)  # of the lag, at every stamp
     for row in range(1, len(values)):
-        steady = -LAG * slope[row - 1]
+        steady = -ROTOR_LAG_S * slope[row - 1]
         behind[row] = steady + keep[row - 1] * (behind[row - 1] - steady)
     return values + behind
 
 
 def _resistance(pairs: Sequence[tuple[Series, Series]], *, spikes_count: bool) -> float:
-    """Return by how many V the voltage falls per unit of load, from readings and loads.
+    """Return the battery's resistance, V per unit of load, from readings and loads.
 
-    Each flight's decline is a polynomial that both are cleared of. ``spikes_count``: whether loads
-    are known in spikes as well. Flights that hardly vary their
-    load tell it badly, and one that saturates for a moment sags by far more than they do: so it is
-    shrunk by the share of chance in its square (positive-part James and Stein 1961), rather than
-    taken for nothing where it is not sure.
+    A polynomial discharge is removed from both. ``spikes_count``: whether loads are known in
+    spikes, too. The estimate is uncertain from flights of nearly constant load, and matters where
+    one saturates for a moment: so it is shrunk by the share of chance in its square (positive-part
+    James and Stein 1961) rather than set to zero.
     """
     falls, varied = [np.empty(0)], [np.empty(0)]
     for reading, load in pairs:
         drawn = np.interp(reading.time, load.time, _charge(load))
-        trend = _polynomials(drawn, 1 + int(np.ceil(float(np.ptp(reading.time)) / TREND)))
-        if len(reading.time) < trend.shape[1] + FEWEST:
+        trend = _polynomials(drawn, 1 + int(np.ceil(float(np.ptp(reading.time)) / TREND_PERIOD_S)))
+        if len(reading.time) < trend.shape[1] + MIN_SPLINE_READINGS:
             continue
         there = np.interp(reading.time, load.time, load.values[:, 0])
         both = np.stack([reading.values[:, 0], there], axis=1)
         left = both - trend @ np.linalg.lstsq(trend, both, rcond=None)[0]
         spread = float(robust_sd(left[:, 1]))
-        calm = spikes_count | (np.abs(left[:, 1]) <= SPIKE * max(spread, 1e-12))
+        calm = spikes_count | (np.abs(left[:, 1]) <= SPIKE_SD * max(spread, 1e-12))
         falls.append(-left[calm, 0])
         varied.append(left[calm, 1])
     fall, vary = np.concatenate(falls), np.concatenate(varied)
@@ -176,7 +168,7 @@ def _resistance(pairs: Sequence[tuple[Series, Series]], *, spikes_count: bool) -
 
 
 def _smoothed(reading: Series, load: Series | None, resistance: float) -> Voltage:
-    """Return a voltage without most of its noise, on the load's stamps where they count."""
+    """Return a voltage without most of its noise, on the load's stamps if there is a resistance."""
     if load is None or resistance == 0.0:
         decline = _spline(reading.time, reading.values[:, 0])(reading.time)
         return Voltage(reading.time, decline, decline)
@@ -200,8 +192,8 @@ def _polynomials(span: Numbers, order: int) -> Numbers:
 
 
 def _spline(time: Numbers, values: Numbers) -> Callable[[Numbers], Numbers]:
-    """Return the curve through noisy values, its stiffness chosen by cross-validation."""
-    if len(time) < FEWEST:
+    """Return the smoothing spline of noisy values, its stiffness by cross-validation."""
+    if len(time) < MIN_SPLINE_READINGS:
         return lambda at: np.asarray(np.interp(at, time, values))
     spline = _spline_of(time.tobytes(), values.astype(float).tobytes())
     return lambda at: np.asarray(spline(at))
@@ -209,7 +201,7 @@ def _spline(time: Numbers, values: Numbers) -> Callable[[Numbers], Numbers]:
 
 @lru_cache(maxsize=256)
 def _spline_of(time: bytes, values: bytes) -> Callable[[Numbers], Numbers]:
-    """Return the spline of float64 samples; a fit, its check and its exports ask for the same."""
+    """Return the spline of float64 samples, kept for a fit, its check and its exports."""
     from scipy.interpolate import make_smoothing_spline  # noqa: PLC0415 (slow to import, seldom needed)
 
     at, readings = np.frombuffer(time), np.frombuffer(values)
@@ -251,10 +243,10 @@ def _stiffness(time: Numbers, values: Numbers) -> float:
 
 
 def _averaged(series: Series) -> Series:
-    """Return the known readings (n, 1), the means of those that follow faster than `OFTEN`."""
+    """Return the known readings (n, 1), averaged to at most `MAX_READING_RATE_HZ`."""
     known = np.isfinite(series.values[:, 0]) & (series.values[:, 0] > 0)
     time, values = series.time[known], series.values[known, 0]
-    bins = np.floor((time - time[0]) * OFTEN + 1e-6).astype(int)
+    bins = np.floor((time - time[0]) * MAX_READING_RATE_HZ + 1e-6).astype(int)
     _, which, count = np.unique(bins, return_inverse=True, return_counts=True)
     time, values = (np.bincount(which, weights=samples) / count for samples in (time, values))
     return Series(time, values[:, None])
@@ -300,7 +292,7 @@ def log_voltage_of(
     Parameters
     ----------
     flights, windows
-        The F stretches that are flown, and the whole flight that each belongs to.
+        F windows, and the whole flight that each belongs to.
     schedule
         Its rate of position control is that of the ticks.
 

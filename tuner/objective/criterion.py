@@ -1,4 +1,4 @@
-"""What an objective is asked with and what it answers: points, criteria, sums and derivatives."""
+"""Arguments and results of an objective: points, criteria, sums and derivatives."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from tuner.core.numerics import Array
 from tuner.objective.segments import OFFSETS
 from tuner.vehicle import REGISTRY, recording_offsets
 
-Either: TypeAlias = Any
+AnyArray: TypeAlias = Any
 """An array of NumPy, or of jax."""
 
 OFFSET_UNIT = 0.01
 """s of a clock's offset, or rad/s of a gyro's, per unit of the search's coordinate."""
 (OFFSET_SD,) = {row.prior_sd / OFFSET_UNIT for row in recording_offsets().values()}
-"""Prior standard deviation of what each flight has of its own, in the search's coordinates."""
+"""Prior standard deviation of per-flight parameters, in the search's coordinates."""
 
 
 def units_of(names: Sequence[str]) -> Array:
-    """Return how much of each quantity of a flight is one in the search's coordinate."""
+    """Return the size of one unit of the search's coordinate for each per-flight parameter."""
     return np.array(
         [OFFSET_UNIT if name in OFFSETS else REGISTRY[name].prior_sd / OFFSET_SD for name in names]
     )
@@ -42,13 +42,13 @@ class Point(eqx.Module):
         the units of `units_of`.
     """
 
-    coefficients: Float[Either, " K"]
-    offsets: Float[Either, "offsets N"]
+    coefficients: Float[AnyArray, " K"]
+    offsets: Float[AnyArray, "offsets N"]
 
 
 @dataclass(frozen=True)
 class Criterion:
-    """What changes from one stage of the search to the next.
+    """The part of the loss that differs between stages of the search.
 
     Attributes
     ----------
@@ -65,20 +65,20 @@ class Criterion:
     prior
         Factor on the prior's residuals.
     states
-        (L, F) start of every segment around which is linearised, in the segments' standard
-        deviations; None where starts are known.
+        (L, F) initial states of the linearisation, in the segments' standard deviations; None where
+        they are not free.
     """
 
     horizon: int
-    scale: dict[str, Float[Either, " N"]]
-    reference_offset: Float[Either, "clocks N"]
+    scale: dict[str, Float[AnyArray, " N"]]
+    reference_offset: Float[AnyArray, "clocks N"]
     huber: float = np.inf
     prior: float = 1.0
-    states: Float[Either, "L F"] | None = None
+    states: Float[AnyArray, "L F"] | None = None
 
 
 class SegmentSums(eqx.Module):
-    """What one segment contributes; P = K + offsets. Where starts are free, at the best of them.
+    """The contribution of each segment, at its best initial state if free; P = K + offsets.
 
     Attributes
     ----------
@@ -93,16 +93,16 @@ class SegmentSums(eqx.Module):
     crash_time
         (F,) s.
     states
-        (L, F) best start, in the segments' standard deviations; None where starts are known.
+        (L, F) best initial state, in the segments' standard deviations; None where not free.
     """
 
-    loss: Float[Either, " F"]
-    gradient: Float[Either, "P F"]
-    hessian: Float[Either, "P P F"]
-    squares: dict[str, Float[Either, " F"]]
-    counts: dict[str, Float[Either, " F"]]
-    crash_time: Float[Either, " F"]
-    states: Float[Either, "L F"] | None
+    loss: Float[AnyArray, " F"]
+    gradient: Float[AnyArray, "P F"]
+    hessian: Float[AnyArray, "P P F"]
+    squares: dict[str, Float[AnyArray, " F"]]
+    counts: dict[str, Float[AnyArray, " F"]]
+    crash_time: Float[AnyArray, " F"]
+    states: Float[AnyArray, "L F"] | None
 
     @property
     def compared(self) -> Any:
@@ -126,12 +126,12 @@ class Jacobian(eqx.Module):
         (F,) s.
     """
 
-    residuals: dict[str, Float[Either, "n k F"]]
-    columns: dict[str, Float[Either, "Q n k F"]]
-    crash_time: Float[Either, " F"]
+    residuals: dict[str, Float[AnyArray, "n k F"]]
+    columns: dict[str, Float[AnyArray, "Q n k F"]]
+    crash_time: Float[AnyArray, " F"]
 
     def of(self, channels: Iterable[str]) -> Jacobian:
-        """Return the part that concerns some channels."""
+        """Return the part of some channels."""
         names = tuple(channels)
         return replace(
             self,

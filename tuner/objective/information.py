@@ -1,8 +1,8 @@
 """Fisher information of the data, by flights, channels and stretches of time.
 
 Everything here is in the scaled coordinates of the `Space` (logarithm or number). Each segment's
-start and each flight's offsets are nuisance parameters: they are eliminated, so that what remains
-concerns the coefficients alone and can be added up over any part of the data.
+start and each flight's offsets are nuisance parameters: they are eliminated, so that the rest is
+information on the coefficients alone and adds up over any part of the data.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from numpy.typing import ArrayLike, NDArray
 from sim_jax.inlet import ReferenceInlet
 from tuner.core.numerics import Array, Inverse, huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
-from tuner.objective.normal_equations import Objective, portions
-from tuner.objective.residuals import is_steady
+from tuner.objective.normal_equations import Objective, flight_batches
+from tuner.objective.residuals import is_informative
 from tuner.objective.space import Space
 from tuner.vehicle import COEFFICIENTS
 
-NEAR = 1e-3
+NEUTRAL_TOLERANCE = 1e-3
 """Steps from its neutral value within which a coefficient is at it."""
-LEFT = 0.25
-"""Share that is left at least of what a new coefficient acts as, where a search of it begins."""
-BLOCK = 2.0
-"""Time beyond which residuals are taken to be independent, s."""
-ASTRAY = 2.0
-"""Residuals' mean square, over that of what was recorded about its mean in all flights, from which
-a simulated flight is another one. What disturbs a vehicle is in its recording, too, so that the
-right model leaves no more than 1; of two flights that have nothing to do with each other, 2."""
+MIN_REMAINING_SHARE = 0.25
+"""Least share left of the coefficient that a new one acts as, at the new one's start value."""
+BLOCK_S = 2.0
+"""Length of a block of time, the unit of stretches: beyond most correlation of residuals."""
+ASTRAY_RATIO = 2.0
+"""Mean square of residuals over the variance of the recorded signal from which a flight refutes the
+fit. Disturbances are in the recording, too, so that the right model leaves at most 1; two unrelated
+flights leave 2."""
 
 
 class Change(NamedTuple):
@@ -74,29 +74,29 @@ class FisherInformation:
     spread
         (C, F) mean square of the weighted residuals: 1 where they are as large as assumed.
     nuisance_prior
-        (K, K): what the priors of offsets and starts contribute.
+        (K, K): contribution of the priors of offsets and starts.
     prior
-        (K, K): what the priors of the coefficients contribute.
+        (K, K): contribution of the priors of the coefficients.
     crashed
-        (F,) which simulated segments crashed, or tumble: their derivatives are
-        `tuner.objective.residuals.CHAOTIC`.
+        (F,) which simulated segments crashed, or tumble: their derivatives exceed
+        `tuner.objective.residuals.MAX_DERIVATIVE`.
     begins
         (F,) s since the flights' starts at which the segments begin.
     scale
         (C, F) factors on the standard deviations of the measurement noise that residuals have.
     ground
-        (K, K): what ground measurements contribute, as data of their own; None without.
+        (K, K): contribution of ground measurements, as data; None without.
     lost
-        (K, K): what flights tell less for nuisances that all of them share; None without.
+        (K, K): information lost to nuisances that all flights share; None without.
     changes
         What might be simulated differently -> how residuals change.
     selection_shifts
-        (K,) how far the estimates would move with terms that were left out; None if none was tried.
+        (K,) shifts of the estimates by omitted terms; None if none was tried.
     astray
-        (F,) which segments of a closed loop crashed, or are `ASTRAY`; None where none can be.
+        (F,) which segments of a closed loop crashed, or exceed `ASTRAY_RATIO`; None in open loop.
     pull, nuisance_pull
         (K,) slopes of the priors' losses at the point, of the coefficients' own and of the
-        nuisances'; None where those of all scores add up to zero with them.
+        nuisances'; None where the whole slope is zero.
     """
 
     channels: tuple[str, ...]
@@ -127,7 +127,7 @@ class FisherInformation:
     ) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
         """Return information (S, K, K), score (S, K), flight and number (S,) of stretches of time.
 
-        ``numbers`` (N, B) says in which stretch of its flight each block of each segment lies.
+        ``numbers`` (N, B) are the stretches, within its flight, of each segment's blocks.
         """
         size = self.score.shape[-1]
         keys = np.stack([np.repeat(self.flight, numbers.shape[1]), numbers.ravel()], axis=-1)
@@ -172,15 +172,15 @@ class FisherInformation:
             nuisance_pull=_summed([part.nuisance_pull for part in parts]),
         )
 
-    def resting(self, where: NDArray[np.bool_]) -> FisherInformation:
-        """Return the same where some coefficients (K,) are held by what is no part of the loss."""
+    def with_resting(self, where: NDArray[np.bool_]) -> FisherInformation:
+        """Return the same with no slope along coefficients (K,) that are held or at a bound."""
         if self.pull is None:
             return self
         return replace(self, pull=np.where(where, self.pull - self.slope, self.pull))
 
     @property
-    def settled(self) -> FisherInformation:
-        """The same where the loss is least, to first order: what a fit from there would see."""
+    def at_minimum(self) -> FisherInformation:
+        """The same at the minimum of the loss, to first order."""
         step = -(self.inverse.matrix @ self.slope)
         return replace(self, score=self.score + self.blocks @ step, pull=None, nuisance_pull=None)
 
@@ -234,11 +234,10 @@ class FisherInformation:
 
     @property
     def refuted(self) -> bool:
-        """Whether the flights contradict all that they say of the coefficients.
+        """Whether the flights contradict the fit.
 
-        A vehicle that crashes where the recorded one flew, or that flies most flights in another
-        way, is not the recorded one, and derivatives along its flights are not those of the
-        recorded ones.
+        It crashes where the recorded vehicle flew, or most simulated flights have little to do with
+        the recorded ones. Derivatives along them are not those along the recorded ones.
         """
         if self.astray is None:
             return False
@@ -263,21 +262,21 @@ class FisherInformation:
 
     @property
     def given(self) -> Array:
-        """The part (K, K) of the total that is no sum over flights: its noise is as it says."""
+        """The part (K, K) of the total that is no sum over flights: its noise is known."""
         return np.asarray(self.prior + self._beside_flights)
 
     @property
     def _beside_flights(self) -> Array:
-        """What adds to the flights' own, and to the priors of the coefficients."""
+        """The information beside that of flights and of the coefficients' priors."""
         beside = self.nuisance_prior
         if self.ground is not None:
             beside = beside + self.ground
         return beside if self.lost is None else beside - self.lost
 
 
-def are_refuting(objective: Objective, point: Point, criterion: Criterion) -> bool:
+def is_refuted(objective: Objective, point: Point, criterion: Criterion) -> bool:
     """Return whether the flights contradict a fit, as of `FisherInformation.refuted`."""
-    parts = [information_at(*batch) for _, batch in portions(objective, point, criterion)]
+    parts = [information_at(*batch) for _, batch in flight_batches(objective, point, criterion)]
     return FisherInformation.joined(parts).refuted
 
 
@@ -286,10 +285,10 @@ def _summed(parts: Sequence[Array | None]) -> Array | None:
     return np.asarray(np.sum(known, axis=0)) if len(known) == len(parts) else None
 
 
-def begun(space: Space, vector: ArrayLike, names: Collection[str]) -> Array:
-    """Return a search vector with new coefficients where a search of them begins.
+def with_start_values(space: Space, vector: ArrayLike, names: Collection[str]) -> Array:
+    """Return a search vector with new coefficients at their start values.
 
-    What they act as at their neutral values begins lower by as much, at least at a quarter.
+    A coefficient that one of them acts as is reduced by as much, at most to a quarter.
     """
     values = space.numbers(np.asarray(vector))
     moved = {name: at for name in names if (at := COEFFICIENTS[name].begin) is not None}
@@ -298,7 +297,7 @@ def begun(space: Space, vector: ArrayLike, names: Collection[str]) -> Array:
     for name, at in tuple(moved.items()):
         other = COEFFICIENTS[name].equivalent_to
         if other in values:
-            moved[other] = max(values[other] - at, LEFT * values[other])
+            moved[other] = max(values[other] - at, MIN_REMAINING_SHARE * values[other])
     there = space.vector_of({**values, **moved})
     start = np.asarray(vector)
     return np.where([name in moved for name in space.names], there, start)
@@ -310,18 +309,18 @@ def with_secants(
     point: Point,
     residuals: Callable[[Point], Mapping[str, Array]],
 ) -> Jacobian:
-    """Return a Jacobian whose columns of some coefficients at neutral values are secants.
+    """Return a Jacobian with secants for coefficients with start values, at neutral values.
 
-    Of those that there do, to first order, what another does: their rows say where they begin.
+    To first order these act there like another coefficient; the secant leads to the start value.
     """
     values = space.numbers(np.asarray(point.coefficients))
     for index, name in enumerate(space.names):
         row = COEFFICIENTS.get(name)
         if row is None or row.begin is None or row.neutral is None:
             continue
-        if abs(values[name] - row.neutral) > NEAR * row.step:
+        if abs(values[name] - row.neutral) > NEUTRAL_TOLERANCE * row.step:
             continue
-        there = begun(space, point.coefficients, (name,))
+        there = with_start_values(space, point.coefficients, (name,))
         change = there - np.asarray(point.coefficients)
         width, change[index] = change[index], 0.0
         beside = np.flatnonzero(change)
@@ -349,20 +348,20 @@ def information_at(
     Parameters
     ----------
     objective, point, criterion
-        The problem, and where it is examined.
+        The problem and the point.
     jacobian
-        There; it is evaluated by default.
+        The Jacobian there; it is evaluated by default.
     offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     alternatives
-        What might be simulated differently -> channel -> (n, k, F) residuals then.
+        Source of error -> channel -> (n, k, F) residuals with it changed.
     """
     jacobian = objective.jacobian(point, criterion) if jacobian is None else jacobian
     space, flight, segments = objective.space, objective.flight, objective.segments.count
     channels = tuple(jacobian.residuals)
     scales = np.stack([criterion.scale[channel][flight] for channel in channels])
     seconds = criterion.horizon / float(objective.schedule.log_rate)
-    blocks = max(int(seconds / BLOCK), 1)
+    blocks = max(int(seconds / BLOCK_S), 1)
     states = 0 if criterion.states is None else len(criterion.states)
     size = len(space) + point.offsets.shape[0] + states
     every = size + len(alternatives)  # a change of the residuals is a column like a derivative
@@ -380,13 +379,13 @@ def information_at(
             changes = [o[channel][..., segment] / scale - error for o in alternatives.values()]
             rows = np.stack([*(columns[..., segment] / scale), *changes], axis=-1)
             robust = huber_weights(error, criterion.huber)
-            stretch = np.minimum((time[:, segment] / BLOCK).astype(int), blocks - 1)
+            stretch = np.minimum((time[:, segment] / BLOCK_S).astype(int), blocks - 1)
             for index in range(blocks):
                 inside = stretch == index
                 own = rows[inside].reshape(-1, every)
                 weighted = (own * robust[inside].reshape(-1, 1)).T
                 curved = weighted @ own
-                if not is_steady(curved[:size, :size], len(own)):
+                if not is_informative(curved[:size, :size], len(own)):
                     rows[inside], crashed[segment] = 0.0, True
                     continue
                 information[number, segment, index] = curved
@@ -399,7 +398,7 @@ def information_at(
     information, score = information * to_scaled[:, None] * to_scaled, score * to_scaled
     fitted = np.asarray(point.offsets) != 0.0 if offsets_fitted is None else offsets_fitted
     of_point = information[..., :size, :size]
-    along, prior, pull = _along(objective, point, criterion, of_point, fitted)
+    along, prior, pull = _nuisance_directions(objective, point, criterion, of_point, fitted)
     movable = np.hstack([fitted[:, flight].T, np.ones((segments, states), bool)])
     return FisherInformation(
         channels=channels,
@@ -420,7 +419,7 @@ def information_at(
         if space.joint_prior is None
         else criterion.prior**2 * space.joint_rows.T @ space.joint_rows,
         astray=_astray(objective, jacobian, crashed),
-        pull=_pull(space, point, criterion),
+        pull=_prior_slope(space, point, criterion),
         nuisance_pull=pull,
     )
 
@@ -428,7 +427,7 @@ def information_at(
 def _astray(
     objective: Objective, jacobian: Jacobian, crashed: NDArray[np.bool_]
 ) -> NDArray[np.bool_] | None:
-    """Return which segments (F,) crashed or are `ASTRAY` in some channel, if the loop is closed.
+    """Return which segments (F,) crashed or are `ASTRAY_RATIO` in some channel, if the loop is closed.
 
     An attitude has no mean.
     """
@@ -447,10 +446,10 @@ def _astray(
         of_recorded = np.square(np.where(used, values - mean, 0.0) * weight).sum() / own.sum()
         of_residuals = np.square(np.asarray(jacobian.residuals[channel])).sum(axis=(0, 1)) / own
         furthest = np.maximum(furthest, of_residuals / max(of_recorded, 1.0))
-    return np.asarray(crashed | (furthest > ASTRAY))
+    return np.asarray(crashed | (furthest > ASTRAY_RATIO))
 
 
-def _along(
+def _nuisance_directions(
     objective: Objective,
     point: Point,
     criterion: Criterion,
@@ -459,8 +458,8 @@ def _along(
 ) -> tuple[Array, Array, Array]:
     """Return how all parameters follow the coefficients: (F, K, Q), starts and offsets at best.
 
-    Given the information (C, F, B, Q, Q) in the scaled coordinates. With it, what the priors of
-    starts and offsets then contribute to the information (K, K), and to the slope (K,).
+    Given the information (C, F, B, Q, Q) in the scaled coordinates. And the contributions of the
+    priors of starts and offsets to the information (K, K) and to the slope (K,).
     """
     whole = information.sum(axis=(0, 2))
     count, (kinds, flights), states = len(objective.space), point.offsets.shape, criterion.states
@@ -487,7 +486,7 @@ def _along(
     return along, prior, pull
 
 
-def _pull(space: Space, point: Point, criterion: Criterion) -> Array:
+def _prior_slope(space: Space, point: Point, criterion: Criterion) -> Array:
     """Return the slope (K,) of the loss of the priors and of ground measurements."""
     slope = space.prior_rows.T @ space.prior_residuals(point.coefficients)
     return np.asarray(criterion.prior**2 * slope)

@@ -1,10 +1,9 @@
-"""The state that a segment is simulated from, how far it may differ, and how that is taken out.
+"""Initial states of segments, their prior, and their elimination from the normal equations.
 
-A flight starts as its recording says. A window starts in the middle of a flight, from a state that
-was smoothed out of noisy samples, with an integrator that nobody recorded. Each segment's start is
-therefore free, near what was recorded. It is no part of the search: to first order the best start
-follows from the coefficients, segment by segment, and what is left of the normal equations speaks
-of the coefficients alone.
+A flight starts in its recorded state. A window starts in the middle of a flight, in a state
+smoothed from noisy samples, with an integrator that was not recorded: so its initial state is free,
+near the recorded one. It is no part of the search: to first order the best initial state follows
+from the coefficients, segment by segment, and is eliminated from the normal equations.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ REST_SPEED, REST_RATE, REST_TILT = 0.1, 0.1, 0.1
 #: m/s and rad/s at the start above which a recording does not begin gently.
 GENTLE_SPEED, GENTLE_RATE = 0.5, 0.5
 #: rad/s of rotors of which none was measured.
-UNKNOWN_SPEED = 600.0
+DEFAULT_ROTOR_SPEED = 600.0
 
 
 def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
@@ -48,10 +47,10 @@ def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
     initial
         The recorded state at the beginning of each segment.
     resting
-        Whether a start that is as slow and level as a hover is at rest and level, heading as
-        recorded. A slow moment in the middle of a flight is no hover.
+        Whether a start as slow and level as a hover is set to rest and level, heading as recorded.
+        A slow moment in the middle of a flight is no hover.
     """
-    states = [_at_rest(state) if resting and rests(state) else state for state in initial]
+    states = [_at_rest(state) if resting and is_at_rest(state) else state for state in initial]
 
     def rows(name: str) -> NDArray[np.float64]:
         return np.stack([getattr(state, name) for state in states], axis=-1)
@@ -59,7 +58,7 @@ def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
     speed, command = rows("rotor_speed"), rows("command")
     known = np.isfinite(speed)
     mean = np.where(known, speed, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    speed = np.where(known, speed, np.where(known.any(axis=0), mean, UNKNOWN_SPEED))
+    speed = np.where(known, speed, np.where(known.any(axis=0), mean, DEFAULT_ROTOR_SPEED))
     position = rows("position")
     return Start(
         motion=Motion(
@@ -80,8 +79,8 @@ def _at_rest(initial: InitialState) -> InitialState:
     return replace(initial, attitude=level, velocity=still, body_rate=still)
 
 
-def rests(initial: InitialState) -> bool:
-    """Return whether a start is as slow and level as a hover, and so taken to be at rest."""
+def is_at_rest(initial: InitialState) -> bool:
+    """Return whether a start is as slow and level as a hover, and so counts as at rest."""
     tilt = 2.0 * np.hypot(initial.attitude[1], initial.attitude[2])
     return bool(
         np.linalg.norm(initial.velocity) < REST_SPEED
@@ -91,7 +90,7 @@ def rests(initial: InitialState) -> bool:
 
 
 def begins_gently(flight: Flight) -> bool:
-    """Return whether a flight begins slowly enough for a fit to follow it from its beginning."""
+    """Return whether a flight begins slowly enough for a search with growing horizons."""
     start = flight.initial
     return bool(
         np.linalg.norm(start.velocity) < GENTLE_SPEED
@@ -123,11 +122,11 @@ def recent_command(flight: Flight, lag: float) -> NDArray[np.float64]:
 STATES: Mapping[str, tuple[int, float]] = {
     name: (row.count, row.prior_sd) for name, row in of_scope("window").items()
 }
-"""What a start consists of: name -> how many numbers, standard deviation of the smoothed one.
+"""Parts of an initial state: name -> count of numbers, prior standard deviation.
 
-The trim is no state: rotors differ and the mass is never quite in the middle, so that what was
-recorded of the motors holds a steady torque about each axis that the model has no use for. In
-closed loop the integrator takes it; where commands are fed in, it is a part of each rotor's.
+The trim is no state: rotors differ and the mass is off centre, so that recorded motor signals hold
+a steady torque about each axis that the model does not have. In closed loop the integrator absorbs
+it; where commands are fed in, it is added to each rotor's.
 """
 _ENDS = np.cumsum([count for count, _ in STATES.values()]).tolist()
 ROWS: Mapping[str, slice] = {
@@ -136,10 +135,10 @@ ROWS: Mapping[str, slice] = {
 }
 """State -> its rows in the vector of a start."""
 
-SPIN = (ROWS["position"].start, ROWS["position"].start + 1, ROWS["rate_integral"].stop - 1)
-"""Rows of what a spin does not forget: position across, and the yaw integrator."""
-YAW_INTEGRAL_GAIN, TICKS = 0.1, 2.0
-"""PX4's default of MC_YAWRATE_I; and by how many ticks it is open when it integrates."""
+SPIN_ROWS = (ROWS["position"].start, ROWS["position"].start + 1, ROWS["rate_integral"].stop - 1)
+"""Rows of the initial state that a spin never forgets: position across, and yaw integrator."""
+YAW_INTEGRAL_GAIN, CLIPPED_TICKS = 0.1, 2.0
+"""PX4's default of MC_YAWRATE_I; and the uncertainty of the integrator's clipping, in ticks."""
 
 
 def freedom_of(ignored: Collection[str]) -> NDArray[np.float64]:
@@ -152,37 +151,36 @@ def freedom_of(ignored: Collection[str]) -> NDArray[np.float64]:
 def freedom_of_spin(
     yaw_rate: NDArray[np.float64], rate: float, position: NDArray[np.float64]
 ) -> dict[int, NDArray[np.float64]]:
-    """Return row of a start -> its standard deviations (F,): what a spin does not forget.
+    """Return row of an initial state -> its standard deviations (F,) in a spin.
 
-    Its yaw step saturates rotors, and the integrator stops while one is clipped: from which tick to
-    which is a matter of a rounding error, and a tick's share of yaw rate and integral gain turns
-    the vehicle for seconds. No controller has a hold on the heading of a spin, so that all samples
-    after that are off by the same angle. And as its attitude is held level about axes that turn, it
-    sways, more and more: a vehicle whose mass is not in the middle doubles a tenth of a millimetre
-    by which it began elsewhere every two or three seconds.
+    A spin's yaw step saturates rotors, and the integrator stops while one is clipped. Rounding
+    errors decide the ticks of that, and one tick's integral turns the vehicle for seconds; nothing
+    controls the heading, so that all later samples are off by the same angle. And attitude held
+    level about turning axes is unstable: with the mass off centre, an initial error of 0.1 mm
+    doubles every two or three seconds.
 
     Parameters
     ----------
     yaw_rate
-        (F,) rad/s that is asked for at once; zero for no spin.
+        (F,) rad/s of the yaw step; zero for no spin.
     rate
         Hz of rate control.
     position
-        (F,) m, standard errors of where the flights are taken to begin.
+        (F,) m, standard errors of the initial positions.
     """
     swaying = position * (yaw_rate != 0.0)
-    integral = TICKS * YAW_INTEGRAL_GAIN * np.abs(yaw_rate) / rate
-    return dict(zip(SPIN, (swaying, swaying, integral), strict=True))
+    integral = CLIPPED_TICKS * YAW_INTEGRAL_GAIN * np.abs(yaw_rate) / rate
+    return dict(zip(SPIN_ROWS, (swaying, swaying, integral), strict=True))
 
 
-def whole(change: Float[Array, "L F"], rows: tuple[int, ...]) -> Float[Array, "N F"]:
-    """Return the change of all N numbers of a start, of which only some rows change."""
+def with_all_rows(change: Float[Array, "L F"], rows: tuple[int, ...]) -> Float[Array, "N F"]:
+    """Return the change of all N numbers of a start from that of some rows, zero elsewhere."""
     changed, none = dict(zip(rows, change, strict=True)), jnp.zeros_like(change[0])
     return jnp.stack([changed.get(row, none) for row in range(_ENDS[-1])])
 
 
-def moved(start: Start, change: Float[Array, "L F"]) -> Start:
-    """Return a start that differs from a recorded one by so much, in the units of `STATES`."""
+def with_change(start: Start, change: Float[Array, "L F"]) -> Start:
+    """Return a recorded start plus a change in the units of `STATES`."""
     parts = {name: change[rows] for name, rows in ROWS.items()}
     motion = start.motion
     turn = parts["attitude"]
@@ -207,7 +205,7 @@ def moved(start: Start, change: Float[Array, "L F"]) -> Start:
 
 
 def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inlet:
-    """Return an inlet whose rotors differ steadily from what was recorded, about three axes."""
+    """Return an inlet with a constant torque trim about three axes added to its rotor signals."""
     if isinstance(inlet, MixedInlet):
         parts = (trimmed(part, vehicle, change) for part in inlet.parts)
         changed: Inlet = eqx.tree_at(lambda i: i.parts, inlet, tuple(parts))
@@ -223,14 +221,14 @@ def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inle
     return recorded_inlet_of(inlet).trimmed(inlet, trim)
 
 
-def spun_up(
+def with_commanded_rotors(
     start: Start,
     vehicle: Vehicle,
     turning: Float[Array, "4 F"],
     *,
     speed_factor: Float[Array, " F"] | None = None,
 ) -> Start:
-    """Return a start whose rotors without a tachometer turn as their commands ask.
+    """Return a start whose rotors without a tachometer have their commanded speeds.
 
     Parameters
     ----------
@@ -249,10 +247,10 @@ def spun_up(
 
 
 RIDGE = 1e-14
-"""Share of the diagonal that is added to it: of a flight that is lost rounding leaves no prior."""
+"""Share of the diagonal that is added to it: rounding may hide the prior of a diverging flight."""
 
 
-def eliminated(
+def eliminate_states(
     loss: NDArray[np.float64],
     gradient: NDArray[np.float64],
     hessian: NDArray[np.float64],
@@ -266,7 +264,7 @@ def eliminated(
         (F,), (F, Q) and (F, Q, Q) of the data at ``states``; the last L of the Q parameters are the
         start's, in standard deviations.
     states
-        (L, F) the start around which was linearised.
+        (L, F) the initial states of the linearisation.
 
     Returns
     -------

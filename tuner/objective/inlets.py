@@ -1,8 +1,8 @@
-"""Recorded signals fed into the simulated loop: which, as what, and what then says nothing.
+"""Recorded signals that are fed into the simulated loop.
 
-Each inlet of the simulator (`sim_jax.inlet`) has one class here, a `RecordedInlet`: it says what a
-recording must hold to feed it, what the simulation then cannot be compared with, and how the
-recording is laid out. An inlet is added by one more class; `INLETS` lists them.
+Each inlet of the simulator (`sim_jax.inlet`) has one class here, a `RecordedInlet`: the signals it
+needs, the channels that are then not compared, and the layout of its input. An inlet is added by
+one more class; `INLETS` lists them.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from tuner.recordings.interpolation import body_rate_from, with_gaps_filled
 from tuner.vehicle import COEFFICIENTS, term_groups
 from tuner.vehicle.coefficient import LoopPart
 
-MISSED = 1.5
-"""Periods of a loop between two samples beyond which its output was not recorded in full."""
+MAX_PERIODS = 1.5
+"""Largest median gap, in periods of a loop, of an output that was recorded in full."""
 
 
-def sparse(flights: Sequence[Flight], signal: str, update_rate: float) -> bool:
+def is_sparse(flights: Sequence[Flight], signal: str, update_rate: float) -> bool:
     """Return whether a signal was recorded less often than it was computed, at a rate in Hz."""
     gaps = np.concatenate([np.diff(flight.series[signal].time) for flight in flights])
-    return bool(np.median(gaps) * update_rate > MISSED)
+    return bool(np.median(gaps) * update_rate > MAX_PERIODS)
 
 
 def zero_order_hold(series: Series, clock: Array) -> Array:
@@ -104,23 +104,23 @@ class RecordedInlet(ABC):
     """The simulator's inlet."""
     needs: ClassVar[tuple[str, ...]]
     """Signals that a recording must hold, the characteristic one first."""
-    silences: ClassVar[tuple[str, ...]] = ("acceleration",)
+    not_compared: ClassVar[tuple[str, ...]] = ("acceleration",)
     """Channels that are fed in or left out, so that the simulation says nothing about them."""
     ignores: ClassVar[tuple[str, ...]]
-    """Parts of a segment's start (`tuner.objective.initial_conditions.STATES`) that do not act."""
+    """Parts of a segment's start (`tuner.objective.initial_conditions.STATES`) without effect."""
     starts_recorded: ClassVar[bool] = True
-    """Whether a recording holds all of the state that a window starts from: no integrator."""
+    """Whether a recording has the whole initial state of a window: it has no integrator."""
     window: ClassVar[float] = 0.5
-    """s, length of a window: open loop, attitude strays within a second whatever it is fed."""
+    """s, length of a window: in open loop attitude diverges within a second."""
     closed_loop: ClassVar[bool] = False
     """Whether the position controller is simulated: it keeps a whole flight to its path, and the
     recording's clock is the reference's rather than the flight controller's."""
     replaces: ClassVar[tuple[LoopPart, ...]] = ()
-    """Parts of the loop in whose place signals are fed in."""
+    """Parts of the loop that the input replaces."""
     frees: ClassVar[tuple[str, ...]] = ()
-    """Coefficients that are free besides the usual ones: what no loop takes out by itself."""
+    """Coefficients that are free besides the usual ones: no loop compensates them here."""
     terms: ClassVar[tuple[str, ...]] = ()
-    """Groups of terms that are free from the beginning where the job leaves the choice."""
+    """Groups of terms that are free from the start, if the job leaves the choice."""
     computed_at: ClassVar[str | None] = None
     """The rate of a `Schedule` at which the flight controller computes the signal."""
     remedy: ClassVar[str] = "use inlet: auto"
@@ -133,16 +133,16 @@ class RecordedInlet(ABC):
 
     @property
     def bypasses(self) -> frozenset[str]:
-        """The coefficients of these parts, of which the simulation then says nothing."""
+        """The coefficients of the replaced parts, which then have no effect."""
         return frozenset(n for n, row in COEFFICIENTS.items() if row.part in self.replaces)
 
     def bypassed(self, flight: Flight) -> frozenset[str]:
-        """Return the coefficients of which the simulation of a flight says nothing."""
+        """Return the coefficients without effect on the simulation of a flight."""
         del flight
         return self.bypasses
 
     def can_be_fed(self, flight: Flight) -> bool:
-        """Return whether a flight holds every column of what the inlet needs."""
+        """Return whether a flight has every column of the signals that the inlet needs."""
         return all(
             flight.has(signal) and bool(np.isfinite(flight.signals[signal]).any(axis=0).all())
             for signal in self.needs
@@ -157,12 +157,12 @@ class RecordedInlet(ABC):
         return None if self.computed_at is None else float(getattr(schedule, self.computed_at))
 
     @abstractmethod
-    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> Inlet:
-        """Lay what was recorded side by side; after its end the last value holds.
+    def lay_out(self, flights: Sequence[Flight], schedule: Schedule) -> Inlet:
+        """Return the recorded input of several flights; after its end the last value holds.
 
         Set-points and commands hold until the loop that computes them runs again. Where they were
-        recorded less often than that, they are taken to move steadily from one sample to the next:
-        a zero-order hold would make them late.
+        recorded less often than that, they are interpolated linearly: a zero-order hold would delay
+        them.
 
         Parameters
         ----------
@@ -182,7 +182,7 @@ class RecordedInlet(ABC):
         longest = max(flight.duration for flight in flights)
         steps = int(np.ceil(longest * schedule.physics_rate)) + 2
         clock, rate = np.arange(steps) / schedule.physics_rate, self.update_rate(schedule)
-        moves = rate is None or sparse(flights, signal, rate)
+        moves = rate is None or is_sparse(flights, signal, rate)
         read = linear_interpolation if moves else zero_order_hold
         table = np.stack(
             [read(with_gaps_filled(flight.series[signal]), clock) for flight in flights], axis=-1
@@ -191,11 +191,11 @@ class RecordedInlet(ABC):
 
 
 STEADY_TORQUE = ("torque_trim_x", "torque_trim_y", "torque_trim_z")
-"""Rotors differ and the mass is never quite in the middle: recorded inputs hold a steady torque
-that turns nothing, and that a simulation which is fed with them has to know of."""
-AIR = ("linear_drag", "angular_drag", "flapping_moment", "thrust_inflow")
-"""Groups of terms by which air damps any multirotor that moves and turns: no loop hides them here,
-and without them the torque of the recorded inputs is what has to stand in for the damping."""
+"""Trims of recorded inputs: as rotors differ and the mass is off centre, these hold a steady torque
+that turns nothing."""
+DAMPING_TERMS = ("linear_drag", "angular_drag", "flapping_moment", "thrust_inflow")
+"""Groups of terms of aerodynamic damping, free from the start in open loop: without them the torque
+of the recorded inputs would be biased to make up for it."""
 
 
 class RecordedReference(RecordedInlet):
@@ -211,16 +211,15 @@ class RecordedReference(RecordedInlet):
     remedy = "name its trajectory in the job file"
 
     def is_preferred(self, flight: Flight) -> bool:
-        """Return whether a reference with velocities is known, flown by controllers like ours.
+        """Return whether the reference has velocities, and the controller commands no torques.
 
-        Without velocities it is a list of set-points to some other controller, not the reference of
-        ours, and a controller that commands torques is no PX4: then it is only used where it is
-        asked for.
+        Set-points without velocities belong to another controller, and one that commands torques is
+        not PX4's: they are used on request only.
         """
         foreign = flight.has("commanded_torque")
         return self.can_be_fed(flight) and flight.has("reference_velocity") and not foreign
 
-    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ReferenceInlet:
+    def lay_out(self, flights: Sequence[Flight], schedule: Schedule) -> ReferenceInlet:
         """Lay the reference out tick by tick, its last point repeated."""
         del schedule
         length = max(len(flight.time) for flight in flights)
@@ -249,7 +248,7 @@ class RecordedBodyRate(RecordedInlet):
     window = 1.0
     computed_at = "position_control_rate"
 
-    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> BodyRateInlet:
+    def lay_out(self, flights: Sequence[Flight], schedule: Schedule) -> BodyRateInlet:
         """Lay both set-points out step by step."""
         (thrust,) = self._resampled("thrust_setpoint", flights, schedule)
         return BodyRateInlet(Vec3(*self._resampled("rate_setpoint", flights, schedule)), thrust)
@@ -261,14 +260,14 @@ class RecordedCommand(RecordedInlet):
     name = "actuator"
     feeds = ActuatorInlet
     needs = ("command",)
-    silences = ("command", "acceleration")
+    not_compared = ("command", "acceleration")
     replaces = ("estimate", "rate control")
     frees = STEADY_TORQUE
-    terms = AIR
+    terms = DAMPING_TERMS
     ignores = ("rate_integral",)
     computed_at = "rate_control_rate"
 
-    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
+    def lay_out(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
         """Lay the commands out step by step."""
         return ActuatorInlet(tuple(self._resampled("command", flights, schedule)))
 
@@ -285,13 +284,13 @@ class RecordedRotorSpeed(RecordedInlet):
     name = "rotor_speed"
     feeds = RotorSpeedInlet
     needs = ("rotor_speed",)
-    silences = ("command", "rotor_speed", "acceleration")
+    not_compared = ("command", "rotor_speed", "acceleration")
     replaces = ("estimate", "rate control", "motors", "tachometer")
     frees = STEADY_TORQUE
-    terms = AIR
+    terms = DAMPING_TERMS
     ignores = ("rotor_speed", "rate_integral")
 
-    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> RotorSpeedInlet:
+    def lay_out(self, flights: Sequence[Flight], schedule: Schedule) -> RotorSpeedInlet:
         """Lay the speeds out step by step."""
         return RotorSpeedInlet(tuple(self._resampled("rotor_speed", flights, schedule)))
 
@@ -311,30 +310,30 @@ class _RecordedThrust(RecordedInlet):
     ignores = ()
     computed_at = "position_control_rate"
 
-    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
+    def lay_out(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
         """Lay the set-points out step by step, for each of four rotors."""
         (thrust,) = self._resampled("thrust_setpoint", flights, schedule)
         return ActuatorInlet((thrust,) * ROTORS)
 
 
 class RecordedAttitude(RecordedInlet):
-    """Attitude and body rate, which are followed; what turns the rotors simulates the thrust.
+    """Recorded attitude and body rate, with rotor signals for the thrust alone.
 
-    For recordings whose commands say nothing about what turns the vehicle: logged too seldom, by
-    another mixer, or not at all. The accelerometer, where recorded, is a channel.
+    For recordings whose commands do not explain the turning: logged too seldom, by another mixer,
+    or not at all. The accelerometer, where recorded, is a channel.
     """
 
     name = "attitude"
     feeds = AttitudeInlet
     needs = ("attitude",)
-    silences = ("attitude", "body_rate", "command", "rotor_speed")
+    not_compared = ("attitude", "body_rate", "command", "rotor_speed")
     replaces = ("estimate", "rate control", "turning", "tachometer")
     ignores = ("attitude", "body_rate", "rate_integral", "trim")
     starts_recorded = False
     window = 1.0
     remedy = "record motor commands, rotor speeds or thrust set-points beside the pose"
 
-    #: What turns the rotors, the most direct first.
+    #: Signals that drive the rotors, the most direct first.
     DRIVES: ClassVar[tuple[RecordedInlet, ...]] = (
         RecordedRotorSpeed(),
         RecordedCommand(),
@@ -342,23 +341,23 @@ class RecordedAttitude(RecordedInlet):
     )
 
     def can_be_fed(self, flight: Flight) -> bool:
-        """Return whether a flight holds its attitude and something that turns the rotors."""
+        """Return whether a flight has its attitude and a signal that drives the rotors."""
         return super().can_be_fed(flight) and any(d.can_be_fed(flight) for d in self.DRIVES)
 
     def drive(self, flight: Flight) -> RecordedInlet:
-        """Return what turns the rotors of a flight that can be fed."""
+        """Return the recorded inlet that drives the rotors of a flight."""
         return next(drive for drive in self.DRIVES if drive.can_be_fed(flight))
 
     def fed(self, flight: Flight) -> tuple[str, ...]:
-        """Return the attitude and what turns the rotors."""
+        """Return the attitude and the signals that drive the rotors."""
         return (*self.needs, *self.drive(flight).needs)
 
     def bypassed(self, flight: Flight) -> frozenset[str]:
-        """Return what turns the vehicle, and the motors where rotor speeds are fed in."""
+        """Return the coefficients of turning, and of the motors where rotor speeds are fed in."""
         return self.bypasses | self.drive(flight).bypassed(flight)
 
-    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> AttitudeInlet:
-        """Lay attitudes and body rates out step by step, beside what turns the rotors."""
+    def lay_out(self, flights: Sequence[Flight], schedule: Schedule) -> AttitudeInlet:
+        """Lay attitudes, body rates and rotor signals out step by step."""
         with_rate = [with_body_rate(flight) for flight in flights]
         attitude = np.stack(self._resampled("attitude", flights, schedule))
         return AttitudeInlet(
@@ -382,13 +381,13 @@ INLETS: Mapping[InletName, RecordedInlet] = {
 
 
 def bypassed_by(names: Sequence[InletName], flights: Sequence[Flight]) -> frozenset[str]:
-    """Return the coefficients that act on no flight, each entering through its own inlet."""
+    """Return the coefficients without effect on any flight, each with its own inlet."""
     pairs = zip(names, flights, strict=True)
     return frozenset.intersection(*(INLETS[name].bypassed(flight) for name, flight in pairs))
 
 
 def freed_by(names: Collection[InletName], *, terms: bool) -> frozenset[str]:
-    """Return the coefficients that flights through some inlets ask for besides the usual ones.
+    """Return the coefficients that all of some inlets free besides the usual ones.
 
     Parameters
     ----------
@@ -414,14 +413,14 @@ def window_seconds(names: Collection[InletName], given: float | None) -> float:
 
 
 def inlet_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Schedule) -> Inlet:
-    """Lay what was recorded side by side, each segment's for its own inlet.
+    """Return the input of all segments, each for its own inlet.
 
     Parameters
     ----------
     names
         F inlets.
     flights, schedule
-        As of `RecordedInlet.lay`.
+        As of `RecordedInlet.lay_out`.
     """
     return _laid([INLETS[name] for name in names], flights, schedule)
 
@@ -429,10 +428,10 @@ def inlet_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Sc
 def _laid(
     recorded: Sequence[RecordedInlet], flights: Sequence[Flight], schedule: Schedule
 ) -> Inlet:
-    """Lay what was recorded side by side, each segment's by its own of F recorded inlets."""
+    """Return the input of all segments, each by its own of F recorded inlets."""
     used = list(dict.fromkeys(recorded))
     if len(used) == 1:
-        return used[0].lay(flights, schedule)
+        return used[0].lay_out(flights, schedule)
     parts = []
     for inlet in used:
         example = flights[recorded.index(inlet)]
@@ -440,11 +439,11 @@ def _laid(
             flight if own is inlet else zeroed(flight, {*inlet.needs, *inlet.fed(example)})
             for own, flight in zip(recorded, flights, strict=True)
         ]
-        parts.append(inlet.lay(feeding, schedule))
+        parts.append(inlet.lay_out(feeding, schedule))
     return MixedInlet(tuple(parts), np.asarray([used.index(inlet) for inlet in recorded]))
 
 
 def recorded_inlet_of(inlet: Inlet) -> RecordedInlet:
-    """Return what feeds an inlet of the simulator."""
+    """Return the recorded inlet that feeds an inlet of the simulator."""
     (recorded,) = (r for r in INLETS.values() if type(inlet) is r.feeds)
     return recorded

@@ -1,4 +1,4 @@
-"""How noisy each recorded signal is, estimated from the recording itself."""
+"""Measurement noise of each recorded signal, estimated from the recording itself."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tuner.core.numerics import Array, robust_sd
 from tuner.recordings.flight import Flight, Series
 
 #: Smallest believable standard deviation, in the channel's unit (attitude: rad).
-FLOOR = {
+MIN_NOISE = {
     "position": 1e-4,
     "attitude": 1e-4,
     "body_rate": 1e-3,
@@ -24,8 +24,8 @@ FLOOR = {
 def white_noise(series: Series) -> Array:
     """Return each column's standard deviation of the noise between neighbouring samples.
 
-    Every sample is compared with the parabola through its neighbours at their own times, which a
-    smooth signal meets however its stamps jitter; the median makes it deaf to jumps.
+    Every sample is compared with the parabola through its neighbours at their own times, so that
+    jitter of stamps does not matter; the median is robust to jumps.
 
     Parameters
     ----------
@@ -82,15 +82,14 @@ def channel_noise(flights: Sequence[Flight], channel: str) -> float:
         else:
             per_flight.append(float(np.nanmedian(white_noise(series))))
     known = [value for value in per_flight if np.isfinite(value)]
-    return max(float(np.median(known)) if known else 0.0, FLOOR[channel])
+    return max(float(np.median(known)) if known else 0.0, MIN_NOISE[channel])
 
 
-def repeats(values: Array) -> Array:
-    """Return how many samples in a row hold the same value as each of some (n, k), 1 for most.
+def repeat_counts(values: Array) -> Array:
+    """Return the length of the run of equal samples that each of (n, k) belongs to.
 
-    What was rounded is off by the same in all of them as long as it rests: they are one reading.
-    Taken for as many, those of a steady yaw spin said more of a moment constant than all else did,
-    and something wrong.
+    A run of equal rounded values has one rounding error: it is one reading. Counted as many, those
+    of a steady yaw spin had biased the moment constant.
     """
     counts = np.ones(values.shape)
     for column, samples in enumerate(values.T):

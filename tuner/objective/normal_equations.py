@@ -1,10 +1,10 @@
 """Loss, gradient and Gauss-Newton Hessian of a fit, segment by segment, keeping no Jacobian.
 
-Flying is a kernel's (`tuner.objective.simulation`); reading a simulation at the recorded stamps and
-summing up is linear, and NumPy's. While sums are made, segments come first in every array, columns
-of derivatives last. Each of F segments contributes a loss, a gradient and a Hessian from which its
-own start has been eliminated; the normal equations add them up, with the priors. How much each
-channel of each flight weighs follows from what the model leaves unexplained of it.
+A compiled kernel simulates (`tuner.objective.simulation`); NumPy reads the simulation at recorded
+stamps and sums up. In these sums segments come first in every array, columns of derivatives last.
+Each of F segments contributes a loss, a gradient and a Hessian from which its own start has been
+eliminated; the normal equations add them up, with the priors. The weight of each channel of each
+flight follows from its residuals.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from tuner.objective.criterion import (
     SegmentSums,
     units_of,
 )
-from tuner.objective.initial_conditions import eliminated
-from tuner.objective.residuals import Block, Reading, gauss_newton, residuals, robust
+from tuner.objective.initial_conditions import eliminate_states
+from tuner.objective.residuals import Block, Reading, gauss_newton, huber_loss, residuals
 from tuner.objective.segments import OFFSETS, Segments
 from tuner.objective.simulation import Flown, fly
 from tuner.objective.space import Space
 from tuner.vehicle.model import Model, with_coefficients
 
 MEMORY = 2**30
-"""bytes that derivatives take at most by default while they are computed."""
-LOGGED = 8
-"""Share of them, one in so many, that is logged at a time where residuals are kept."""
-CHUNK = 16
+"""Default largest size of derivatives in memory, bytes."""
+LOG_SHARE = 8
+"""Memory over that of the logs simulated at a time, where residuals are kept."""
+VECTORS_AT_ONCE = 16
 """Vectors simulated side by side: enough to fill the processor, few enough for its memory."""
-NEAR = 3.0
-"""Multiple of the noise up to which a flight counts as met, by its worst channel."""
-STRAY = 3.0
-"""A flight that is met this many times worse than the median one counts less."""
+MATCHED_RATIO = 3.0
+"""Largest ratio of the worst channel's residuals to the noise of a matched flight."""
+STRAY_RATIO = 3.0
+"""Residuals over those of the median flight from which a flight has a smaller weight."""
 
 
 class Objective(eqx.Module):
@@ -64,7 +64,7 @@ class Objective(eqx.Module):
     space
         Free coefficients.
     schedule, samples, limits
-        How the simulation runs, and how many samples a log has at most.
+        Rates and limits of the simulation, and the largest number of logged samples.
     """
 
     model: Model
@@ -74,15 +74,15 @@ class Objective(eqx.Module):
     samples: int = eqx.field(static=True)
     limits: Limits = eqx.field(static=True)
     memory: int = eqx.field(static=True, default=MEMORY)
-    """bytes that derivatives may take while they are computed: segments beyond take turns."""
+    """Largest size of derivatives, bytes: segments beyond it take turns."""
     conditions: tuple[str, ...] = eqx.field(static=True, default=())
-    """What surrounds each flight and is estimated with it, of `tuner.vehicle.conditions`."""
+    """Names of the estimated per-flight conditions, of `tuner.vehicle.conditions`."""
     multiplicity: Float[Array, " N"] | None = None
-    """How often each flight counts in loss, gradient and Hessian; None is once."""
+    """Multiplicity of each flight in loss, gradient and Hessian; None is 1."""
 
     @property
     def of_flight(self) -> tuple[str, ...]:
-        """What each flight has of its own, in the order of a point's rows."""
+        """Names of the per-flight parameters, in the order of a point's rows."""
         return (*OFFSETS, *self.conditions)
 
     @property
@@ -97,7 +97,7 @@ class Objective(eqx.Module):
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """What was measured, in the order of jax's trees: sums do not depend on how it was laid."""
+        """The measured channels, sorted: sums do not depend on their order in the recording."""
         return tuple(sorted(self.segments.measured))
 
     def model_at(self, vector: ArrayLike) -> Model:
@@ -110,15 +110,12 @@ class Objective(eqx.Module):
         return Point(np.asarray(vector), np.zeros((len(self.of_flight), self.flights)))
 
     def conditions_at(self, point: Point) -> dict[str, Array]:
-        """Return what surrounds each flight at a point: name -> (N,), in its unit."""
+        """Return the per-flight conditions at a point: name -> (N,), in its unit."""
         rows, units = np.asarray(point.offsets)[len(OFFSETS) :], units_of(self.conditions)
         return {name: rows[row] * units[row] for row, name in enumerate(self.conditions)}
 
     def fly(
-        self,
-        point: Point,
-        criterion: Criterion,
-        moving: Mapping[str, int] = MappingProxyType({}),
+        self, point: Point, criterion: Criterion, moving: Mapping[str, int] = MappingProxyType({})
     ) -> Flown:
         """Fly the segments up to the criterion's horizon.
 
@@ -129,7 +126,7 @@ class Objective(eqx.Module):
         criterion
             Gives the horizon and the starts.
         moving
-            By what is differentiated, and by how many columns each: ``coefficients``,
+            Variables of the derivatives -> their number of columns: ``coefficients``,
             ``conditions``, ``states``, in this order.
         """
         conditions = self.conditions_at(point)
@@ -146,15 +143,11 @@ class Objective(eqx.Module):
         )
 
     def compare(
-        self,
-        point: Point,
-        criterion: Criterion,
-        moving: Mapping[str, int] = MappingProxyType({}),
+        self, point: Point, criterion: Criterion, moving: Mapping[str, int] = MappingProxyType({})
     ) -> tuple[Array, Iterator[tuple[str, Block]]]:
         """Fly the segments; return (F,) times of crashes, and channels with blocks of residuals.
 
-        The arguments are those of `fly`. Where conditions move, so do all that flights have of
-        their own.
+        The arguments are those of `fly`. Where conditions move, so do the offsets.
         """
         flown = self.fly(point, criterion, moving)
         reading = Reading(
@@ -177,7 +170,7 @@ class Objective(eqx.Module):
     ) -> SegmentSums:
         """Return every segment's contribution at a point.
 
-        Where coefficients are ``still``, derivatives are those by what each flight has of its own.
+        With ``still`` coefficients, derivatives are those by per-flight parameters alone.
         """
         moving = self._moving(criterion, derivatives=derivatives, still=still)
         parts = [
@@ -206,7 +199,7 @@ class Objective(eqx.Module):
     def _moving(
         self, criterion: Criterion, *, derivatives: bool = True, still: bool = False
     ) -> dict[str, int]:
-        """Return by what sums are differentiated: by their starts at least, to eliminate these."""
+        """Return the variables of derivatives: at least free starts, to eliminate them."""
         moving = {} if criterion.states is None else {"states": len(criterion.states)}
         if derivatives:
             moving = {"conditions": len(self.conditions), **moving}
@@ -259,7 +252,7 @@ class Objective(eqx.Module):
             squares[name][some] += np.einsum("fnk,fnk->f", block.errors, block.errors)
             counts[name][some] += block.counts.sum(axis=(1, 2))
             scaled = block.errors / scale[:, None, None]
-            loss[some] += 0.5 * robust(scaled, huber).sum(axis=(1, 2))
+            loss[some] += 0.5 * huber_loss(scaled, huber).sum(axis=(1, 2))
             if total:
                 along, across = gauss_newton(block.columns, scaled, scale, huber)
                 gradient[some] += along
@@ -270,7 +263,9 @@ class Objective(eqx.Module):
                 bend[name][some] += np.einsum("fnkl,fnkm->flm", own, own)
         best = None
         if criterion.states is not None:
-            loss, gradient, hessian, best = eliminated(loss, gradient, hessian, criterion.states)
+            loss, gradient, hessian, best = eliminate_states(
+                loss, gradient, hessian, criterion.states
+            )
             change = (best - criterion.states).T
             for name in self.channels:
                 pull = 2.0 * slope[name] + np.einsum("flm,fm->fl", bend[name], change)
@@ -293,14 +288,14 @@ class Objective(eqx.Module):
     ) -> tuple[dict[str, Array], dict[str, Array], Array]:
         """Return channel -> (n, k, F) residuals and (Q, n, k, F) columns; (F,) times of crashes.
 
-        Segments are flown in turn, so that what is logged takes less than what is laid out.
+        Segments are simulated in turn, so that logs take less memory than the result.
         """
         errors, columns, crash_time = {}, {}, np.zeros(self.segments.count)
         for name in self.channels:
             n, k, segments = np.shape(self.segments.measured[name].weight)
             errors[name] = np.zeros((segments, n, k))
             columns[name] = np.zeros((segments, n, k, _columns(moving)))
-        for some, part, of_part in self._in_turn(criterion, moving, self.memory // LOGGED):
+        for some, part, of_part in self._in_turn(criterion, moving, self.memory // LOG_SHARE):
             crash_time[some], blocks = part.compare(point, of_part, moving)
             for name, block in blocks:
                 place = np.arange(part.segments.count)[block.segments, None], block.stamps
@@ -314,7 +309,7 @@ class Objective(eqx.Module):
 
 
 def _columns(moving: Mapping[str, int]) -> int:
-    """Return how many columns residuals have where so much moves."""
+    """Return the number of columns of residuals."""
     return sum(moving.values()) + len(OFFSETS) * ("conditions" in moving)
 
 
@@ -327,13 +322,13 @@ def some_segments(
     return replace(objective, segments=kept), replace(criterion, states=states)
 
 
-def portions(
+def flight_batches(
     objective: Objective, point: Point, criterion: Criterion
 ) -> Iterator[tuple[NDArray[np.intp], tuple[Objective, Point, Criterion]]]:
-    """Return flights that follow each other and whose Jacobian fits the objective's memory.
+    """Yield batches of consecutive flights whose Jacobian fits the objective's memory.
 
-    Their numbers, and the problem, point and criterion of them alone. A flight alone is taken
-    however large it is.
+    Each has the flights' numbers, and their problem, point and criterion. One flight is always
+    taken, however large it is.
     """
     starts = 0 if criterion.states is None else len(criterion.states)
     columns = len(objective.space) + len(point.offsets) + starts
@@ -344,14 +339,14 @@ def portions(
     for number, size in enumerate(sizes):
         if number > first and taken + size > objective.memory:
             flights = np.arange(first, number)
-            yield flights, portion(objective, point, criterion, flights)
+            yield flights, flight_batch(objective, point, criterion, flights)
             first, taken = number, 0
         taken += size
     flights = np.arange(first, len(sizes))
-    yield flights, portion(objective, point, criterion, flights)
+    yield flights, flight_batch(objective, point, criterion, flights)
 
 
-def portion(
+def flight_batch(
     objective: Objective, point: Point, criterion: Criterion, flights: NDArray[np.intp]
 ) -> tuple[Objective, Point, Criterion]:
     """Return problem, point and criterion of some flights alone, numbered anew."""
@@ -372,14 +367,9 @@ def portion(
 def with_conditions(
     objective: Objective, point: Point, names: Sequence[str]
 ) -> tuple[Objective, Point]:
-    """Return a problem in which more surrounds each flight, and its point, where that is nothing.
+    """Return a problem with more per-flight conditions, and its point with these at zero.
 
-    Parameters
-    ----------
-    objective, point
-        The problem, and where it stands.
-    names
-        Of `tuner.vehicle.conditions`.
+    ``names`` are of `tuner.vehicle.conditions`.
     """
     added = tuple(name for name in names if name not in objective.conditions)
     wider = replace(objective, conditions=(*objective.conditions, *added))
@@ -411,7 +401,7 @@ def normal_equations(
     objective
         Gives the priors, and which flight each segment belongs to.
     point, criterion, sums
-        Where, in which terms, and what the segments contribute there.
+        The point, the criterion, and the segments' contributions there.
     """
     space, vector, offsets = objective.space, *map(np.asarray, (point.coefficients, point.offsets))
     count, (kinds, flights), prior = len(space), offsets.shape, criterion.prior
@@ -465,13 +455,13 @@ def position_rmse(
     return float(sigma * np.sqrt(3.0 * float(np.sum(squares["position"])) / compared))
 
 
-def strays(residual: dict[str, Array], noise_inflation: float) -> dict[str, Array]:
-    """Weigh a flight down that is met far worse than the others, so that it cannot poison them."""
+def downweighting(residual: dict[str, Array], noise_inflation: float) -> dict[str, Array]:
+    """Return scales that reduce the weight of flights matched far worse than the others."""
     table = np.stack(list(residual.values())) / noise_inflation
     with np.errstate(all="ignore"):
         per_flight = np.nan_to_num(np.nanmedian(table, axis=0), nan=1.0)
     typical = max(float(np.median(per_flight)), 1.0)
-    stray = per_flight > STRAY * typical
+    stray = per_flight > STRAY_RATIO * typical
     return {
         name: np.where(stray & np.isfinite(values), np.maximum(values / noise_inflation, 1.0), 1.0)
         for name, values in residual.items()
@@ -479,14 +469,14 @@ def strays(residual: dict[str, Array], noise_inflation: float) -> dict[str, Arra
 
 
 def misfit(residual: dict[str, Array]) -> dict[str, Array]:
-    """Return how much larger than noise each channel's residuals are on each flight, at least 1."""
+    """Return residuals over noise of each channel on each flight, at least 1."""
     return {
         name: np.maximum(np.nan_to_num(values, nan=1.0), 1.0) for name, values in residual.items()
     }
 
 
 class Batch(eqx.Module):
-    """What S vectors give.
+    """The losses of S vectors.
 
     Attributes
     ----------
@@ -519,17 +509,19 @@ def evaluate(objective: Objective, vectors: Array, point: Point, criterion: Crit
     """
     engine = current()
     problem = engine.share((objective, point, criterion))
-    chunks = [vectors[first : first + CHUNK] for first in range(0, len(vectors), CHUNK)]
+    chunks = [
+        vectors[first : first + VECTORS_AT_ONCE]
+        for first in range(0, len(vectors), VECTORS_AT_ONCE)
+    ]
     parts = engine.map(_evaluated, [(problem, chunk) for chunk in chunks])
     joined: Batch = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     return joined
 
 
 def _evaluated(
-    task: tuple[Callable[[], tuple[Objective, Point, Criterion]], Array],
-    _report: Report,
+    task: tuple[Callable[[], tuple[Objective, Point, Criterion]], Array], _report: Report
 ) -> Batch:
-    """Return what some vectors give: all segments of all vectors fly side by side."""
+    """Return the losses of some vectors: all segments of all vectors are simulated side by side."""
     (objective, point, criterion), vectors = task[0](), task[1]
     count, segments = len(vectors), objective.segments.count
     together = np.tile(np.arange(segments), count)
@@ -542,7 +534,7 @@ def _evaluated(
     for name, block in blocks:
         scale = criterion.scale[name][objective.flight[block.segments]]
         scaled = block.errors / scale[:, None, None]
-        loss[block.segments] += 0.5 * robust(scaled, criterion.huber).sum(axis=(1, 2))
+        loss[block.segments] += 0.5 * huber_loss(scaled, criterion.huber).sum(axis=(1, 2))
         squares[name][block.segments] += np.einsum("fnk,fnk->fk", block.errors, block.errors)
     by_axis = {n: np.moveaxis(s.reshape(count, segments, -1), -1, 1) for n, s in squares.items()}
     return Batch(loss.reshape(count, segments), by_axis, crash_time.reshape(count, segments))

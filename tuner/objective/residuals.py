@@ -18,12 +18,12 @@ from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Segments
 from tuner.objective.simulation import CODE, Flown
 
-RAMP = 0.25
+RAMP_SHARE = 0.25
 """Share of the time between two jumps of a zero-order hold that the ramp to the next takes."""
 
 
-BLOCK = 1024
-"""Stamps of segments that are compared at a time: what is computed of them stays in the cache."""
+STAMPS_AT_ONCE = 1024
+"""Stamps of segments that are compared at a time: their results fit the processor's cache."""
 
 
 class Block(NamedTuple):
@@ -34,8 +34,8 @@ class Block(NamedTuple):
     segments
         Which of the F segments: G of them.
     stamps
-        (G, m) numbers of the stamps; where a segment has fewer, some stand for nothing: their
-        errors and columns are zero.
+        (G, m) numbers of the stamps; where a segment has fewer, errors and columns of the rest are
+        zero.
     counts
         (G, m, k) whether something was measured.
     errors
@@ -54,7 +54,7 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """How a simulation is read, to be compared.
+    """Clock offsets, gyro biases and range by which a simulation is read at recorded stamps.
 
     Attributes
     ----------
@@ -100,11 +100,11 @@ def residuals(flown: Flown, segments: Segments, name: str, reading: Reading) -> 
     order = np.argsort(~used, axis=1, kind="stable")[:, :most]
     log, moved_log = _Series(flown.channels[name]), flown.columns[name]
     columns = None if moved_log is None else _Series(moved_log, moved=True)
-    together = max(BLOCK // max(most, 1), 1)
+    together = max(STAMPS_AT_ONCE // max(most, 1), 1)
     for first in range(0, len(time), together):
         some = slice(first, first + together)
-        for begin in range(0, most, BLOCK):
-            stamps = order[some, begin : begin + BLOCK]
+        for begin in range(0, most, STAMPS_AT_ONCE):
+            stamps = order[some, begin : begin + STAMPS_AT_ONCE]
             real = np.take_along_axis(used[some], stamps, axis=1)
 
             def at(rows: NDArray[Any], stamps: NDArray[np.intp] = stamps) -> NDArray[Any]:
@@ -119,11 +119,7 @@ def residuals(flown: Flown, segments: Segments, name: str, reading: Reading) -> 
 
 
 def _compared(
-    name: str,
-    log: _Series,
-    columns: _Series | None,
-    place: _Place,
-    recorded: Array,
+    name: str, log: _Series, columns: _Series | None, place: _Place, recorded: Array
 ) -> tuple[Array, Array]:
     """Return errors (G, m, k) of a channel in its unit, and their columns (G, m, k, Q)."""
     reading = place.reading
@@ -145,14 +141,10 @@ def _compared(
 
 
 class _Place:
-    """Where stamps lie in a log, and how it is read there."""
+    """Stamps of a channel as fractional sample numbers of a simulation's log."""
 
     def __init__(
-        self,
-        segments: NDArray[np.intp],
-        time: Array,
-        name: str,
-        reading: Reading,
+        self, segments: NDArray[np.intp], time: Array, name: str, reading: Reading
     ) -> None:
         self.reading, self.name, self.segments = reading, name, segments[:, None]
         self.clock = CLOCK_OF[name]
@@ -164,15 +156,14 @@ class _Place:
             self.bias = reading.offsets[len(CLOCKS) :, segments].T[:, None]
 
     def read(self, series: _Series) -> Array:
-        """Return what the log of a simulation holds at the stamps, (G, m, *rest)."""
+        """Return the values of a simulation's log at the stamps, (G, m, *rest)."""
         if self.name != "command":
             return series.mixed(self.segments, self.place, lambda share: share)
-        # A zero-order hold, moved a little along a ramp into each of its next values. A sample
-        # whose stamp falls well between two jumps does not move: samples that were taken in step
-        # with the jumps say nothing of a clock but where it passes one.
+        # A zero-order hold with a ramp before each jump. A stamp well between two jumps does not
+        # move with the clock's offset: only stamps near a jump have information on it.
         held = series.at(self.segments, series.below(self.before))
-        held += series.mixed(self.segments, self.place, _risen)
-        held -= series.mixed(self.segments, self.before, _risen)
+        held += series.mixed(self.segments, self.place, _ramp)
+        held -= series.mixed(self.segments, self.before, _ramp)
         return held
 
     def by_offset(self, series: _Series) -> Array:
@@ -180,8 +171,8 @@ class _Place:
         below = series.below(self.place)
         slope = series.at(self.segments, below + 1) - series.at(self.segments, below)
         if self.name == "command":
-            risen = 1.0 - (1.0 - (self.place - below)) / RAMP
-            slope = slope * (((risen > 0.0) & (risen < 1.0)) / RAMP)[..., None]
+            risen = 1.0 - (1.0 - (self.place - below)) / RAMP_SHARE
+            slope = slope * (((risen > 0.0) & (risen < 1.0)) / RAMP_SHARE)[..., None]
         moved = np.zeros((*slope.shape, len(self.reading.offsets)))
         moved[..., self.clock] = -self.reading.rate * slope
         if self.name == "body_rate":
@@ -190,8 +181,8 @@ class _Place:
         return moved
 
 
-def _risen(share: Array) -> Array:
-    return np.clip(1.0 - (1.0 - share) / RAMP, 0.0, 1.0)
+def _ramp(share: Array) -> Array:
+    return np.clip(1.0 - (1.0 - share) / RAMP_SHARE, 0.0, 1.0)
 
 
 class _Series:
@@ -217,12 +208,9 @@ class _Series:
         return rows.reshape(*row.shape, *self.rest)
 
     def mixed(
-        self,
-        segments: NDArray[np.intp],
-        place: Array,
-        share_of: Callable[[Array], Array],
+        self, segments: NDArray[np.intp], place: Array, share_of: Callable[[Array], Array]
     ) -> Array:
-        """Return what lies between the samples before and after places."""
+        """Return values between the samples before and after places."""
         below = self.below(place)
         first, second = self.at(segments, below), self.at(segments, below + 1)
         share = share_of(place - below)
@@ -234,13 +222,8 @@ class _Series:
         return second
 
 
-def at_stamps(
-    channel: Array,
-    name: str,
-    time: Array,
-    reading: Reading,
-) -> Array:
-    """Return what a recording of a simulation (F, samples, c) would hold at stamps (F, n)."""
+def at_stamps(channel: Array, name: str, time: Array, reading: Reading) -> Array:
+    """Return the values of a simulated channel (F, samples, c) at recorded stamps (F, n)."""
     place = _Place(np.arange(len(time)), time, name, reading)
     return place.read(_Series(channel)) + place.bias
 
@@ -269,16 +252,15 @@ def _rotation_program() -> Program:
     )
 
 
-CHAOTIC = 1e6
-"""Root mean square derivative of a channel by a step of the search, in (scaled) standard
-deviations, beyond which it says nothing: where a simulated vehicle tumbles, derivatives grow a
-million millionfold, and the straight line that they draw ends before the smallest step."""
+MAX_DERIVATIVE = 1e6
+"""Largest root mean square derivative of a channel by a step of the search, in (scaled) standard
+deviations. A tumbling vehicle has a millionfold of it, and linearity ends before any step."""
 ROWS_AT_ONCE = 1024
-"""Residuals whose products are summed up by one call of BLAS: few enough for one thread, so that
-sums do not depend on how many there are."""
+"""Residuals in one call of BLAS: few enough for one thread, so that sums do not depend on their
+number."""
 
 
-def robust(error: Array, limit: float) -> Array:
+def huber_loss(error: Array, limit: float) -> Array:
     """Return Huber's loss of an error: its square, growing linearly beyond a limit."""
     size = np.abs(error)
     beyond = size > limit
@@ -290,7 +272,7 @@ def robust(error: Array, limit: float) -> Array:
 def gauss_newton(columns: Array, scaled: Array, scale: Array, huber: float) -> tuple[Array, Array]:
     """Return gradient (F, Q) and Gauss-Newton Hessian (F, Q, Q) of one channel's robust loss.
 
-    Zero where the derivatives are `CHAOTIC`.
+    Zero where the derivatives exceed `MAX_DERIVATIVE`.
 
     Parameters
     ----------
@@ -299,7 +281,7 @@ def gauss_newton(columns: Array, scaled: Array, scale: Array, huber: float) -> t
     scaled, scale
         (F, n, k) residuals, and the (F,) by which they were divided.
     huber
-        As for `robust`.
+        As for `huber_loss`.
     """
     segments, size = columns.shape[0], columns.shape[-1]
     root = np.sqrt(huber_weights(scaled, huber))
@@ -312,16 +294,13 @@ def gauss_newton(columns: Array, scaled: Array, scale: Array, huber: float) -> t
         some = rows[:, first : first + ROWS_AT_ONCE]
         gradient += np.einsum("fr,frq->fq", error[:, first : first + ROWS_AT_ONCE], some)
         hessian += np.swapaxes(some, 1, 2) @ some
-    chaotic = ~is_steady(hessian, rows.shape[1])
+    chaotic = ~is_informative(hessian, rows.shape[1])
     if chaotic.any():
         gradient[chaotic], hessian[chaotic] = 0.0, 0.0
     return gradient, hessian
 
 
-def is_steady(hessian: Array, rows: int) -> NDArray[np.bool_]:
-    """Return whether the derivatives that Hessians (..., Q, Q) of so many rows sum up say anything.
-
-    See `CHAOTIC`.
-    """
+def is_informative(hessian: Array, rows: int) -> NDArray[np.bool_]:
+    """Return whether derivatives are within `MAX_DERIVATIVE`, by Hessians (..., Q, Q) of rows."""
     largest = np.diagonal(hessian, axis1=-2, axis2=-1).max(axis=-1, initial=0.0)
-    return np.asarray(largest <= CHAOTIC**2 * max(rows, 1))
+    return np.asarray(largest <= MAX_DERIVATIVE**2 * max(rows, 1))

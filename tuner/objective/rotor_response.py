@@ -1,4 +1,4 @@
-"""The rotor speeds that follow recorded commands, by the simulator's own curve and lag."""
+"""Rotor speeds in response to recorded commands, by the simulator's own curve and lag."""
 
 from __future__ import annotations
 
@@ -19,43 +19,43 @@ from tuner.objective.simulation import CODE
 
 
 @dataclass(frozen=True)
-class Lags:
-    """How rotors follow commands.
+class MotorLags:
+    """Time constants and delay of rotors.
 
     Attributes
     ----------
     up, down
         s, time constants.
-    late
+    delay
         s from a command to its effect.
     """
 
     up: float
     down: float
-    late: float
+    delay: float
 
     @property
     def coordinates(self) -> Array:
         """Logarithms of the time constants, and the latency in s."""
-        return np.array([np.log(self.up), np.log(self.down), self.late])
+        return np.array([np.log(self.up), np.log(self.down), self.delay])
 
     @staticmethod
-    def at(coordinates: Array) -> Lags:
+    def at(coordinates: Array) -> MotorLags:
         """Return the lags of some coordinates."""
-        up, down, late = coordinates
-        return Lags(float(np.exp(up)), float(np.exp(down)), float(late))
+        up, down, delay = coordinates
+        return MotorLags(float(np.exp(up)), float(np.exp(down)), float(delay))
 
 
-def rotor_speeds(command: Array, step: float, motor: Motor, lags: Lags) -> Array:
+def rotor_speeds(command: Array, step: float, motor: Motor, lags: MotorLags) -> Array:
     """Return (n, 4) rad/s at the times of commands (n, 4), settled at the first one.
 
     A command holds until the next, ``step`` s later: over each step its mean is followed.
     """
     time = np.arange(len(command)) * step
-    late = time - lags.late
+    delay = time - lags.delay
     held = np.vstack([np.zeros(command.shape[1]), np.cumsum(command[:-1], axis=0)]) * step
-    total = np.column_stack([np.interp(late, time, column) for column in held.T])
-    total += np.minimum(late, 0.0)[:, None] * command[0]
+    total = np.column_stack([np.interp(delay, time, column) for column in held.T])
+    total += np.minimum(delay, 0.0)[:, None] * command[0]
     mean = np.diff(total, axis=0) / step
     lagging = eqx.tree_at(
         lambda m: (m.time_constant_up, m.time_constant_down), motor, (lags.up, lags.down)
@@ -71,7 +71,7 @@ def rotor_speeds(command: Array, step: float, motor: Motor, lags: Lags) -> Array
 
 
 def _followed(given: Any, _: Mapping[str, int]) -> tuple[Any, Any]:
-    """Return the speed that one rotor's first command asks for, and (turns,) those that follow."""
+    """Return one rotor's steady speed at its first command, and its later speeds (turns,)."""
     (motor, step), command = given
     lag, begun = Lag.over(motor, step), reference_speed(motor, command[0])
 

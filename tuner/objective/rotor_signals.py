@@ -1,9 +1,8 @@
-"""What was recorded of the rotors, held against the vehicle file.
+"""Recorded rotor signals compared with the vehicle file.
 
 A multirotor's angular acceleration is its rotors' torque over its inertia, and their mean lift its
-weight. That tells how well recorded commands or speeds explain how the vehicle turned, in which
-order their columns stand and how the rotors spin, in which unit speeds are, and which commands make
-a thrust and torque that was commanded.
+weight. This shows how well recorded commands or speeds explain the turning, the order of their
+columns, the rotors' spins, the unit of speeds, and the commands of a commanded thrust and torque.
 """
 
 from __future__ import annotations
@@ -31,26 +30,26 @@ from tuner.vehicle.motor_orders import columns_of
 
 Source = Literal["command", "rotor_speed"]
 
-FASTEST = 250.0
-"""Hz at which signals are compared, at most."""
-LATEST = 0.06
-"""s by which a turn may follow a command: lag, latency and clocks."""
-SMOOTHED = 3
+MAX_RATE_HZ = 250.0
+"""Largest rate at which signals are compared."""
+MAX_DELAY_S = 0.06
+"""Largest delay of turning behind commands: lag, latency and clocks."""
+SMOOTHING_SAMPLES = 3
 """Samples over which both are averaged against noise."""
-FEWEST = 100
-"""Samples below which nothing is said."""
+MIN_SAMPLES = 100
+"""Least number of samples of a comparison."""
 
 
 @dataclass(frozen=True)
 class TorqueCorrelation:
-    """What the rotors explain of a flight's angular acceleration.
+    """Correlation of the rotors' torque with a flight's angular acceleration.
 
     Attributes
     ----------
     source
-        What was recorded of the rotors.
+        The recorded rotor signal.
     correlation
-        About body x, y and z, at the delay at which roll and pitch together are met best.
+        About body x, y and z, at the best delay of roll and pitch together.
     rate, gyro_rate
         Hz at which the rotors and the gyro were logged.
     """
@@ -66,8 +65,10 @@ class TorqueCorrelation:
         return 0.5 * (self.correlation[0] + self.correlation[1])
 
 
-def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> TorqueCorrelation | None:
-    """Return what a recorded signal of the rotors explains; None if too little was recorded."""
+def torque_correlation(
+    flight: Flight, vehicle: VehicleFile, source: Source
+) -> TorqueCorrelation | None:
+    """Return the torque correlation of a rotor signal; None if too little was recorded."""
     if not flight.has(source) or "body_rate" not in flight.series:
         return None
     read = _turning(flight.series, vehicle, source, (0.0, flight.duration))
@@ -82,7 +83,7 @@ def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> TorqueCor
             late, early = turning[:delay], torque[-delay:]
         return _correlations(late - late.mean(axis=0), early - early.mean(axis=0))
 
-    found = (after(delay) for delay in range(-1, max(1, round(LATEST / step)) + 1))
+    found = (after(delay) for delay in range(-1, max(1, round(MAX_DELAY_S / step)) + 1))
     best = max(found, key=lambda correlation: correlation[0] + correlation[1]).tolist()
     rates = flight.series[source].rate, flight.series["body_rate"].rate
     return TorqueCorrelation(source, (best[0], best[1], best[2]), *rates)
@@ -91,18 +92,17 @@ def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> TorqueCor
 def _turning(
     series: Mapping[str, Series], vehicle: VehicleFile, source: Source, span: tuple[float, float]
 ) -> tuple[float, Array, Array] | None:
-    """Return the s from sample to sample, and two signals over what both cover of a span in s.
+    """Return step in s, angular acceleration (n, 3), rad/s², and squared rotor speeds (n, rotors).
 
-    Angular acceleration (n, 3) in rad/s², and squared rotor speeds (n, rotors), (rad/s)², at the
-    gyro's rate; None if too little was recorded.
+    They have the gyro's rate, over the common part of a span in s; None if that is too short.
     """
     gyro, rotors = series["body_rate"], series[source]
-    rate = min(FASTEST, gyro.rate)
+    rate = min(MAX_RATE_HZ, gyro.rate)
     begin = max(span[0], gyro.time[0], rotors.time[0])
     end = min(span[1], gyro.time[-1], rotors.time[-1])
     count = int((end - begin) * rate)
     known = [bool(np.isfinite(signal.values).any(axis=0).all()) for signal in (gyro, rotors)]
-    if count < FEWEST or not all(known):
+    if count < MIN_SAMPLES or not all(known):
         return None
     clock = begin + np.arange(count) / rate
     step = float(clock[1] - clock[0])
@@ -131,7 +131,7 @@ def levers(vehicle: VehicleFile) -> Array:
 
 
 def _smoothed(values: Array) -> Array:
-    kernel = np.ones(SMOOTHED) / SMOOTHED
+    kernel = np.ones(SMOOTHING_SAMPLES) / SMOOTHING_SAMPLES
     return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
 
 
@@ -141,23 +141,23 @@ def _correlations(turning: Array, torque: Array) -> Array:
     return np.asarray((turning * torque).sum(axis=0) / np.maximum(size, 1e-300))
 
 
-LAGS = (0.005, 0.015, 0.03, 0.06)
-"""s of the rotors' lag that are tried."""
-LATEST_STAMP = 0.4
-"""s by which stamps may be late or early."""
-SLOW = 2.0
-"""Hz below which turns are left out."""
-ENOUGH = 0.4
-"""Correlation about roll and pitch from which an order is believed."""
-SETTLED = 40.0
-"""Lags after which a rotor has followed, to the last digit."""
-CLEARER = 0.3
-"""By how much the next best order must be less alike."""
+TRIED_LAGS_S = (0.005, 0.015, 0.03, 0.06)
+"""Lags of rotors that are tried."""
+MAX_STAMP_ERROR_S = 0.4
+"""Largest error of stamps that is tried, either way."""
+HIGH_PASS_HZ = 2.0
+"""Frequency below which turning is filtered out: drag has a part in it."""
+MIN_CORRELATION = 0.4
+"""Least correlation about roll and pitch of an accepted order."""
+RESPONSE_LAGS = 40.0
+"""Length of a rotor's impulse response, in lags: to the last digit."""
+MIN_LEAD = 0.3
+"""Least difference of correlation to the next best order."""
 
 
 @dataclass(frozen=True)
 class MotorOrder:
-    """How recorded columns stand to the rotors of a vehicle file.
+    """The assignment of recorded columns to the rotors of a vehicle file.
 
     Attributes
     ----------
@@ -182,10 +182,7 @@ class MotorOrder:
 
 
 def motor_order(
-    series: Mapping[str, Series],
-    vehicle: VehicleFile,
-    source: Source,
-    span: tuple[float, float],
+    series: Mapping[str, Series], vehicle: VehicleFile, source: Source, span: tuple[float, float]
 ) -> MotorOrder | None:
     """Return which rotor each recorded column drives; None where the recording does not show it.
 
@@ -194,26 +191,29 @@ def motor_order(
     series
         Signals, among them ``body_rate`` and the source.
     vehicle
-        Where its rotors sit, and how they spin.
+        Gives the rotors' places and spins.
     source
-        What was recorded of the rotors.
+        The recorded rotor signal.
     span
-        s of the flight.
+        Begin and end of the flight in s.
     """
     read = _quick_turning(series, vehicle, source, span)
     if read is None:
         return None
     _, turning, lagged = read
     arms = levers(vehicle)
-    alike_of = {
+    correlation_of = {
         order: max(min(_correlations(turning, x @ arms[list(order)])[:2]) for x in lagged)
         for order in permutations(range(4))
     }
-    best, second = sorted(alike_of, key=alike_of.__getitem__, reverse=True)[:2]
-    if alike_of[best] < ENOUGH or alike_of[second] > alike_of[best] - CLEARER:
+    best, second = sorted(correlation_of, key=correlation_of.__getitem__, reverse=True)[:2]
+    if (
+        correlation_of[best] < MIN_CORRELATION
+        or correlation_of[second] > correlation_of[best] - MIN_LEAD
+    ):
         return None
     yaw = max((_correlations(turning, x @ arms[list(best)])[2] for x in lagged), key=abs)
-    return MotorOrder(best, bool(yaw < 0.0) if abs(yaw) > ENOUGH else None)
+    return MotorOrder(best, bool(yaw < 0.0) if abs(yaw) > MIN_CORRELATION else None)
 
 
 def lateness(
@@ -225,7 +225,7 @@ def lateness(
     """Return by how many s a signal of the rotors is stamped later than the turning it makes.
 
     Zero where it follows as rotors do, or where that is not seen: the correlation has to rise by
-    `CLEARER` above that without a delay, and above that of any delay with the opposite sign, which
+    `MIN_LEAD` above that without a delay, and above that of any delay with the opposite sign, which
     of a periodic motion is as large. Parameters as of `motor_order`.
     """
     read = _quick_turning(series, vehicle, source, span)
@@ -242,11 +242,11 @@ def lateness(
         )
         return float(max(min(axes[:2]) for axes in of_lags))
 
-    most = min(round(LATEST_STAMP / step), count // 4)
+    most = min(round(MAX_STAMP_ERROR_S / step), count // 4)
     found = np.array([alike(delay) for delay in range(-most, most + 1)])
     best, rival = int(found.argmax()), max(found[most], -found.min())
-    clear = found[best] > max(ENOUGH, rival + CLEARER)
-    return float((best - most) * step) if clear and abs(best - most) * step > LATEST else 0.0
+    clear = found[best] > max(MIN_CORRELATION, rival + MIN_LEAD)
+    return float((best - most) * step) if clear and abs(best - most) * step > MAX_DELAY_S else 0.0
 
 
 def _quick_turning(
@@ -257,13 +257,13 @@ def _quick_turning(
 ) -> tuple[float, Array, list[Array]] | None:
     """Return the s between samples, and the quick part of turning (n, 3) and squared speeds.
 
-    The latter (n, 4) for each of `LAGS`; None where too little was recorded.
+    The latter (n, 4) for each of `TRIED_LAGS_S`; None where too little was recorded.
     """
     read = _turning(series, vehicle, source, span)
-    if read is None or len(vehicle.rotors) != 4 or 0.5 / read[0] < 4.0 * SLOW:
+    if read is None or len(vehicle.rotors) != 4 or 0.5 / read[0] < 4.0 * HIGH_PASS_HZ:
         return None
     step, turning, squares = read
-    lagged = [_without_slow(_lagged(squares, step, lag), step) for lag in LAGS]
+    lagged = [_without_slow(_lagged(squares, step, lag), step) for lag in TRIED_LAGS_S]
     return step, _without_slow(turning, step), lagged
 
 
@@ -286,21 +286,16 @@ def order_findings(
 
 
 def columns_of_rotors(vehicle: VehicleFile, notes: Sequence[Note]) -> list[int] | None:
-    """Return the recorded column, from 0, of each rotor, where only the vehicle file says it.
+    """Return the recorded column, from 0, of each rotor by the vehicle file.
 
-    Parameters
-    ----------
-    vehicle
-        Whose file may say in which order its recordings are.
-    notes
-        Of the recording, whose topic map may have said it, and then was read so.
+    None if it gives no order, or by ``notes`` the recording's topic map had one when it was read.
     """
-    said = any(note.code is NoteCode.MOTOR_ORDER_GIVEN for note in notes)
-    return None if said or vehicle.motor_order is None else columns_of(vehicle.motor_order)
+    mapped = any(note.code is NoteCode.MOTOR_ORDER_GIVEN for note in notes)
+    return None if mapped or vehicle.motor_order is None else columns_of(vehicle.motor_order)
 
 
 def in_rotor_order(series: Mapping[str, Series], columns: list[int]) -> dict[str, Series]:
-    """Return signals with what was recorded of motors in the order of the rotors."""
+    """Return signals with the columns of motors in the order of the rotors."""
     return {
         name: Series(of.time, of.values[:, columns]) if name in PER_MOTOR else of
         for name, of in series.items()
@@ -323,15 +318,15 @@ def flight_in_rotor_order(flight: Flight, vehicle: VehicleFile) -> Flight:
 
 
 def _without_slow(values: Array, step: float) -> Array:
-    """Return (n, k) values without the turns in which drag has a part: those of laps.
+    """Return (n, k) values after a Butterworth high pass of second order, without delay.
 
-    By Butterworth's high pass of second order, forwards and backwards, and so without delay.
+    Forwards and backwards; it removes the slow turning of laps, in which drag has a part.
     """
-    edge = min(round(1.0 / SLOW / step), len(values) - 1)
+    edge = min(round(1.0 / HIGH_PASS_HZ / step), len(values) - 1)
     before = 2.0 * values[0] - values[edge:0:-1]
     behind = 2.0 * values[-1] - values[-2 : -edge - 2 : -1]
     spectrum = np.fft.rfft(np.concatenate([before, values, behind]), axis=0)
-    share = (np.fft.rfftfreq(len(values) + 2 * edge, step) / SLOW) ** 4
+    share = (np.fft.rfftfreq(len(values) + 2 * edge, step) / HIGH_PASS_HZ) ** 4
     filtered = np.fft.irfft(
         spectrum * (share / (1.0 + share))[:, None], len(values) + 2 * edge, axis=0
     )
@@ -339,9 +334,9 @@ def _without_slow(values: Array, step: float) -> Array:
 
 
 def _lagged(squares: Array, step: float, lag: float) -> Array:
-    """Return squared speeds (n, 4) as rotors of a lag in s follow them, settled at the first."""
+    """Return squared speeds (n, 4) after a first-order lag in s, settled at the first."""
     decay = np.exp(-step / lag)
-    response = (1.0 - decay) * decay ** np.arange(math.ceil(SETTLED * lag / step))
+    response = (1.0 - decay) * decay ** np.arange(math.ceil(RESPONSE_LAGS * lag / step))
     late = [np.convolve(column - column[0], response)[: len(squares)] for column in squares.T]
     return _smoothed(squares[0] + np.stack(late, axis=-1))
 
@@ -382,8 +377,8 @@ def with_commands(flight: Flight, vehicle: VehicleFile) -> Flight:
 def commands_of(wrench: Array, vehicle: VehicleFile) -> Array:
     """Return commands (n, 4) of thrust in N and torque in N m (n, 4), body FLU.
 
-    They are above 1 where the vehicle file's rotors are too weak for what was commanded. The signs
-    of a quad-X's rotors, which a vehicle file must have, make the matrix regular.
+    They are above 1 where the vehicle file's rotors are too weak. The matrix is regular: a vehicle
+    file has the signs of a quad-X's rotors.
     """
     shares = np.vstack([np.ones(4), levers(vehicle).T])
     lift = np.maximum(wrench @ np.linalg.inv(shares).T, 0.0)
@@ -395,15 +390,15 @@ def commands_of(wrench: Array, vehicle: VehicleFile) -> Array:
     return np.asarray(np.maximum(shifted - motor.input_offset, 0.0))
 
 
-CARRIES = 1.25
-"""Times the weight that commands may lift, or less, in their unit."""
+WEIGHT_TOLERANCE = 1.25
+"""Largest factor between lift and weight, either way, of commands in the right unit."""
 
 
-def lifts_as_dshot(flight: Flight, vehicle: VehicleFile) -> tuple[float, float] | None:
-    """Return what commands lift as pulses and as DShot, over the weight, where that is in doubt.
+def dshot_lift(flight: Flight, vehicle: VehicleFile) -> tuple[float, float] | None:
+    """Return the lift over weight of commands as pulses and as DShot, where the unit is in doubt.
 
-    Between 1000 and 2000 nothing else tells the two apart. None where commands were not taken for
-    pulses by their range, or pulses carry the vehicle, or better than DShot does.
+    Values between 1000 and 2000 may be either. None where commands were not read as pulses by their
+    range, or lift as pulses is near the weight, or nearer than as DShot.
     """
     read = ("command", UNIT_PHRASES["pwm_us"])
     if not any(n.code is NoteCode.UNIT_READ and n.names == read for n in flight.notes):
@@ -415,13 +410,13 @@ def lifts_as_dshot(flight: Flight, vehicle: VehicleFile) -> tuple[float, float] 
         for u in (pulses, to_si(1e3 * (1.0 + pulses), "dshot"))
     )
     off = abs(math.log(lift))
-    return (lift, other) if off > max(abs(math.log(other)), math.log(CARRIES)) else None
+    return (lift, other) if off > max(abs(math.log(other)), math.log(WEIGHT_TOLERANCE)) else None
 
 
 SPEED_UNITS = {"si": "in rad/s", "rpm": "in revolutions a minute", "hz": "in revolutions a second"}
 """Units that rotor speeds come in, and how a sentence calls them."""
-NEAR = math.sqrt(6.0)
-"""Times that a speed may be off what the vehicle file says: units lie over its square apart."""
+UNIT_TOLERANCE = math.sqrt(6.0)
+"""Largest ratio of recorded to expected speed in the right unit: units differ by its square."""
 
 
 def with_speeds_in_si(flight: Flight, vehicle: VehicleFile) -> Flight:
@@ -440,9 +435,11 @@ def with_speeds_in_si(flight: Flight, vehicle: VehicleFile) -> Flight:
     factors = {unit: UNITS[unit][0] / UNITS[assumed][0] for unit in SPEED_UNITS}
 
     def fits(unit: str) -> bool:
-        fastest = NEAR * vehicle.motor.max_rotor_velocity
+        fastest = UNIT_TOLERANCE * vehicle.motor.max_rotor_velocity
         slow_enough = float(np.nanmedian(flight.signals["rotor_speed"])) * factors[unit] < fastest
-        return slow_enough and all(1 / NEAR < ratio * factors[unit] < NEAR for ratio in ratios)
+        return slow_enough and all(
+            1 / UNIT_TOLERANCE < ratio * factors[unit] < UNIT_TOLERANCE for ratio in ratios
+        )
 
     if not ratios or fits(assumed):
         return flight
@@ -464,7 +461,7 @@ def with_speeds_in_si(flight: Flight, vehicle: VehicleFile) -> Flight:
 
 
 def _ratios(flight: Flight, vehicle: VehicleFile) -> list[float]:
-    """Return how many times too fast the rotors turn, by the weight and by the commands."""
+    """Return recorded over expected rotor speeds, by the weight and by the commands."""
     speeds = flight.signals["rotor_speed"]
     squares = float(np.nanmedian(np.square(speeds)))
     hover = vehicle.mass * GRAVITY / (len(vehicle.rotors) * vehicle.aerodynamics.motor_constant)

@@ -1,4 +1,4 @@
-"""Flights as arrays of one shape: what is flown, what was measured, and how much it weighs."""
+"""Flights and windows as arrays of one shape: inputs, measurements and weights."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from tuner.objective.battery import log_voltage_of
 from tuner.objective.initial_conditions import (
     freedom_of,
     freedom_of_spin,
+    is_at_rest,
     recent_command,
-    rests,
     start_of,
 )
 from tuner.objective.inlets import INLETS, inlet_of
-from tuner.objective.noise import repeats
+from tuner.objective.noise import repeat_counts
 from tuner.objective.windows import Window, windows_of
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_position_error
@@ -45,10 +45,10 @@ CLOCK_OF = {
     "acceleration": 1,
 }
 
-#: What comparisons are made of, whether or not it is fed in.
+#: Channels that are compared even where they are fed in.
 POSE = ("position", "attitude")
 
-#: What a recording may get wrong by a constant: its clocks, in s, and its gyro, in rad/s.
+#: Constant errors of a recording: offsets of its clocks, s, and biases of its gyro, rad/s.
 OFFSETS = tuple(recording_offsets())
 
 
@@ -91,11 +91,11 @@ class Segments(eqx.Module):
     log_voltage: Float[Array, "ticks F"] | None = None
     """Logarithm of the battery's voltage in V, one a control tick; NaN where it is unknown."""
     disturbance: Disturbance | None = None
-    """What pushes them, as far as that is known."""
+    """Known forces and moments of disturbances."""
     freedom: Float[Array, "L F"] | None = None
-    """Standard deviations of what is free of the start; None if it is known."""
+    """Prior standard deviations of the free rows of a start; None if none is free."""
     freed: tuple[int, ...] = eqx.field(static=True, default=())
-    """What that is: L rows of a whole start's (`tuner.objective.initial_conditions`)."""
+    """The L free rows of a start (`tuner.objective.initial_conditions`)."""
 
     @property
     def windowed(self) -> bool:
@@ -109,7 +109,7 @@ class Segments(eqx.Module):
 
     @property
     def count(self) -> int:
-        """How many segments there are."""
+        """Number of segments."""
         return self.flight.shape[0]
 
 
@@ -122,7 +122,7 @@ def segments_of(
 ) -> Segments:
     """Lay whole flights side by side for the ``reference`` inlet.
 
-    What a spin does not forget is free at its start: see `freedom_of_spin`.
+    A spin has a free initial state: see `freedom_of_spin`.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def segments_of(
     noise
         Channel -> standard deviation in its unit (attitude: rad). Channels not named are left out.
     schedule
-        On whose control ticks the battery's voltage is laid out.
+        Rates of the control ticks, at which the battery's voltage is laid out.
     weights
         Flight name -> channel -> factor on the residuals.
 
@@ -140,7 +140,7 @@ def segments_of(
     RecordingError
         A flight holds no reference.
     """
-    silent = INLETS["reference"].silences
+    silent = INLETS["reference"].not_compared
     noise = {channel: sigma for channel, sigma in noise.items() if channel not in silent}
     for flight in flights:
         if not flight.has("reference_position"):
@@ -149,7 +149,7 @@ def segments_of(
                 "holds no reference and none is named",
                 "name its trajectory in the job file, or fit through another inlet",
             )
-    inlet = INLETS["reference"].lay(flights, schedule)
+    inlet = INLETS["reference"].lay_out(flights, schedule)
     assert isinstance(inlet, ReferenceInlet)
     freed = {}
     if bool(np.any(inlet.spins)):
@@ -162,14 +162,14 @@ def segments_of(
         start=start_of([flight.initial for flight in flights]),
         measured={name: _measured(flights, name, sd, weights) for name, sd in noise.items()},
         flight=np.arange(len(flights)),
-        resting=np.asarray([rests(flight.initial) for flight in flights]),
+        resting=np.asarray([is_at_rest(flight.initial) for flight in flights]),
         log_voltage=log_voltage_of(flights, [Window(flight, 0.0) for flight in flights], schedule),
         freedom=np.asarray(np.stack(list(freed.values()))) if freed else None,
         freed=tuple(freed),
     )
 
 
-class Piece(NamedTuple):
+class FlightWindow(NamedTuple):
     """A window of one of some flights.
 
     Attributes
@@ -177,9 +177,9 @@ class Piece(NamedTuple):
     number
         Of its flight.
     window
-        As it was recorded.
+        As recorded.
     flight
-        What is fed in of it on the clock of what it is compared with.
+        The window with its inputs on the clock of the compared channels.
     """
 
     number: int
@@ -187,7 +187,7 @@ class Piece(NamedTuple):
     flight: Flight
 
 
-def pieces_of(
+def cut_windows(
     flights: Sequence[Flight],
     *,
     inlets: Sequence[InletName],
@@ -195,7 +195,7 @@ def pieces_of(
     stride: float | None = None,
     free_starts: bool = True,
     input_late: Mapping[str, float] = MappingProxyType({}),
-) -> list[Piece]:
+) -> list[FlightWindow]:
     """Cut flights into the windows that `window_segments` lays out, with parameters as there."""
     pieces = []
     for number, (flight, name) in enumerate(zip(flights, inlets, strict=True)):
@@ -204,7 +204,9 @@ def pieces_of(
             flight, seconds, fed=fed, stride=stride, smoothed_widely=free_starts
         ):
             own = INLETS[name].fed(window.flight)
-            pieces.append(Piece(number, window, on_time(window.flight, own, late)))
+            pieces.append(
+                FlightWindow(number, window, with_earlier_stamps(window.flight, own, late))
+            )
     return pieces
 
 
@@ -220,7 +222,7 @@ def window_segments(
     stride: float | None = None,
     free_starts: bool = True,
     input_late: Mapping[str, float] = MappingProxyType({}),
-    pieces: Sequence[Piece] | None = None,
+    pieces: Sequence[FlightWindow] | None = None,
 ) -> Segments:
     """Lay the windows of all flights side by side.
 
@@ -229,12 +231,11 @@ def window_segments(
     flights
         N flights.
     inlets, schedule
-        What is fed in of each flight, and when.
+        Inlet of each flight, and the rates of the loop.
     seconds
         s, length of a window.
     lag
-        s after which a rotor has followed its command: gives the speed of those without tachometer
-        at a start.
+        Time constant of rotors, s: gives the initial speed of those without tachometer.
     noise, weights
         As of `segments_of`.
     stride
@@ -243,12 +244,12 @@ def window_segments(
         Whether starts are free, about the widely smoothed state; else they are the recorded states
         (`tuner.recordings.states`).
     input_late
-        Flight name -> s by which what is fed in is stamped later than what it is compared with.
+        Flight name -> s by which inputs are stamped later than the compared channels.
     pieces
-        The windows, where `pieces_of` has cut them already.
+        The windows, if `cut_windows` has cut them already.
     """
     if pieces is None:
-        pieces = pieces_of(
+        pieces = cut_windows(
             flights,
             inlets=inlets,
             seconds=seconds,
@@ -267,10 +268,11 @@ def window_segments(
     compared = {
         channel: sigma
         for channel, sigma in noise.items()
-        if channel in POSE or any(channel not in INLETS[name].silences for name in inlets)
+        if channel in POSE or any(channel not in INLETS[name].not_compared for name in inlets)
     }
     weights = {
-        flight.name: dict(weights.get(flight.name, {})) | dict.fromkeys(INLETS[name].silences, 0.0)
+        flight.name: dict(weights.get(flight.name, {}))
+        | dict.fromkeys(INLETS[name].not_compared, 0.0)
         for flight, name in zip(flights, inlets, strict=True)
     }
     return Segments(
@@ -290,8 +292,8 @@ def window_segments(
     )
 
 
-def on_time(flight: Flight, signals: Sequence[str], late: float) -> Flight:
-    """Return a flight some of whose signals are stamped earlier by so many s."""
+def with_earlier_stamps(flight: Flight, signals: Sequence[str], late: float) -> Flight:
+    """Return a flight with the stamps of some signals moved to earlier by ``late`` s."""
     if late == 0.0:
         return flight
     moved = {
@@ -307,7 +309,7 @@ def _measured(
     sigma: float,
     weights: Mapping[str, Mapping[str, float]],
 ) -> Measured:
-    """Return a channel of all flights, in their time, behind the end zero; level, an attitude."""
+    """Return a channel of all flights, padded with zeros, or with a level attitude."""
     width = 4 if channel in ("attitude", "rotor_speed", "command") else 3
     first = 1 if channel == "attitude" else 0
     nothing = Series(np.zeros(0), np.zeros((0, width)))
@@ -322,7 +324,7 @@ def _measured(
         finite, length = np.isfinite(series.values), len(series.time)
         scale = finite * (weights.get(flight.name, {}).get(channel, 1.0) / sigma)
         if channel == "command":
-            scale = scale / np.sqrt(repeats(series.values))
+            scale = scale / np.sqrt(repeat_counts(series.values))
         time[:length, number] = series.time
         values[:length, :, number] = np.where(finite, series.values, 0.0)
         weight[:length, :, number] = scale[:, first:]

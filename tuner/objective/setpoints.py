@@ -1,9 +1,9 @@
-"""What was flown, held against the controller file: set-points computed from the recorded state.
+"""Recorded rate set-points compared with those of the controller file.
 
 Position and attitude control are functions of reference and state. Both were recorded, so that the
-controller file says which rate set-points they make; the recorded ones tell by what factor, how
-late and how far off they are. A wrong law or gain shows as a factor; an axis that was commanded
-otherwise, or another controller, as no likeness at all.
+controller file's set-points can be computed; the recorded ones differ by a gain, a delay and a
+bias. A wrong law or gain shows as a factor; another controller, or an axis with other commands, has
+no correlation.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ from tuner.recordings.flight import Flight, Series
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.model import controller_of
 
-POINTS = 1024
-"""Set-points that are looked at, spread over a flight."""
-LATENCIES = np.arange(0.0, 0.0801, 0.004)
-"""s by which the state that a controller sees may be old."""
-ALIKE = 0.5
-"""Correlation below which recorded set-points are not those of the controller file."""
-FACTOR = 1.4
-"""Ratio of recorded to computed set-points beyond which a gain or law is doubted."""
-LATE = 0.04
-"""s of delay that are worth a word: twice what cameras, network and estimator usually take."""
-OFF = 0.05
-"""rad/s of steady difference that is worth a word."""
-MOVES = 0.05
-"""rad/s of spread below which an axis was not commanded."""
+COMPARED_SETPOINTS = 1024
+"""Set-points compared, spread over a flight."""
+LATENCIES_S = np.arange(0.0, 0.0801, 0.004)
+"""Ages of the state in the controller that are tried."""
+MIN_CORRELATION = 0.5
+"""Least correlation of recorded set-points with those of the controller file."""
+MAX_GAIN_RATIO = 1.4
+"""Ratio of recorded to computed set-points beyond which a wrong gain or law is reported."""
+MIN_REPORTED_DELAY_S = 0.04
+"""Least reported delay: twice the usual one of cameras, network and estimator."""
+MIN_REPORTED_BIAS = 0.05
+"""Least reported bias, rad/s."""
+MIN_SPREAD = 0.05
+"""Least standard deviation of a commanded axis, rad/s."""
 AXES = ("roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
 class AxisMatch:
-    """How the recorded rate set-points of an axis stand to the computed ones.
+    """Comparison of an axis' recorded rate set-points with the computed ones.
 
     Attributes
     ----------
@@ -75,36 +75,36 @@ class AxisMatch:
 
 @dataclass(frozen=True)
 class SetpointMatch:
-    """How the recorded rate set-points of a flight stand to the computed ones.
+    """Comparison of a flight's recorded rate set-points with the computed ones.
 
     Attributes
     ----------
     axes
         Roll, pitch, yaw.
-    late
-        s, age of the recorded state that they answer, as roll and pitch show it.
+    delay
+        s, age of the recorded state in the controller, by roll and pitch.
     """
 
     axes: tuple[AxisMatch, ...]
-    late: float
+    delay: float
 
     @property
     def is_ours(self) -> bool:
         """Whether roll and pitch, where they were commanded, follow from the controller file."""
-        tilting = [axis for axis in self.axes[:2] if axis.spread > MOVES]
-        return all(axis.correlation > ALIKE and axis.gain > 0.0 for axis in tilting)
+        tilting = [axis for axis in self.axes[:2] if axis.spread > MIN_SPREAD]
+        return all(axis.correlation > MIN_CORRELATION and axis.gain > 0.0 for axis in tilting)
 
     @property
     def heading_is_ours(self) -> bool:
         """Whether yaw, if it was commanded, follows from it too."""
         yaw = self.axes[2]
-        return yaw.spread < 2.0 * MOVES or yaw.correlation > ALIKE
+        return yaw.spread < 2.0 * MIN_SPREAD or yaw.correlation > MIN_CORRELATION
 
 
 def match_setpoints(flight: Flight, controller: ControllerFile) -> SetpointMatch | None:
-    """Return how recorded rate set-points follow from reference and state; None without them.
+    """Return the comparison of recorded with computed rate set-points; None without signals.
 
-    A yaw spin is commanded otherwise by design, and is recognised elsewhere.
+    A yaw spin has other commands by design, and is recognised elsewhere: None.
     """
     needed = ("reference_position", "reference_velocity", "rate_setpoint", "position", "attitude")
     if not all(flight.has(name) for name in needed) or flight.yaw_rate_setpoint is not None:
@@ -113,19 +113,19 @@ def match_setpoints(flight: Flight, controller: ControllerFile) -> SetpointMatch
     inside = (recorded.time > 0.2) & (recorded.time < flight.duration - 0.2)
     if inside.sum() < 50:
         return None
-    chosen = np.linspace(0, inside.sum() - 1, POINTS).astype(np.intp)
+    chosen = np.linspace(0, inside.sum() - 1, COMPARED_SETPOINTS).astype(np.intp)
     time, wanted = recorded.time[inside][chosen], recorded.values[inside][chosen]
     matches = (
         SetpointMatch(
-            tuple(_axis(wanted[:, i], computed[:, i]) for i in range(3)), late=float(latency)
+            tuple(_axis(wanted[:, i], computed[:, i]) for i in range(3)), delay=float(latency)
         )
-        for latency, computed in zip(LATENCIES, _computed(flight, controller, time), strict=True)
+        for latency, computed in zip(LATENCIES_S, _computed(flight, controller, time), strict=True)
     )
     return max(matches, key=lambda match: match.axes[0].correlation + match.axes[1].correlation)
 
 
 def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Finding, ...]:
-    """Return which axes of a flight were commanded with another gain, delay, bias or heading."""
+    """Return findings on another gain, delay, bias or heading of a flight's set-points."""
     match = match_setpoints(flight, controller)
     if match is None:
         return ()
@@ -137,17 +137,20 @@ def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Findi
         return (Finding(Code.SETPOINTS_FOREIGN, "warning", flight.name, correlations),)
     findings = []
     for name, axis in zip(AXES, match.axes, strict=True):
-        if axis.spread < MOVES or axis.correlation < ALIKE:
+        if axis.spread < MIN_SPREAD or axis.correlation < MIN_CORRELATION:
             continue
-        if not 1.0 / FACTOR < axis.gain < FACTOR:
+        if not 1.0 / MAX_GAIN_RATIO < axis.gain < MAX_GAIN_RATIO:
             numbers = {"gain": round(axis.gain, 2), "correlation": round(axis.correlation, 2)}
             names = (name, _guess(axis.gain, controller))
             findings.append(Finding(Code.SETPOINTS_SCALED, "warning", flight.name, numbers, names))
-        elif abs(axis.bias) > OFF:
+        elif abs(axis.bias) > MIN_REPORTED_BIAS:
             numbers = {"bias": round(axis.bias, 3)}
             findings.append(Finding(Code.SETPOINTS_BIASED, "info", flight.name, numbers, (name,)))
-    if match.late > LATE and max(axis.spread for axis in match.axes[:2]) > MOVES:
-        numbers = {"seconds": match.late}
+    if (
+        match.delay > MIN_REPORTED_DELAY_S
+        and max(axis.spread for axis in match.axes[:2]) > MIN_SPREAD
+    ):
+        numbers = {"seconds": match.delay}
         findings.append(Finding(Code.SETPOINTS_LATE, "info", flight.name, numbers))
     if not match.heading_is_ours:
         numbers = {"correlation": round(match.axes[2].correlation, 2)}
@@ -156,7 +159,7 @@ def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Findi
 
 
 def _guess(gain: float, controller: ControllerFile) -> str:
-    """Return what would explain a factor: the other attitude law, or a gain."""
+    """Return the attitude law that would explain a factor; empty for a wrong gain."""
     law = controller.attitude.law
     if law == "quaternion" and abs(gain - 2.0) < 0.3:
         return "rotation_matrix"
@@ -179,12 +182,12 @@ def _axis(recorded: Array, computed: Array) -> AxisMatch:
 
 def _computed(flight: Flight, controller: ControllerFile, time: Array) -> Array:
     """Return the set-points (latencies, n, 3) of the controller file at some times in s."""
-    then = (time[None] - LATENCIES[:, None]).ravel()
+    then = (time[None] - LATENCIES_S[:, None]).ravel()
     state = {
         name: linear_interpolation(flight.series[name], then) for name in ("position", "attitude")
     }
     state["velocity"] = linear_interpolation(_velocity(flight), then)
-    now = np.tile(time, len(LATENCIES))
+    now = np.tile(time, len(LATENCIES_S))
     for name in ("reference_position", "reference_velocity", "reference_acceleration"):
         series = flight.series.get(name)
         held = np.zeros((len(now), 3)) if series is None else zero_order_hold(series, now)
@@ -197,7 +200,7 @@ def _computed(flight: Flight, controller: ControllerFile, time: Array) -> Array:
     name = "rate set-points of a controller file"
     program = program_of(_rates, arguments, name=name, made_of=(), packages=CODE)
     rates: Array = program(given, lanes=len(now)).values
-    return rates.reshape(len(LATENCIES), len(time), 3)
+    return rates.reshape(len(LATENCIES_S), len(time), 3)
 
 
 def _rates(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int]) -> JaxArray:

@@ -1,4 +1,4 @@
-"""Segments simulated by a kernel: how they begin, what is fed in, what a recording would hold.
+"""Simulation of segments by a compiled kernel: initial state, inputs and recorded channels.
 
 The function `_flight` flies one segment; `lanes` flies many side by side. A program belongs to what
 is simulated (inlet, rates, terms, what is compared), not to how many segments there are, how long
@@ -37,25 +37,27 @@ from sim_jax.trim import trimmed_start
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.core.numerics import Array
 from tuner.objective.battery import relative_log_voltage
-from tuner.objective.initial_conditions import ROWS, SPIN, moved, spun_up, trimmed, whole
+from tuner.objective.initial_conditions import (
+    ROWS,
+    SPIN_ROWS,
+    trimmed,
+    with_all_rows,
+    with_change,
+    with_commanded_rotors,
+)
 from tuner.objective.segments import Segments
 from tuner.vehicle import COEFFICIENTS
-from tuner.vehicle.model import (
-    Model,
-    coefficients_in,
-    with_coefficients,
-    with_terms_computed,
-)
+from tuner.vehicle.model import Model, coefficients_in, with_coefficients, with_terms_computed
 
-MOTION, TURNED, SPEEDS, SETPOINTS = "motion", "turned", "speeds", "setpoints"
-"""What no recording holds: the centre of mass's position, velocity and body rate; the body's
-attitude; the rotors' speeds; and the set-points of rate and thrust."""
+MOTION, BODY_ATTITUDE, TRUE_ROTOR_SPEED, SETPOINTS = "motion", "turned", "speeds", "setpoints"
+"""Channels that no recording has: the centre of mass's position, velocity and body rate; the body's
+attitude; the true rotor speeds; and the set-points of rate and thrust."""
 
 LOGGED = (
     *("position", "attitude", "body_rate", "rotor_speed", "command"),
-    *(MOTION, TURNED, SPEEDS, SETPOINTS),
+    *(MOTION, BODY_ATTITUDE, TRUE_ROTOR_SPEED, SETPOINTS),
 )
-"""What every program without derivatives logs; what nobody asks for is not written."""
+"""Channels of every program without derivatives; those that are not requested are not written."""
 EFFECTS = tuple(name for name, row in COEFFICIENTS.items() if row.is_effect)
 TERMS = tuple(name for name in EFFECTS if COEFFICIENTS[name].group)
 """Coefficients beyond the base model, and those of them that a fit may add."""
@@ -64,7 +66,7 @@ CODE = ("sim_jax", "tuner")
 
 
 class Flown(NamedTuple):
-    """What segments are compared by, logged at ``schedule.log_rate``; the pose is the markers'.
+    """Simulated channels at ``schedule.log_rate``; the pose is the markers'.
 
     Attributes
     ----------
@@ -83,7 +85,7 @@ class Flown(NamedTuple):
 
 
 class _Given(NamedTuple):
-    """What a program is given of a model and of one segment."""
+    """Input of a program: a model and one segment."""
 
     model: Model
     coefficients: dict[str, Any]
@@ -114,21 +116,21 @@ def fly(
     segments
         F of them.
     samples
-        How many samples are logged.
+        Number of logged samples.
     coefficients
         Name -> value that replaces the model's: a number, or (F,) each segment's own.
     states
-        (L, F) how far the starts lie from the recorded ones, in the segments' standard deviations.
+        (L, F) deviation of the starts from the recorded ones, in the segments' standard deviations.
     conditions
         Name -> (F,) per-flight conditions, in their units.
     tangents
         Directions along which is differentiated: coefficient or condition -> (Q,), and
         ``"states"`` -> (Q, L). None differentiates by nothing.
     channels
-        What is logged; by default what was measured.
+        Channels to log; by default the measured ones.
     """
     if conditions or {*model.vehicle.effects, *coefficients}.intersection(EFFECTS):
-        model, conditions = _with_all(model, segments, conditions)
+        model, conditions = _with_all_terms(model, segments, conditions)
     names = tuple(segments.measured) if channels is None else channels
     moves = tangents is not None
     # in one order, for it tells programs apart
@@ -137,8 +139,8 @@ def fly(
     own = not moves or any(np.ndim(value) for value in coefficients.values())
     if segments.freedom is None and isinstance(segments.inlet, ReferenceInlet):
         # as flights with a spin have it: one program serves both
-        nothing = np.zeros((len(SPIN), segments.count))
-        segments = replace(segments, freedom=nothing, freed=SPIN)
+        nothing = np.zeros((len(SPIN_ROWS), segments.count))
+        segments = replace(segments, freedom=nothing, freed=SPIN_ROWS)
     if segments.freedom is not None and states is None:
         states = np.zeros((len(segments.freed), segments.count))
     given = _Given(
@@ -181,12 +183,12 @@ def fly(
     )
 
 
-def _with_all(
+def _with_all_terms(
     model: Model, segments: Segments, conditions: Mapping[str, Any]
 ) -> tuple[Model, dict[str, Any]]:
-    """Return model and conditions with all terms, and all that surrounds, at neutral values.
+    """Return model and conditions with all terms and conditions, at neutral values.
 
-    So two programs serve all that flies alike: of the base model, and of any terms beyond it.
+    So two programs serve all vehicles: one of the base model, and one of any terms beyond it.
     """
     around = ["wind_x", "wind_y"]
     if segments.log_voltage is None:
@@ -196,13 +198,13 @@ def _with_all(
 
 
 def flown_part(segments: Segments) -> Segments:
-    """Return what of segments is flown, not compared."""
+    """Return the part of segments that is simulated, without measurements."""
     flown: Segments = replace(segments, measured={}, flight=jnp.zeros(segments.count, int))
     return flown
 
 
 def _arguments(given: _Given, *, own_coefficients: bool, moves: bool) -> _Given:
-    """Return how each leaf is laid out: segments along the last axis but for what they share."""
+    """Return the layout of each leaf: segments along the last axis, except for shared ones."""
     each = partial(Argument.of, lanes=True, moves=moves)
     return _Given(
         model=jax.tree.map(partial(Argument.of, lanes=False), given.model),
@@ -216,7 +218,7 @@ def _arguments(given: _Given, *, own_coefficients: bool, moves: bool) -> _Given:
 
 
 def laid_out(segments: Segments) -> Any:
-    """Return how each leaf of what is flown of segments is laid out."""
+    """Return the layout of each leaf of the simulated part of segments."""
 
     def each(leaf: Any, name: str | None = None) -> Argument:
         shape = np.shape(leaf)[:-1]
@@ -269,11 +271,7 @@ def _flight(
     """Fly one segment: channel -> (samples, c), and the time of a crash."""
     model = with_coefficients(given.model, given.coefficients)
     parts: tuple[Start, Inlet, Environment] = beginning_of(
-        model,
-        given.segments,
-        schedule,
-        states=given.states,
-        conditions=given.conditions,
+        model, given.segments, schedule, states=given.states, conditions=given.conditions
     )
     start, inlet, environment = parts
     plant, first = start_simulation(
@@ -314,7 +312,7 @@ def recorded_of(
     conditions: Mapping[str, Float[JaxArray, " *F"]],
     channels: Collection[str],
 ) -> dict[str, JaxArray]:
-    """Return channel -> what a recording of logged samples would hold, columns after the samples.
+    """Return channel -> the values that a recording of logged samples would have, columns last.
 
     Parameters
     ----------
@@ -335,8 +333,8 @@ def recorded_of(
         "rotor_speed": log.rotor_speed if log.read_speed is None else log.read_speed,
         "command": log.command,
         MOTION: (*_parts(motion.position), *_parts(motion.velocity), *_parts(motion.body_rate)),
-        SPEEDS: log.rotor_speed,
-        TURNED: tuple(getattr(motion.attitude, axis) for axis in "wxyz"),
+        TRUE_ROTOR_SPEED: log.rotor_speed,
+        BODY_ATTITUDE: tuple(getattr(motion.attitude, axis) for axis in "wxyz"),
         SETPOINTS: (*_parts(log.setpoints.rate), log.setpoints.thrust),
     }
     if "acceleration" in channels:
@@ -359,16 +357,16 @@ def beginning_of(
     states: Float[JaxArray, "L F"] | None = None,
     conditions: Mapping[str, Float[JaxArray, " F"]] = MappingProxyType({}),
 ) -> tuple[Start, Inlet, Environment]:
-    """Return what segments start from, what is fed in and what surrounds them.
+    """Return initial state, input and environment of segments.
 
     Parameters
     ----------
     model, segments, schedule
         What flies.
     states
-        How far the starts lie from the recorded ones, in the segments' standard deviations.
+        Deviation of the starts from the recorded ones, in the segments' standard deviations.
     conditions
-        Name, of `tuner.vehicle.conditions` -> what surrounds each segment, in its unit.
+        Name, of `tuner.vehicle.conditions` -> value of each segment, in its unit.
     """
     start, inlet = segments.start, segments.inlet
     true = gyro_of(model.vehicle).body_rate(start.motion.body_rate)
@@ -382,10 +380,10 @@ def beginning_of(
             model.vehicle, model.controller, start, segments.resting, speed_factor=factor
         )
     if segments.turning is not None:
-        start = spun_up(start, model.vehicle, segments.turning, speed_factor=factor)
+        start = with_commanded_rotors(start, model.vehicle, segments.turning, speed_factor=factor)
     if states is not None and segments.freedom is not None:
-        change = whole(states * segments.freedom, segments.freed)
-        start = moved(start, change)
+        change = with_all_rows(states * segments.freedom, segments.freed)
+        start = with_change(start, change)
         if ROWS["trim"].start in segments.freed:
             inlet = trimmed(inlet, model.vehicle, change)
     return start, inlet, environment
@@ -398,9 +396,9 @@ def accelerometer(
     environment: Environment,
     biases: Mapping[str, Float[JaxArray, " F"]],
 ) -> tuple[JaxArray, JaxArray, JaxArray]:
-    """Return what an accelerometer at the centre of mass reads, m/s² along the body's axes.
+    """Return the reading of an accelerometer at the centre of mass, m/s² along the body's axes.
 
-    That is the specific force: all that acts but gravity, over the mass; plus its bias.
+    It is the specific force (all forces but gravity, over the mass) plus the bias.
     """
     air = Air.around(vehicle, motion, environment, tuple(jnp.zeros_like(w) for w in rotor_speed))
     pull = total_wrench(vehicle, motion, rotor_speed, air).force * (1.0 / vehicle.body.mass)
@@ -411,7 +409,7 @@ def accelerometer(
 def environment_of(
     model: Model, segments: Segments, conditions: Mapping[str, Float[JaxArray, " F"]]
 ) -> Environment:
-    """Return what surrounds the segments, as far as it acts on a model."""
+    """Return the environment of the segments, as far as it acts on a model."""
     log_voltage = None
     volts, reference = segments.log_voltage, model.reference_voltage
     acts = "battery_exponent" in model.vehicle.effects

@@ -1,4 +1,4 @@
-"""Which coefficients are free, how far they may go, and the vector that the search moves."""
+"""The free coefficients, their bounds and priors, and the search vector."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from tuner.vehicle.joint_prior import JointPrior
 from tuner.vehicle.registry import COEFFICIENTS
 from tuner.vehicle.vehicle import Size, scaled_to_size, size_of
 
-AS_TABLED = Size()
-LEAST_SLOPE = 1e-150
-"""Whose inverse has a square that is a number."""
-OFF_BOUND = 0.05
+STANDARD_SIZE = Size()
+MIN_SLOPE = 1e-150
+"""Least slope: the square of its inverse is still finite."""
+START_MARGIN = 0.05
 """A start on a bound is moved inside by this share of the range."""
 CUTOFF = "gyro_cutoff"
-INSIDE_HALF = 0.99
-"""Share of half the rate loop's rate that a filter of the gyro may reach."""
+MAX_CUTOFF_SHARE = 0.99
+"""Largest cut-off of a gyro filter, as a share of the rate loop's Nyquist frequency."""
 
 
 class Space:
@@ -39,7 +39,7 @@ class Space:
         parameters: Sequence[Parameter],
         fixed: Mapping[str, float],
         joint_prior: JointPrior | None = None,
-        size: Size = AS_TABLED,
+        size: Size = STANDARD_SIZE,
     ) -> None:
         self.size = size
         self.parameters = tuple(parameters)
@@ -83,9 +83,9 @@ class Space:
         return np.asarray(self.lower + self.width * self.share(vector))
 
     def prior_residuals(self, vector: ArrayLike) -> Array:
-        """Return (*S, R) what half the square of is the priors' loss at search vectors (*S, K).
+        """Return the priors' residuals (*S, R) at search vectors (*S, K).
 
-        Of each parameter's own prior, then of the joint one. Their derivatives by the scaled
+        Those of each parameter's own prior, then of the joint one. Their derivatives by the scaled
         coordinates are ``prior_rows`` (R, K).
         """
         scaled = self.scaled(vector)
@@ -123,11 +123,11 @@ class Space:
         }
 
     def share(self, vector: ArrayLike) -> Array:
-        """Return where between its bounds each scaled coordinate of a search vector lies, 0..1."""
+        """Return each scaled coordinate's place between its bounds at a search vector, 0..1."""
         return np.asarray(expit(np.asarray(vector) / self.stretch))
 
     def at_share(self, share: Array) -> Array:
-        """Return the search vector (*S, K) so far between the bounds, just inside them."""
+        """Return the search vector (*S, K) at shares of the bounds' range, just inside them."""
         inside = np.clip(share, 1e-6, 1 - 1e-6)
         return np.asarray(np.log(inside / (1 - inside)) * self.stretch)
 
@@ -142,7 +142,7 @@ class Space:
         """
         share = self.share(vector)
         slope = self.width * share * (1 - share) / self.stretch
-        return np.asarray(np.maximum(slope, LEAST_SLOPE))
+        return np.asarray(np.maximum(slope, MIN_SLOPE))
 
 
 def space_of(
@@ -154,18 +154,18 @@ def space_of(
     bypassed: Collection[str] = (),
     freed: Collection[str] = (),
 ) -> Space:
-    """Return what a job fits.
+    """Return the space of a job's free coefficients.
 
     Parameters
     ----------
     vehicle, controller
-        Where the coefficients start.
+        Give the start values.
     job
-        Which are free, between which bounds, with which priors and ties.
+        Gives free and fixed coefficients, bounds, priors and ties.
     joint_prior
-        What ground measurements say.
+        Result of ground measurements.
     bypassed
-        Coefficients that do not act on the job's flights: they stay as they are.
+        Coefficients without effect on the job's flights: they stay as they are.
     freed
         Coefficients that are free besides the usual ones.
 
@@ -213,7 +213,7 @@ def space_of(
 def _with_filter_bounded(
     job: JobFile, controller: ControllerFile, values: Mapping[str, float]
 ) -> JobFile:
-    """Return a job that looks for no filter of the gyro that the simulated rate loop cannot have.
+    """Return a job with the gyro filter's cut-off bounded below half the rate loop's rate.
 
     Raises
     ------
@@ -227,7 +227,7 @@ def _with_filter_bounded(
     _, upper = COEFFICIENTS[CUTOFF].limits(values[CUTOFF])
     if given.upper is not None or upper < half:
         return job
-    changed = given.replace(upper=INSIDE_HALF * half)
+    changed = given.replace(upper=MAX_CUTOFF_SHARE * half)
     return job.replace(coefficients={**job.coefficients, CUTOFF: changed})
 
 
@@ -250,13 +250,13 @@ def extended(
     Parameters
     ----------
     space
-        Where they are fixed, or act in no term.
+        The space, in which they are not free.
     names
-        Of the coefficients.
+        Names of the coefficients.
     job
         Their bounds and priors.
     values
-        Coefficient -> where it starts; of all in ``names``.
+        Coefficient -> start value, of all in ``names``.
     """
     added = (parameter_of((name,), values, job, space.size) for name in names)
     fixed = {n: v for n, v in space.fixed.items() if n not in names}
@@ -266,7 +266,7 @@ def extended(
 def parameter_of(
     names: tuple[str, ...], values: Mapping[str, float], job: JobFile, size: Size
 ) -> Parameter:
-    """Return the coordinate of a coefficient and of those tied to it, as a job has it."""
+    """Return the parameter of a coefficient and of those tied to it, by a job's settings."""
     name = names[0]
     row, start = scaled_to_size(COEFFICIENTS[name], size), values[name]
     given = job.coefficients.get(name, CoefficientSettings())
@@ -295,7 +295,7 @@ def parameter_of(
     least, width = scaled(lower), scaled(upper) - scaled(lower)
     moved, initial, share = None, start, (scaled(start) - least) / width
     if not 1e-9 < share < 1.0 - 1e-9:
-        inner = least + width * float(np.clip(share, OFF_BOUND, 1.0 - OFF_BOUND))
+        inner = least + width * float(np.clip(share, START_MARGIN, 1.0 - START_MARGIN))
         moved, initial = start, float(np.exp(inner)) if scale == "log" else inner
     mean, sd, quarter = scaled(initial), row.prior_sd, 0.25 * (upper - lower)
     if scale != row.scale:  # a start of zero has no share of itself

@@ -30,7 +30,7 @@ class Published:
     Attributes
     ----------
     inlet
-        What the simulator flies, one point a control tick.
+        The simulator's input, one point a control tick.
     lap
         (ticks,) laps completed at each control tick.
     """

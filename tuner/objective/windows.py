@@ -1,7 +1,7 @@
-"""A flight cut into short ones, each of which starts from the recorded state: multiple shooting.
+"""Windows of a flight, each simulated from the recorded state: multiple shooting.
 
-What is simulated strays from what was recorded, the further the longer; over a second it stays near
-enough for a fit to find its way from almost anywhere, and a window needs no gentle beginning.
+A simulation diverges from the recording with time; over a second it stays close enough for a search
+from almost any start, and a window needs no gentle beginning.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from tuner.core.numerics import Array
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.recordings.states import initial_state, states_at
 
-BEFORE = 1.2
-"""s of a recording before a window that may help to estimate its start."""
-BEHIND = 0.1
-"""s of a recording after a window that may help as well."""
-FEWEST = 8
-"""Poses that a stretch must hold to be a window."""
-UNFED = 0.25
-"""Share of a window for which what is fed in may be unknown at a time, if not two samples."""
-STEADY = 0.6
-"""Share of the gaps between samples that are about as long in what was logged slowly: what is left
-of a signal that was mostly corrupt has gaps of all lengths."""
-MOSTLY = 0.5
-"""Share of a flight that must make windows: less of it is no flight to judge a vehicle by."""
+BEFORE_S = 1.2
+"""Time before a window whose samples help to estimate its initial state."""
+AFTER_S = 0.1
+"""Time after a window whose samples help, too."""
+MIN_POSES = 8
+"""Least number of poses in a window."""
+MAX_UNFED_SHARE = 0.25
+"""Longest gap of an input as a share of its window, or else two samples."""
+MIN_REGULAR_SHARE = 0.6
+"""Least share of regular gaps in a slowly logged signal: the rest of a mostly corrupt signal has
+gaps of all lengths."""
+MIN_COVERAGE = 0.5
+"""Least share of a flight that makes windows: a fit to less of it is no measure of the vehicle."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +57,13 @@ def windows_of(
 ) -> tuple[Window, ...]:
     """Cut a flight into windows of so many s, one behind the other.
 
-    A stretch with hardly a pose in it is left out, and so are one in which a signal that is fed in
-    is unknown for long, and a rest shorter than half a window.
+    Stretches with too few poses or with a gap of an input are left out, and so is a rest shorter
+    than half a window.
 
     Parameters
     ----------
     flight
-        What is cut.
+        The flight.
     seconds
         s, length of a window.
     fed
@@ -71,14 +71,13 @@ def windows_of(
     stride
         s from the beginning of a window to that of the next; by default its length.
     smoothed_widely
-        Whether a window's initial state is smoothed over a tenth of a second on either side, for
-        a start that stays free; else it is the recorded state of `tuner.recordings.states`. The
-        windows are the same ones either way.
+        Whether a window's initial state is smoothed over 0.1 s on either side, for a free start;
+        else it is the recorded state of `tuner.recordings.states`. The windows are the same.
 
     Raises
     ------
     RecordingError
-        No stretch of the flight holds enough poses and enough of what is fed in.
+        No stretch of the flight has enough poses and inputs.
     """
     stretches = _stretches(flight, seconds, stride)
     usable = _usable(flight, stretches, fed)
@@ -116,14 +115,14 @@ def require_windows(flight: Flight, seconds: float, fed: Collection[str]) -> Non
     stretches = _stretches(flight, seconds, None)
     for names in ((), *((name,) for name in fed), fed):
         usable = len(_usable(flight, stretches, names))
-        if usable < MOSTLY * len(stretches):
+        if usable < MIN_COVERAGE * len(stretches):
             what = " and ".join(names).replace("_", " ") or "pose"
             lacking = 100.0 * (1.0 - usable / len(stretches))
-            seldom = not names and flight.series["position"].rate * seconds < FEWEST
+            seldom = not names and flight.series["position"].rate * seconds < MIN_POSES
             raise RecordingError(
                 flight.path,
                 f"lacks a continuous {what} in {lacking:.0f} % of its mission",
-                f"log the pose at {np.ceil(FEWEST / seconds):.0f} Hz or more"
+                f"log the pose at {np.ceil(MIN_POSES / seconds):.0f} Hz or more"
                 if seldom
                 else "inspect the recording: samples outside their range are dropped",
             )
@@ -142,7 +141,7 @@ def _stretches(flight: Flight, seconds: float, stride: float | None) -> list[tup
 def _usable(
     flight: Flight, stretches: Sequence[tuple[int, int]], fed: Collection[str]
 ) -> list[tuple[int, int]]:
-    """Return the stretches with poses, and with signals that are fed in never unknown for long."""
+    """Return the stretches with enough poses and without gaps of inputs."""
     signals = [flight.series.get(name) for name in ("position", "attitude", *fed)]
     series = [signal for signal in signals if signal is not None]
     known = [s.time[np.isfinite(column)] for s in series[2:] for column in s.values.T]
@@ -152,11 +151,11 @@ def _usable(
 
     def is_known(begin: float, end: float) -> bool:
         pose = _between(series[0].time, begin, end)
-        if len(pose) < FEWEST or np.diff(pose).max() > 0.5 * (end - begin):
+        if len(pose) < MIN_POSES or np.diff(pose).max() > 0.5 * (end - begin):
             return False
         return all(
             np.diff(_between(time, begin, end), prepend=begin, append=end).max()
-            <= max(UNFED * (end - begin), gap)
+            <= max(MAX_UNFED_SHARE * (end - begin), gap)
             for time, gap in gaps
         )
 
@@ -169,10 +168,10 @@ def _between(time: Array, begin: float, end: float) -> Array:
 
 
 def _period(time: Array) -> float:
-    """Return the s between samples; 0 of what is left of a signal most of which was dropped."""
+    """Return the period of samples in s; 0 for a signal most of which was dropped."""
     steps = np.diff(time)
     usual = float(np.median(steps))
-    return usual if np.mean(np.abs(steps - usual) < 0.5 * usual) > STEADY else 0.0
+    return usual if np.mean(np.abs(steps - usual) < 0.5 * usual) > MIN_REGULAR_SHARE else 0.0
 
 
 def _window(
@@ -180,7 +179,7 @@ def _window(
 ) -> Window:
     begin, end = float(flight.time[first]), float(flight.time[last])
     series, initial = _around(flight.series, begin, end), recorded
-    if smoothed_widely:  # but where a gap leaves too little
+    if smoothed_widely:  # unless a gap leaves too few samples
         smoothed = initial_state(series)
         initial = smoothed if _is_known(smoothed) else recorded
     stretch = replace(
@@ -199,5 +198,7 @@ def _is_known(state: InitialState) -> bool:
 
 
 def _around(series: Mapping[str, Series], begin: float, end: float) -> dict[str, Series]:
-    near = {name: signal.between(begin - BEFORE, end + BEHIND) for name, signal in series.items()}
+    near = {
+        name: signal.between(begin - BEFORE_S, end + AFTER_S) for name, signal in series.items()
+    }
     return {n: Series(s.time - begin, s.values) for n, s in near.items() if len(s.time)}

@@ -8,10 +8,10 @@ from warnings import catch_warnings
 import numpy as np
 
 from tuner.objective.criterion import Point
-from tuner.objective.normal_equations import CHUNK, evaluate, position_rmse
+from tuner.objective.normal_equations import VECTORS_AT_ONCE, evaluate, position_rmse
 from tuner.search.progress import Iterate, StageProblem, point_of
 
-POPULATION = CHUNK
+POPULATION = VECTORS_AT_ONCE
 """Vectors in one generation: those that are simulated at once."""
 INITIAL_SD = 0.5
 """First standard deviation, in those of the coefficients' priors."""

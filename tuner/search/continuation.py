@@ -19,10 +19,10 @@ from tuner.core.numerics import Array, scaled_inverse, scaled_solve
 from tuner.objective.criterion import OFFSET_UNIT, Point, SegmentSums
 from tuner.objective.normal_equations import (
     Objective,
+    downweighting,
     misfit,
     normal_equations,
     root_mean_squares,
-    strays,
     sums_at,
 )
 from tuner.objective.segments import CLOCKS
@@ -299,6 +299,6 @@ def _finished(problem: StageProblem, progress: Progress) -> Progress:
     best = int(np.argmin(iterate.losses))
     every = root_mean_squares(problem.objective, iterate.sums)
     residual = {name: of_starts[best] for name, of_starts in every.items()}
-    scales = misfit(residual) if stage.rescales else strays(residual, stage.noise_inflation)
+    scales = misfit(residual) if stage.rescales else downweighting(residual, stage.noise_inflation)
     states = estimated_states(iterate.sums, best, progress.states)
     return replace(progress, scales=scales, states=states)

@@ -15,7 +15,13 @@ from tuner.equation_error.recorded_accelerations import Steps, rows_of, steps_of
 from tuner.equation_error.regression import convolved, summing
 from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.inlets import INLETS
-from tuner.objective.rotor_signals import Source, TorqueCorrelation, explained, levers, motor_order
+from tuner.objective.rotor_signals import (
+    Source,
+    TorqueCorrelation,
+    levers,
+    motor_order,
+    torque_correlation,
+)
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
 from tuner.recordings.flight import Flight
 from tuner.recordings.notes import NoteCode
@@ -121,7 +127,7 @@ def choose_inlet(
     for name, source in SIGNAL_OF_INLET.items():
         if not INLETS[name].can_be_fed(flight):
             continue
-        correlation = explained(flight, vehicle, source)
+        correlation = torque_correlation(flight, vehicle, source)
         if (
             correlation is None
             or correlation.tilting >= MIN_TORQUE_CORRELATION

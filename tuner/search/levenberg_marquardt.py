@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from tuner.core.numerics import Array
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.normal_equations import (
-    NEAR,
+    MATCHED_RATIO,
     NormalEquations,
     Objective,
     normal_equations,
@@ -313,12 +313,12 @@ def _has_converged(
     assert step.sums is not None, "what has stepped has sums"
     stage, predicted = problem.stage, step.predicted_reduction
     # windows with residuals far above the noise have no sharp minimum
-    vague = problem.objective.segments.windowed & (worst > NEAR)
+    vague = problem.objective.segments.windowed & (worst > MATCHED_RATIO)
     least = np.where(vague, max(stage.tolerance, WINDOW_TOLERANCE), stage.tolerance)
     if stage.rough:
         little = predicted <= stage.tolerance
     elif not problem.last:
-        little = (predicted <= HANDOVER_REDUCTION) & step.accepted & (worst <= NEAR)
+        little = (predicted <= HANDOVER_REDUCTION) & step.accepted & (worst <= MATCHED_RATIO)
     else:
         little = predicted * step.loss * step.sums.compared <= FINAL_LIKELIHOOD_GAIN
     ended = little | (step.loss <= stage.target_loss) | step.stalled
@@ -343,7 +343,7 @@ def _next_stage_start(problem: StageProblem, step: Step, worst: Array) -> tuple[
     lead a model with missing terms astray: the default damping keeps it close. After a stage of
     whole flights the next one differs by its weights alone.
     """
-    near = step.accepted & (worst <= NEAR)
+    near = step.accepted & (worst <= MATCHED_RATIO)
     untried = near & (step.predicted_reduction <= HANDOVER_REDUCTION)
     points: Point = jax.tree.map(
         lambda new, old: np.where(untried.reshape(-1, *[1] * (old.ndim - 1)), new, old),

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.disturbances.predictor import Predictor, hidden
-from tuner.objective.information import begun
+from tuner.objective.information import with_start_values
 from tuner.objective.space import Space
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
@@ -209,7 +209,9 @@ class LinearisedInnovations:
         }
         if base is None or not lags:
             return None
-        return self._with(base, lags, lags, begun(self.space, self.vector, names_of(lags)))
+        return self._with(
+            base, lags, lags, with_start_values(self.space, self.vector, names_of(lags))
+        )
 
     def _with(
         self, base: tuple[Job, Fitted], judged: Groups, kept: Collection[str], moved: Array

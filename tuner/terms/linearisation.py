@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from sim_jax.numeric import Array as JaxArray
 from tuner.core.numerics import scaled_solve
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point, SegmentSums, units_of
-from tuner.objective.information import BLOCK, FisherInformation, information_at, with_secants
-from tuner.objective.normal_equations import Objective, portions
-from tuner.objective.residuals import robust
+from tuner.objective.information import BLOCK_S, FisherInformation, information_at, with_secants
+from tuner.objective.normal_equations import Objective, flight_batches
+from tuner.objective.residuals import huber_loss
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import Stretches
@@ -166,7 +166,9 @@ class LinearisedLoss:
             columns_seen = self.columns[of_flight[0]]
             mine = np.flatnonzero(np.isin(columns, columns_seen))
             local = np.searchsorted(columns_seen, columns[mine])
-            for part in np.array_split(of_flight, max(round(len(of_flight) * BLOCK / seconds), 1)):
+            for part in np.array_split(
+                of_flight, max(round(len(of_flight) * BLOCK_S / seconds), 1)
+            ):
                 square = np.zeros((len(columns), len(columns)))
                 square[np.ix_(mine, mine)] = self.hessian[part].sum(axis=0)[np.ix_(local, local)]
                 information.append(square)
@@ -258,7 +260,7 @@ def linearise(
     """
     parts, loss = [], 0.0
     half = replace(objective, memory=objective.memory // 2)
-    for flights, batch in portions(half, point, criterion):
+    for flights, batch in flight_batches(half, point, criterion):
         jacobian = with_secants(
             batch[0].jacobian(*batch[1:]),
             batch[0].space,
@@ -382,7 +384,7 @@ def linearised_from(
     count, flights = size - condition_count, int(information.flight.max()) + 1
     # windows that begin in the same stretch count as one: their residuals are as dependent as those
     # of a flight simulated whole
-    blocks = information.begins[:, None] / BLOCK + np.arange(information.blocks.shape[2])
+    blocks = information.begins[:, None] / BLOCK_S + np.arange(information.blocks.shape[2])
     numbers = np.floor(blocks + 1e-9).astype(np.intp)
     hessian, score, flight, number = information.in_stretches(numbers)
     section = np.minimum(
@@ -419,7 +421,7 @@ def _loss_of(objective: Objective, criterion: Criterion, jacobian: Jacobian) -> 
     """Return half the robust sum of squares, as the search counts it."""
     limit = criterion.huber
     return sum(
-        0.5 * float(robust(of / criterion.scale[name][objective.flight], limit).sum())
+        0.5 * float(huber_loss(of / criterion.scale[name][objective.flight], limit).sum())
         for name, of in jacobian.residuals.items()
     )
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to import
 
 from tuner.core.numerics import scaled_solve, symmetric_eigen, unit_diagonal
-from tuner.objective.information import BLOCK
+from tuner.objective.information import BLOCK_S
 from tuner.terms.linearisation import RIDGE, SECTIONS_PER_FLIGHT, Columns, LinearisedLoss
 from tuner.uncertainty.covariance import STRETCH_S
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
@@ -66,7 +66,7 @@ def _sections(flight: NDArray[np.intp]) -> NDArray[np.intp]:
     numbers, count = np.empty(len(flight), np.intp), 0
     for own in np.unique(flight):
         stretches = np.flatnonzero(flight == own)
-        many = max(SECTIONS_PER_FLIGHT, round(len(stretches) * BLOCK / STRETCH_S))
+        many = max(SECTIONS_PER_FLIGHT, round(len(stretches) * BLOCK_S / STRETCH_S))
         for part in np.array_split(stretches, min(many, len(stretches))):
             numbers[part] = count
             count += 1

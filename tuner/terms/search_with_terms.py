@@ -14,8 +14,8 @@ from tuner.core.spans import span
 from tuner.evaluate.validation import point_estimates
 from tuner.findings.findings import Finding
 from tuner.objective.battery import require_voltage
-from tuner.objective.information import are_refuting
-from tuner.objective.initial_conditions import rests
+from tuner.objective.information import is_refuted
+from tuner.objective.initial_conditions import is_at_rest
 from tuner.objective.inlets import INLETS
 from tuner.objective.space import extended
 from tuner.recordings.flight import Flight
@@ -94,7 +94,7 @@ def hover_tilt(flights: Sequence[Flight]) -> np.ndarray[tuple[int, int], np.dtyp
 
     One row of zeros where none does.
     """
-    attitudes = [flight.initial.attitude for flight in flights if rests(flight.initial)]
+    attitudes = [flight.initial.attitude for flight in flights if is_at_rest(flight.initial)]
     # for an attitude Rz(heading)·tilt, the world's z axis in the body is that of the tilt alone
     tilts = [(2.0 * (w * x + y * z), 2.0 * (w * y - x * z)) for w, x, y, z in attitudes]
     return np.array(tilts or [(0.0, 0.0)])
@@ -159,7 +159,7 @@ def search_with_terms(
 def _is_refuted(fitted: Fitted) -> bool:
     if fitted.residuals_at_noise_level:
         return False
-    return are_refuting(fitted.objective, fitted.point, fitted.criterion)
+    return is_refuted(fitted.objective, fitted.point, fitted.criterion)
 
 
 def with_terms_selected(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from tuner.core.phrases import listed
 from tuner.objective.criterion import Point, units_of
-from tuner.objective.information import begun
+from tuner.objective.information import with_start_values
 from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.search.estimation import (
     FIRST_POLISH,
@@ -235,7 +235,7 @@ class Selection:
             state.fitted,
             objective=objective,
             point=Point(
-                begun(objective.space, vector, new_ones),
+                with_start_values(objective.space, vector, new_ones),
                 offsets_of(state.fitted, objective, reset=idle),
             ),
         )
@@ -252,7 +252,7 @@ class Selection:
 
         if anew:
             start[: len(self.job.space)] = self.job.space.initial
-            start = begun(objective.space, start, wanted)
+            start = with_start_values(objective.space, start, wanted)
             return search_again(
                 self.job, from_here, start, free=free_ones, title=title, on_progress=on_progress
             )

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import special  # scipy.stats takes a quarter of a second to import
 
 from tuner.core.numerics import Z95, Array, Inverse, scaled_root, symmetric_eigen
-from tuner.objective.information import BLOCK, FisherInformation
+from tuner.objective.information import BLOCK_S, FisherInformation
 
 PRIOR_WIDENING = 100.0
 """Factor on the priors' widths that leaves the information of the flights alone."""
@@ -348,7 +348,7 @@ class Stretches:
 def stretches_of(information: FisherInformation) -> Stretches:
     """Return all flights in stretches of `STRETCH_S`, or shorter ones for short recordings."""
     total = float(np.sum(_ends(information)))
-    return _cut(information, float(np.clip(total / MIN_STRETCHES, BLOCK, STRETCH_S)))
+    return _cut(information, float(np.clip(total / MIN_STRETCHES, BLOCK_S, STRETCH_S)))
 
 
 def flight_parts(information: FisherInformation) -> Stretches:
@@ -362,7 +362,7 @@ def flight_parts(information: FisherInformation) -> Stretches:
 def _ends(information: FisherInformation) -> Array:
     """Return the s (N,) at which the flights' last segments end."""
     blocks = information.blocks.shape[2]
-    ends = information.begins + blocks * BLOCK
+    ends = information.begins + blocks * BLOCK_S
     return np.array(
         [ends[information.flight == flight].max() for flight in np.unique(information.flight)]
     )
@@ -370,7 +370,7 @@ def _ends(information: FisherInformation) -> Array:
 
 def _cut(information: FisherInformation, seconds: float) -> Stretches:
     blocks = information.blocks.shape[2]
-    times = information.begins[:, None] + (np.arange(blocks) + 0.5) * BLOCK
+    times = information.begins[:, None] + (np.arange(blocks) + 0.5) * BLOCK_S
     known, score, *_ = information.in_stretches(np.floor(times / seconds).astype(np.intp))
     to_minimum = -information.inverse.matrix @ information.slope
     flown = np.any(known != 0.0, axis=(1, 2))

@@ -120,7 +120,7 @@ def uncertainty_of(
     )
     space = fitted.objective.space
     searched = set(space.names) - set(fitted.held.values())
-    information = information.resting(resting_parameters(space, fitted.point, searched))
+    information = information.with_resting(resting_parameters(space, fitted.point, searched))
     vector = np.asarray(fitted.point.coefficients)
     return uncertainty_at(space, vector, information, tuple(fitted.scales))
 

@@ -13,7 +13,7 @@ from tuner.core.numerics import Z95, Array, scaled_solve
 from tuner.disturbances.predictor import Predictor, with_hidden, with_strengths
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_at
-from tuner.objective.normal_equations import Objective, portion, portions
+from tuner.objective.normal_equations import Objective, flight_batch, flight_batches
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import (
@@ -100,10 +100,10 @@ def examine(
     if predictor is not None:
         slopes = predictor.slopes(objective, Point(point.coefficients, predictor.feed.offsets))
     residuals: list[Residual] = []
-    for flights, batch in portions(objective, point, criterion):
+    for flights, batch in flight_batches(objective, point, criterion):
         flight_names = [names[number] for number in flights]
         others = {
-            name: portion(replace(other, space=objective.space), point, criterion, flights)[0]
+            name: flight_batch(replace(other, space=objective.space), point, criterion, flights)[0]
             for name, other in alternatives.items()
         }
         if predictor is not None and slopes is not None:  # first: two Jacobians are too much
@@ -135,7 +135,7 @@ def examine(
         apart = np.array([gains.get(name, 0.0) for name in objective.space.names]) * reference
         information = replace(information, selection_shifts=np.hypot(moves, apart))
     searched = set(full_problem.fitted) - set(fitted.held.values())
-    information = information.resting(resting_parameters(objective.space, point, searched))
+    information = information.with_resting(resting_parameters(objective.space, point, searched))
     information = replace(information, astray=astray)
 
     def known(*others: str) -> Uncertainty:
@@ -167,7 +167,7 @@ def _uncertainty_of(
     vector = np.asarray(full_problem.point.coefficients)[indices]
     information = information.about(indices)
     if not at_minimum:  # flights may agree with each other and not with the vehicle
-        information = information.settled
+        information = information.at_minimum
     return uncertainty_at(space, vector, information, flights)
 
 

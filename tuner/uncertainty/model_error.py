@@ -40,11 +40,19 @@ from tuner.equation_error.rate_controller import (
 from tuner.equation_error.recorded_accelerations import MIN_SAMPLES, Mask, Steps, steps_of
 from tuner.findings.findings import Code, Finding
 from tuner.findings.sentences import CONTROLLER_FILE
-from tuner.objective.battery import log_voltage_of, read_again
+from tuner.objective.battery import log_voltage_of, with_readings_redrawn
 from tuner.objective.criterion import Point
 from tuner.objective.inlets import zero_order_hold
 from tuner.objective.normal_equations import Objective
-from tuner.objective.simulation import MOTION, SETPOINTS, SPEEDS, TURNED, Flown, environment_of, fly
+from tuner.objective.simulation import (
+    BODY_ATTITUDE,
+    MOTION,
+    SETPOINTS,
+    TRUE_ROTOR_SPEED,
+    Flown,
+    environment_of,
+    fly,
+)
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
 from tuner.search.findings import outlying_flights
@@ -62,7 +70,7 @@ from tuner.vehicle.model import Model
 
 MIN_REPORTED_SHIFT = 0.5
 """Least shift of a coefficient that is reported, in standard errors without it."""
-_CHANNELS = ("position", "attitude", SPEEDS, "body_rate", "command")
+_CHANNELS = ("position", "attitude", TRUE_ROTOR_SPEED, "body_rate", "command")
 LOOP_SIGNALS = ("rate_setpoint", "body_rate", "command")
 """Recorded inputs and output of a rate controller."""
 MIN_REPORTED_LATENCY_S = 1.5e-3
@@ -171,7 +179,7 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
         limits=objective.limits,
         coefficients=objective.space.values(vector),
         conditions=conditions,
-        channels=(*_CHANNELS, MOTION, TURNED, SETPOINTS),
+        channels=(*_CHANNELS, MOTION, BODY_ATTITUDE, SETPOINTS),
     )
     rate = float(schedule.log_rate)
     odd = outlying_flights(fitted.scales)
@@ -307,7 +315,7 @@ def _with_other_readings(
     assert as_read is not None, "the segments hold what was read"
     random, others = np.random.default_rng(0), {}
     for number in range(VOLTMETER_DRAWS):
-        again = log_voltage_of(read_again(flights, random), windows, objective.schedule)
+        again = log_voltage_of(with_readings_redrawn(flights, random), windows, objective.schedule)
         assert again is not None, "there is a voltmeter"
         volts = segments.log_voltage + (again - as_read)
         others[f"{READINGS} {number}"] = replace(
@@ -572,7 +580,7 @@ def _simulated(
     def at(name: str) -> Array:
         return _interpolated(Series(clock, channels[name][number]), part.time)
 
-    rows, attitude, speeds = at(MOTION), at(TURNED), at(SPEEDS)
+    rows, attitude, speeds = at(MOTION), at(BODY_ATTITUDE), at(TRUE_ROTOR_SPEED)
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     position, velocity, turning = (Vec3.of(rows[:, at].T) for at in _MOTION_PARTS)
     motion = Motion(position, velocity, Quaternion.of(attitude.T), turning)

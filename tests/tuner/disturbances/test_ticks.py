@@ -52,12 +52,12 @@ def test_a_clock_that_is_late_moves_the_samples_and_a_command_holds() -> None:
 def test_a_command_that_rests_weighs_in_a_filter_as_one_that_moves() -> None:
     commands = measured(0.01 * np.arange(1, 50), 4)
     values = np.round(10.0 * np.asarray(commands.values)) / 10.0  # some rest for ten samples
-    rests = np.stack([repeats(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
-    assert rests.max() > 5
+    is_at_rest = np.stack([repeats(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
+    assert is_at_rest.max() > 5
     as_one = replace(
         commands,
         values=jnp.asarray(values),
-        weight=commands.weight / jnp.asarray(np.sqrt(rests)),
+        weight=commands.weight / jnp.asarray(np.sqrt(is_at_rest)),
     )
     np.testing.assert_allclose(each_reading(as_one).weight, commands.weight)
 

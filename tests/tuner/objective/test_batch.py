@@ -8,7 +8,7 @@ import pytest
 
 from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.objective.criterion import Point
-from tuner.objective.normal_equations import CHUNK, evaluate
+from tuner.objective.normal_equations import VECTORS_AT_ONCE, evaluate
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
 
@@ -20,12 +20,12 @@ def fit():
 
 def test_each_vector_gives_what_it_gives_alone(fit):
     criterion = replace(criterion_of(fit), huber=2.0)
-    steps = np.random.default_rng(1).normal(0.0, 0.2, (CHUNK + 1, len(FREE)))
+    steps = np.random.default_rng(1).normal(0.0, 0.2, (VECTORS_AT_ONCE + 1, len(FREE)))
     vectors = np.asarray(fit.space.initial) + steps
     late = jnp.full((5, 2), 0.1)
     batch = evaluate(fit, vectors, Point(jnp.asarray(vectors[0]), late), criterion)
-    assert batch.loss.shape == (CHUNK + 1, 2)
-    for number in (0, 3, CHUNK):
+    assert batch.loss.shape == (VECTORS_AT_ONCE + 1, 2)
+    for number in (0, 3, VECTORS_AT_ONCE):
         alone = fit.sums(Point(jnp.asarray(vectors[number]), late), criterion, derivatives=False)
         np.testing.assert_allclose(batch.loss[number], alone.loss, rtol=1e-9)
         for name, squares in alone.squares.items():

@@ -23,9 +23,9 @@ from tuner.objective.battery import (
     IDLE,
     _resistance,
     log_voltage_of,
-    read_again,
     require_voltage,
     voltages_of,
+    with_readings_redrawn,
     with_reference_voltage,
 )
 from tuner.objective.criterion import Point
@@ -276,13 +276,16 @@ def test_a_voltmeter_that_is_read_again_scatters_a_curve_as_other_readings_do():
     curves, again, random = [], [], np.random.default_rng(2)
     for seed in range(12):
         known, _ = loaded(seed)
-        (curve,), (other,) = voltages_of([known]), voltages_of(read_again([known], random))
+        (curve,), (other,) = (
+            voltages_of([known]),
+            voltages_of(with_readings_redrawn([known], random)),
+        )
         curves.append(curve.volts)
         again.append(other.volts - curve.volts)
     scatter = np.sqrt(np.mean(np.var(curves, axis=0, ddof=1)))
     assert np.sqrt(np.mean(np.square(again))) == pytest.approx(scatter, rel=0.2)
     silent = flight("silent")
-    assert read_again([silent], random)[0] is silent
+    assert with_readings_redrawn([silent], random)[0] is silent
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1.0])

@@ -22,11 +22,11 @@ from tests.tuner.uncertainty.making import (
 from tuner.disturbances.predictor import unscaled
 from tuner.objective.initial_conditions import (
     ROWS,
-    eliminated,
+    eliminate_states,
     freedom_of,
     freedom_of_spin,
-    moved,
-    whole,
+    with_all_rows,
+    with_change,
 )
 from tuner.objective.segments import segments_of
 from tuner.objective.simulation import beginning_of
@@ -45,7 +45,7 @@ def test_elimination_is_the_minimum_over_the_start():
     gradient = rng.normal(size=(kept + states, segments))
     centre = rng.normal(size=(states, segments))
     loss = 50.0 + rng.random(segments)
-    least, left, information, best = eliminated(
+    least, left, information, best = eliminate_states(
         loss, gradient.T, np.moveaxis(hessian, -1, 0), centre
     )
     for segment in range(segments):
@@ -67,7 +67,7 @@ def test_elimination_is_the_minimum_over_the_start():
 def test_the_start_of_a_lost_flight_has_a_minimum():
     own = np.stack([np.eye(2), 1e20 * np.ones((2, 2))])
     hessian = np.pad(own, ((0, 0), (1, 0), (1, 0)))
-    least, *_, best = eliminated(np.ones(2), np.ones((2, 3)), hessian, np.zeros((2, 2)))
+    least, *_, best = eliminate_states(np.ones(2), np.ones((2, 3)), hessian, np.zeros((2, 2)))
     assert best[:, 0] == pytest.approx(-0.5)
     assert np.isfinite(least).all()
 
@@ -82,7 +82,7 @@ def test_a_start_moves_by_what_it_is_told(still):
     _, start = still
     change = np.zeros((COUNT, 2))
     change[0], change[3 + 1], change[6 + 2], change[12 + 3, 1] = 0.1, 0.2, 0.02, 0.5
-    there = moved(start, jnp.asarray(change))
+    there = with_change(start, jnp.asarray(change))
     assert np.asarray(there.motion.position.x) == pytest.approx(1.1)
     assert np.asarray(there.motion.velocity.y) == pytest.approx(0.2)
     assert np.asarray(there.motion.attitude.heading().y) == pytest.approx(0.02, rel=1e-3)
@@ -96,7 +96,7 @@ def test_what_cannot_matter_is_not_free():
 
 def test_what_is_free_of_a_start_takes_its_place_in_all_of_it():
     change = jnp.asarray([[1.0, 2.0], [3.0, 4.0]])
-    all_of_it = np.asarray(whole(change, (1, COUNT - 1)))
+    all_of_it = np.asarray(with_all_rows(change, (1, COUNT - 1)))
     assert all_of_it.shape == (COUNT, 2)
     np.testing.assert_array_equal(all_of_it[[1, COUNT - 1]], change)
     assert np.count_nonzero(all_of_it) == 4
@@ -121,7 +121,7 @@ def test_a_rotor_without_tachometer_turns_as_its_command_asks_of_the_battery(sha
 
 
 YAW = ROWS["rate_integral"].stop - 1
-SPIN = np.array([0.0, 2.0])
+SPIN_ROWS = np.array([0.0, 2.0])
 """rad/s of the two flights of `problem`."""
 
 
@@ -135,7 +135,7 @@ BEGUN = np.array([1e-4, 2e-4])
 
 
 def test_a_spin_leaves_a_tick_of_its_integrator_and_where_it_began_open_and_nothing_else():
-    freedom = freedom_of_spin(SPIN, 400.0, BEGUN)
+    freedom = freedom_of_spin(SPIN_ROWS, 400.0, BEGUN)
     names = {row: n for n, rows in ROWS.items() for row in range(rows.start, rows.stop)}
     assert [names[row] for row in freedom] == ["position", "position", "rate_integral"]
     assert list(freedom)[:2] == [ROWS["position"].start, ROWS["position"].start + 1]
@@ -166,10 +166,10 @@ def test_where_a_spin_began_is_not_asked_of_a_fit_that_compares_no_positions():
 def test_what_a_spin_began_with_says_nothing_of_the_coefficients(row, free):
     """Flown with an integrator a tick off, or from beside: the truth fits as noise allows."""
     fit = problem(free)
-    freedom = freedom_of_spin(SPIN, PHYSICS, 5.0 * BEGUN)
+    freedom = freedom_of_spin(SPIN_ROWS, PHYSICS, 5.0 * BEGUN)
     start = fit.segments.start
     change = jnp.zeros((max(r.stop for r in ROWS.values()), 2)).at[row].set(0.5 * freedom[row])
-    off = replace(fit, segments=replace(fit.segments, start=moved(start, change)))
+    off = replace(fit, segments=replace(fit.segments, start=with_change(start, change)))
     recorded = with_data(off, truth(fit)).segments.measured
     known = replace(fit.segments, measured=recorded)
     open_ = replace(known, freedom=jnp.asarray(np.stack([*freedom.values()])), freed=(*freedom,))

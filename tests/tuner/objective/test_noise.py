@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_jax.schedule import Schedule
-from tuner.objective.noise import repeats, white_noise
+from tuner.objective.noise import repeat_counts, white_noise
 from tuner.objective.segments import segments_of
 from tuner.recordings.flight import Series
 
@@ -37,8 +37,8 @@ def test_a_column_that_was_not_measured_has_no_noise():
 
 def test_a_value_that_rests_is_one_reading():
     values = np.array([[1.0, 1.0], [1.0, 2.0], [1.0, 3.0], [2.0, 3.0], [np.nan, np.nan]])
-    assert repeats(values).tolist() == [[3, 1], [3, 1], [3, 2], [1, 2], [1, 1]]
-    assert repeats(values[:0]).shape == (0, 2)
+    assert repeat_counts(values).tolist() == [[3, 1], [3, 1], [3, 2], [1, 2], [1, 1]]
+    assert repeat_counts(values[:0]).shape == (0, 2)
 
 
 def test_a_steady_command_that_was_rounded_says_what_one_reading_says(flight):

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from lanes.program import _program_of
-from tuner.objective.rotor_response import Lags, rotor_speeds
+from tuner.objective.rotor_response import MotorLags, rotor_speeds
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.model import model_of
 
 STEP = 0.0025
-LAGS = Lags(up=0.02, down=0.05, late=0.004)
+LAGS = MotorLags(up=0.02, down=0.05, delay=0.004)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def test_a_step_of_the_command_is_followed_late_and_with_its_own_lag(low, high, 
 def test_rotors_begin_settled_at_the_first_command_alone(motor):
     command = np.full((10, 4), 0.6)
     command[0] = 0.3
-    speeds = rotor_speeds(command, STEP, motor, Lags(up=0.02, down=0.05, late=0.0))
+    speeds = rotor_speeds(command, STEP, motor, MotorLags(up=0.02, down=0.05, delay=0.0))
     np.testing.assert_allclose(speeds[0], motor.input_scaling * 0.3 + motor.zero_position_armed)
     assert (np.diff(speeds[1:], axis=0) > 0.0).all()
 

@@ -61,14 +61,14 @@ def test_a_gain_and_a_bias_are_told_apart(flight):
 
 
 def test_set_points_that_answer_an_old_state_are_said_to(flight):
-    prompt = match_setpoints(flight, OURS).late
+    prompt = match_setpoints(flight, OURS).delay
     assert prompt < 0.03
     series = dict(flight.series)
     for name in ("position", "velocity", "attitude"):
         if name in series:
             series[name] = Series(series[name].time - 0.048, series[name].values)
     held_back = replace(flight, series=series)
-    assert match_setpoints(held_back, OURS).late == pytest.approx(prompt + 0.048, abs=0.005)
+    assert match_setpoints(held_back, OURS).delay == pytest.approx(prompt + 0.048, abs=0.005)
     (finding,) = setpoint_findings(held_back, OURS)
     assert finding.code is Code.SETPOINTS_LATE
     assert "ms old" in one_line(finding)

@@ -82,7 +82,7 @@ def test_commands_recorded_in_full_are_held_and_sparse_ones_joined():
 
 def test_the_actuator_inlet_holds_what_was_recorded(flight):
     schedule = Schedule()
-    inlet = INLETS["actuator"].lay([flight], schedule)
+    inlet = INLETS["actuator"].lay_out([flight], schedule)
     assert isinstance(inlet, ActuatorInlet)
     series = flight.series["command"]
     at = 4.0

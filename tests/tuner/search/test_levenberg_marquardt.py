@@ -9,7 +9,7 @@ import pytest
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import NormalEquations
 from tuner.search import levenberg_marquardt
-from tuner.search.levenberg_marquardt import NEAR, advance, initial_step
+from tuner.search.levenberg_marquardt import MATCHED_RATIO, advance, initial_step
 
 END = np.array([1.0, 1.0])
 START = np.array([-1.2, 1.0])
@@ -133,12 +133,12 @@ def ends(last, gain, accepted, worst, *, step_reduction=1.0, tries=1):
 @pytest.mark.parametrize("last", [False, True])
 @pytest.mark.parametrize("gain", [0.009, 0.011])
 @pytest.mark.parametrize("accepted", [False, True])
-@pytest.mark.parametrize("worst", [0.9 * NEAR, 1.1 * NEAR])
+@pytest.mark.parametrize("worst", [0.9 * MATCHED_RATIO, 1.1 * MATCHED_RATIO])
 def test_a_stage_ends_before_a_small_step_where_the_fit_is_near_and_the_last_was_better(
     last, gain, accepted, worst
 ):
     ended = ends(last, gain, accepted, worst)
-    assert ended is (not last and gain < 0.01 and accepted and worst < NEAR)
+    assert ended is (not last and gain < 0.01 and accepted and worst < MATCHED_RATIO)
 
 
 @pytest.mark.parametrize("last", [False, True])
@@ -147,5 +147,5 @@ def test_a_stage_ends_before_a_small_step_where_the_fit_is_near_and_the_last_was
 def test_rejected_tries_end_the_last_stage_once_the_next_promises_nothing(
     last, step_reduction, tries
 ):
-    ended = ends(last, 0.1, False, 2.0 * NEAR, step_reduction=step_reduction, tries=tries)
+    ended = ends(last, 0.1, False, 2.0 * MATCHED_RATIO, step_reduction=step_reduction, tries=tries)
     assert ended is (tries == 4 and not (last and step_reduction > 1e-4))

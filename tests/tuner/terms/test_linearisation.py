@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
 from tuner.config import JobFile
-from tuner.objective.information import BLOCK, FisherInformation
+from tuner.objective.information import BLOCK_S, FisherInformation
 from tuner.objective.space import space_of
 from tuner.terms.linearisation import linearised_from, neutral_of
 from tuner.terms.score import score
@@ -52,12 +52,12 @@ def experiment(seed):
 
 def test_windows_that_begin_within_two_seconds_are_one_stretch():
     information, linear = experiment(0)
-    stretches = round(SECONDS / BLOCK)
+    stretches = round(SECONDS / BLOCK_S)
     assert linear.flight.tolist() == np.repeat(np.arange(FLIGHTS), stretches).tolist()
     assert (
         linear.section.tolist() == np.tile(np.repeat([0, 1, 2], stretches // 3), FLIGHTS).tolist()
     )
-    first = information.blocks[0, : round(BLOCK / STRIDE), 0]
+    first = information.blocks[0, : round(BLOCK_S / STRIDE), 0]
     np.testing.assert_allclose(linear.hessian[0], first.sum(axis=0))
     np.testing.assert_allclose(linear.score.sum(axis=0), information.score.sum(axis=(0, 1, 2)))
     np.testing.assert_allclose(linear.information(), information.data)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.objective.normal_equations import Objective, portions
+from tuner.objective.normal_equations import Objective, flight_batches
 from tuner.uncertainty.estimates import flights_refute
 from tuner.uncertainty.examination import Examination, examine, knowledge_of
 from tuner.uncertainty.identifiability import stand_ins_of
@@ -44,7 +44,7 @@ def test_flights_that_do_not_fit_the_memory_take_turns(
 ) -> None:
     small = replace(objective, memory=1)
     fitted = making.fitted_of(small, making.truth(small))
-    assert [list(p) for p, _ in portions(small, fitted.point, fitted.criterion)] == [[0], [1]]
+    assert [list(p) for p, _ in flight_batches(small, fitted.point, fitted.criterion)] == [[0], [1]]
     turns = examine(fitted)
     assert turns.residuals[0].flight != turns.residuals[-1].flight
     assert [r.flight for r in turns.residuals] == [r.flight for r in examination.residuals]
