@@ -1,4 +1,4 @@
-"""What the accelerations of all flights say of a vehicle: coefficients, terms, shares."""
+"""Estimation of coefficients and terms from the accelerations of all flights."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from tuner.core.numerics import Array
 from tuner.equation_error.model_accelerations import ModelAccelerations, values_at
 from tuner.equation_error.recorded_accelerations import Commands, Mask, Steps
 from tuner.equation_error.regression import (
-    MEMORY,
+    MEMORY_S,
     Regression,
     convolved,
+    feedback_bias,
     minimised,
-    misled,
     regress,
     summing,
 )
@@ -25,40 +25,38 @@ from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import Model, with_terms_computed
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
-GAINS = ("torque_gain_x", "torque_gain_y", "torque_gain_z")
-"""What of a moment predicts turning: no part of the vehicle."""
-NOISE_KNOWN = 0.25
-"""Share of what the noise of rotor speeds makes of a coefficient by which that may be wrong: a
-guess, for noise that is not white or not as large as samples say."""
-POWER = "thrust_exponent"
-"""Forces tell it, and in them what air does to all rotors of a vehicle that flies faster the faster
-they turn passes for it. Moments are of differences among rotors: that these follow it as well is
-not known."""
-AHEAD = 0.3
-"""s over which `GAINS` are fitted to predict: between those at which predictions are compared."""
-HORIZONS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
-"""s over which predictions are compared with holding the state."""
+TORQUE_GAINS = ("torque_gain_x", "torque_gain_y", "torque_gain_z")
+"""Factors on the moments that predict turning best: not part of the vehicle."""
+NOISE_UNCERTAINTY = 0.25
+"""Relative standard error of the correction for noise of rotor speeds: a guess, for noise that is
+not white or not of the estimated size."""
+THRUST_EXPONENT = "thrust_exponent"
+"""Estimated from forces, where effects of airspeed on all rotors imitate it. Whether moments, which
+are differences among rotors, follow the same exponent is not known."""
+PREDICTION_S = 0.3
+"""Time ahead for which `TORQUE_GAINS` are fitted: amid `HORIZONS_S`."""
+HORIZONS_S = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
+"""Times ahead at which predictions are compared with holding the state."""
 TILTING = slice(3, 5)
-"""Axes of accelerations."""
+"""Roll and pitch among the axes of accelerations."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What recorded accelerations say, before anything is simulated.
+    """Estimates from recorded accelerations.
 
     Attributes
     ----------
     values
-        Coefficient -> value: physical ones without regard to what predicts best, and `GAINS` at
-        which they predict best.
+        Coefficient -> value: physical ones, and the `TORQUE_GAINS` with which these predict best.
     errors
         Coefficient -> standard error of its scaled coordinate, of the physical ones.
     explained
-        (6,) share of the recorded specific force and angular acceleration, axis by axis, that the
-        physical values explain; below zero where they make it worse.
+        (6,) share of the variance of recorded specific force and angular acceleration that the
+        physical values explain; negative where they make it worse.
     horizon
-        s up to which a prediction of roll and pitch rate, along the recorded motion, beats that
-        they stay; None if none does.
+        s up to which a prediction of roll and pitch rate, along the recorded motion, is better than
+        holding them; None if none is.
     """
 
     values: Mapping[str, float]
@@ -80,19 +78,19 @@ def estimate(
     flights: Sequence[Steps],
     commands: Sequence[Commands] = (),
 ) -> Estimate:
-    """Return what some flights' accelerations say.
+    """Return the estimates from some flights' accelerations.
 
     Parameters
     ----------
     model
-        Holds what does not move.
+        Gives the fixed coefficients.
     space
-        Free coefficients, those of candidates and `GAINS` among them, at neutral values.
+        Free coefficients, those of candidates and `TORQUE_GAINS` among them, at neutral values.
     candidates
-        Groups that are added if flights left out are predicted better with them.
+        Groups that are added if held-out flights are predicted better with them.
     commands
-        Where rotors follow these: all, and every second, which tells what is not known of the time
-        between two.
+        All commands, and every second one, which shows the error by their times in between; none
+        where rotor speeds were recorded.
     """
     absent = [n for n in space.free if COEFFICIENTS[n].is_effect and n not in model.vehicle.effects]
     made = ModelAccelerations(
@@ -101,7 +99,7 @@ def estimate(
     names, quiet = np.array(space.names), made.noiseless
     begin = np.array([p.scaled(p.initial) for p in space.parameters])
     acts = np.any([np.any(one.columns != 0.0, axis=(0, 1)) for one in quiet.at(begin)], axis=0)
-    is_gain = np.isin(names, GAINS)
+    is_gain = np.isin(names, TORQUE_GAINS)
     free = acts & ~is_gain
     groups = {
         group: np.isin(names, members)
@@ -113,18 +111,18 @@ def estimate(
     free = free & ~out
     found = regress(made, np.where(out, begin, full.point), free=free, near=True)
     again = partial(regress, begin=found.point, free=free, near=True)
-    others = [(1.0, again(made, memory=times * MEMORY)) for times in (0.5, 2.0)]
+    others = [(1.0, again(made, memory=times * MEMORY_S)) for times in (0.5, 2.0)]
     as_read = again(quiet) if made.noisy else found
-    others.append((NOISE_KNOWN, as_read))
+    others.append((NOISE_UNCERTAINTY, as_read))
     if commands:
         others.append((1.0, again(replace(made, commands=commands[1]))))
-    of_power, by_squares = free & (names == POWER), as_read
+    of_power, by_squares = free & (names == THRUST_EXPONENT), as_read
     if of_power.any():
         of_squares = np.where(of_power, begin, as_read.point)
         by_squares = regress(quiet, of_squares, free=free & ~of_power, near=True)
     errors = np.sqrt(
         np.diag(found.covariance)
-        + misled(quiet, found, free=free, memory=MEMORY) ** 2
+        + feedback_bias(quiet, found, free=free, memory=MEMORY_S) ** 2
         + np.where(of_power, 0.0, by_squares.point - as_read.point) ** 2
         + np.where(free, full.point - found.point, 0.0) ** 2
         + sum((share * (other.point - found.point)) ** 2 for share, other in others)
@@ -132,7 +130,7 @@ def estimate(
     predicted = minimised(
         quiet,
         found.point,
-        lambda one: [summing(one.steps.step, AHEAD)] * 6,
+        lambda one: [summing(one.steps.step, PREDICTION_S)] * 6,
         mean=found.point,
         free=acts & is_gain,
     )
@@ -146,29 +144,25 @@ def estimate(
         values={name: values[name] for name in kept},
         errors=named(errors, free),
         rows=rows,
-        explained=_explained(quiet, found.point),
+        explained=_explained_shares(quiet, found.point),
         horizon=_horizon(quiet, predicted),
     )
 
 
 def _selected(
-    full: Regression,
-    groups: Mapping[str, Mask],
-    candidates: Groups,
-    begin: Array,
-    free: Mask,
+    full: Regression, groups: Mapping[str, Mask], candidates: Groups, begin: Array, free: Mask
 ) -> tuple[tuple[SelectionRow, ...], Mask]:
-    """Return the table of the groups, and which coordinates (K,) are none of the model.
+    """Return the table of the groups, and which coordinates (K,) are eliminated.
 
-    Backward elimination: of the groups the one goes first without which units that were left out
-    are predicted best, as long as they are not predicted worse by more than the scatter.
+    Backward elimination: the group goes first without which held-out units are predicted best, as
+    long as they are not predicted worse by more than the scatter.
     """
     out, rows = np.zeros(len(free), bool), list[SelectionRow]()
     left = dict(groups)
     while left:
-        whole = _left_out(full, begin, free, out)
+        whole = _held_out_losses(full, begin, free, out)
         gains = {
-            group: _left_out(full, begin, free, out | members) - whole
+            group: _held_out_losses(full, begin, free, out | members) - whole
             for group, members in left.items()
         }
         worth = {
@@ -185,8 +179,8 @@ def _selected(
     return tuple(sorted(rows, key=lambda row: (not row.kept, -(row.gain_holdout or 0.0)))), out
 
 
-def _left_out(full: Regression, begin: Array, free: Mask, out: Mask) -> Array:
-    """Return each unit's (U,) loss with what meets the others, some coordinates at the start."""
+def _held_out_losses(full: Regression, begin: Array, free: Mask, out: Mask) -> Array:
+    """Return each unit's (U,) loss with a fit to the others, ``out`` at their start values."""
     away = np.where(out, begin - full.point, 0.0)
     units = np.eye(len(full.sums.slope), dtype=bool)
     return np.concatenate(
@@ -208,23 +202,23 @@ def _row(
     )
 
 
-def _explained(made: ModelAccelerations, point: Array) -> Array:
-    """Return the shares (6,) of recorded accelerations that are explained."""
+def _explained_shares(made: ModelAccelerations, point: Array) -> Array:
+    """Return the explained shares (6,) of the variance of recorded accelerations."""
     linear = made.at(point)
-    left = np.concatenate([one.left[one.steps.known] for one in linear])
+    left = np.concatenate([one.errors[one.steps.known] for one in linear])
     there = np.concatenate([one.steps.accelerations[one.steps.known] for one in linear])
     return np.asarray(1.0 - np.mean(left**2, axis=0) / there.var(axis=0))
 
 
 def _horizon(made: ModelAccelerations, point: Array) -> float | None:
-    """Return the s up to which predictions of roll and pitch rate beat holding them."""
+    """Return the s up to which predictions of roll and pitch rate are better than holding them."""
     linear, reached = made.at(point), None
-    for seconds in HORIZONS:
+    for seconds in HORIZONS_S:
         missed, turned = np.sum(
             [
                 [
                     np.sum(convolved(rows[:, TILTING], one.steps.known, kernel) ** 2)
-                    for rows in (one.left, one.steps.accelerations)
+                    for rows in (one.errors, one.steps.accelerations)
                 ]
                 for one in linear
                 for kernel in [summing(one.steps.step, seconds)]

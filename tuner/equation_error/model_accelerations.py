@@ -1,4 +1,4 @@
-"""The accelerations that the model's forces and moments make of recorded states and inputs."""
+"""Accelerations by the model's forces and moments at recorded states and inputs."""
 
 from __future__ import annotations
 
@@ -26,43 +26,42 @@ from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model, with_coefficients
 
 SPEED_STEP = 1e-3
-"""Change of a rotor's speed over itself by which accelerations are differentiated."""
+"""Relative step of a rotor's speed in finite differences."""
 CHANGE_STEP = 100.0
-"""rad/s², likewise of a rotor's acceleration."""
+"""Step of a rotor's acceleration in finite differences, rad/s²."""
 MOTOR_STEP = 1e-2
-"""Step of a motor's logarithm, or of a number over its usual size, likewise."""
+"""Step of a motor's logarithm, or of a number over its usual size, in finite differences."""
 ROTORS = 4
-EVERY = 5
-"""Steps of which one tells how the noise of rotor speeds moves what is computed."""
-AT_ONCE = 2048
-"""Of these, how many are computed at once: a call costs as much as a thousand of them."""
+NOISE_STRIDE = 5
+"""Stride of the steps at which the effect of noise of rotor speeds is computed."""
+NOISE_BATCH = 2048
+"""Number of these computed at once: a call costs as much as a thousand of them."""
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearisedAccelerations:
     """The accelerations of one flight's N steps about a point of K scaled coordinates.
 
     Attributes
     ----------
     steps
         As they were recorded.
-    left
+    errors
         (N, 6) recorded accelerations minus the model's.
     columns
         (N, 6, K) derivatives of the model's, or by fewer coordinates where only these are asked.
-    moved
-        (2, 2, 6, K, K): how the noise of rotor speeds moves columns together; the mean over steps
-        and sum over rotors of products of derivatives by a rotor's speed and by its acceleration.
-        Zero without noise.
-    crossed
+    noise_products
+        (2, 2, 6, K, K): products of the columns' derivatives by a rotor's speed and by its
+        acceleration, mean over steps and sum over rotors. Zero without noise.
+    noise_cross
         (2, 2, 6, K): likewise of columns and the model's accelerations.
     """
 
     steps: Steps
-    left: Array
+    errors: Array
     columns: Array
-    moved: Array
-    crossed: Array
+    noise_products: Array
+    noise_cross: Array
 
 
 @dataclass(frozen=True)
@@ -72,9 +71,9 @@ class ModelAccelerations:
     Attributes
     ----------
     model
-        Holds the coefficients that do not move.
+        Gives the fixed coefficients.
     parameters
-        The K that do.
+        The K free ones.
     commands
         Of each flight (n, 4), held from tick to tick of a clock, where rotors follow these by the
         motors' curve and lags; none where rotor speeds were recorded.
@@ -92,17 +91,19 @@ class ModelAccelerations:
 
     @property
     def noiseless(self) -> ModelAccelerations:
-        """The same with rotor speeds that are taken as they are."""
+        """The same without noise of rotor speeds."""
         return replace(self, flights=tuple(replace(part, noise=0.0) for part in self.flights))
 
-    def at(self, point: Array, by: NDArray[np.intp] | None = None) -> tuple[Linear, ...]:
+    def at(
+        self, point: Array, by: NDArray[np.intp] | None = None
+    ) -> tuple[LinearisedAccelerations, ...]:
         """Return each flight's accelerations about a point (K,) of scaled coordinates.
 
-        With derivatives by some of these; by all is the default. Noise takes most of the time.
+        With derivatives by some of these; by default by all. Noise takes most of the time.
         """
         flights, by = self._with_rotors(point), np.arange(len(point)) if by is None else by
-        made = _made(self.model, self.parameters, point, flights, by)
-        left = [
+        made = _modelled(self.model, self.parameters, point, flights, by)
+        errors = [
             part.accelerations - values for part, (values, _) in zip(flights, made, strict=True)
         ]
         columns = [of_flight.copy() for _, of_flight in made]
@@ -112,35 +113,39 @@ class ModelAccelerations:
             if moves_rotors(parameter.name):
                 step = MOTOR_STEP * (parameter.usual or 1.0)
                 beside = self._with_rotors(point + step * np.eye(len(point))[which])
-                ends = _made(here, (), np.zeros(0), beside, by[:0])
+                ends = _modelled(here, (), np.zeros(0), beside, by[:0])
                 for flight, (part, (modelled, _)) in enumerate(zip(beside, ends, strict=True)):
-                    change = left[flight] - (part.accelerations - modelled)
+                    change = errors[flight] - (part.accelerations - modelled)
                     columns[flight][:, :, number] = change / step
-        moved, crossed = self._moved(point, flights, by)
-        return tuple(map(Linear, flights, left, columns, moved, crossed))
+        noise_products, noise_cross = self._noise_sums(point, flights, by)
+        return tuple(
+            map(LinearisedAccelerations, flights, errors, columns, noise_products, noise_cross)
+        )
 
-    def _moved(
+    def _noise_sums(
         self, point: Array, flights: Sequence[Steps], by: NDArray[np.intp]
     ) -> tuple[Array, Array]:
-        """Return `Linear.moved` and `Linear.crossed` of all flights, of every so manyth step."""
+        """Return the noise products and cross products of all flights."""
         size = len(by)
-        moved, crossed = (np.zeros((len(flights), 2, 2, 6, *k)) for k in ((size, size), (size,)))
+        noise_products, noise_cross = (
+            np.zeros((len(flights), 2, 2, 6, *k)) for k in ((size, size), (size,))
+        )
         if not self.noisy:
-            return moved, crossed
-        steps = _side_by_side(flights, every=EVERY)
-        counts = [len(part.time[::EVERY]) for part in flights]
+            return noise_products, noise_cross
+        steps = _side_by_side(flights, every=NOISE_STRIDE)
+        counts = [len(part.time[::NOISE_STRIDE]) for part in flights]
         flight = np.repeat(np.arange(len(flights)), counts)
-        for first in range(0, len(flight), AT_ONCE):
-            some = slice(first, first + AT_ONCE)
+        for first in range(0, len(flight), NOISE_BATCH):
+            some = slice(first, first + NOISE_BATCH)
             here = jax.tree.map(lambda a, s=some: a[..., s], steps)
             values, columns = self._slopes(point, here, by)
             for number in np.unique(flight[some]):
                 own = flight[some] == number
                 slopes = columns[:, :, :, own].reshape(2, 6, -1, size)
                 mean = slopes.mT[:, None] / counts[number]
-                moved[number] += mean @ slopes
-                crossed[number] += (mean @ values[:, :, :, own].reshape(2, 6, -1, 1))[..., 0]
-        return moved, crossed
+                noise_products[number] += mean @ slopes
+                noise_cross[number] += (mean @ values[:, :, :, own].reshape(2, 6, -1, 1))[..., 0]
+        return noise_products, noise_cross
 
     def _slopes(self, point: Array, steps: Any, by: NDArray[np.intp]) -> tuple[Array, Array]:
         """Return derivatives of n steps' accelerations (2, 6, 4, n) and columns (2, 6, 4, n, K).
@@ -193,7 +198,7 @@ def values_at(parameters: Sequence[Parameter], point: Array) -> dict[str, float]
 
 
 def _side_by_side(flights: Sequence[Steps], every: int = 1) -> Any:
-    """Return motion, rotor speeds and accelerations of all flights' every so manyth step (N,)."""
+    """Return motion, rotor speeds and accelerations of all flights, with a stride of steps (N,)."""
     return jax.tree.map(
         lambda *leaves: np.concatenate([leaf[..., ::every] for leaf in leaves], axis=-1),
         *((part.motion, part.rotor_speed.T, part.rotor_acceleration.T) for part in flights),
@@ -205,7 +210,7 @@ def _in_lanes(rotors: Array) -> Array:
     return np.moveaxis(rotors, -2, 0).reshape(ROTORS, -1)
 
 
-def _made(
+def _modelled(
     model: Model,
     parameters: Sequence[Parameter],
     point: Array,
@@ -219,11 +224,7 @@ def _made(
 
 
 def _computed(
-    model: Model,
-    parameters: Sequence[Parameter],
-    point: Array,
-    steps: Any,
-    by: NDArray[np.intp],
+    model: Model, parameters: Sequence[Parameter], point: Array, steps: Any, by: NDArray[np.intp]
 ) -> tuple[Array, Array]:
     """Return the modelled accelerations (N, 6) and columns (N, 6, k) of `_side_by_side`'s steps."""
     values, slopes = values_at(parameters, point), dict[str, Array]()

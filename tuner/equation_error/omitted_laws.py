@@ -1,17 +1,16 @@
-"""Laws of force and moment that a fitted model lacks, by what it leaves of accelerations.
+"""Laws of force and moment that a fitted model omits, from its errors of accelerations.
 
-The accelerations of a fitted model, along the recorded motion, leave errors. What of them no change
-of the fitted coefficients can explain is regressed on a dictionary of what forces and moments may
-go with (`FEATURES`): airspeed, body rates, the rotors' speed. A feature counts if its efficient
-score, summed over stretches of `STRETCH`, is larger than the largest of all features' would be by
-chance: every stretch's contribution changes its sign at random (the wild bootstrap, clustered),
-which keeps what is correlated within a stretch and among features, and counts how many are tried.
-The likeliest is taken into the model, and the others are judged again.
+The accelerations of a fitted model, along the recorded motion, leave errors. The part that no
+change of the fitted coefficients explains is regressed on a dictionary of features (`FEATURES`):
+airspeed, body rates, the rotors' speed. A feature is significant if its efficient score, summed
+over stretches of `STRETCH_S`, exceeds the largest of all features' by chance: the contribution of
+every stretch gets a random sign (the clustered wild bootstrap), which keeps correlation within a
+stretch and among features, and accounts for their number. The likeliest is added to the model, and
+the others are tested again.
 
-Features, and what coefficients change, are those of the simulated flight, which follows the
-reference as the recorded one does and knows nothing of its gusts and of its sensors' noise: what
-the loop answers to gusts passes for no law (an instrumental variable; Ljung, 7.6). Errors are
-filtered as in `tuner.equation_error.regression`.
+Features and derivatives are those of the simulated flight, which follows the same reference without
+the recorded gusts and sensor noise, so that the loop's response to gusts is not taken for a law
+(an instrumental variable; Ljung, 7.6). Errors are filtered as in `tuner.equation_error.regression`.
 
 Sources: Cameron, Gelbach and Miller, "Bootstrap-based improvements for inference with clustered
 errors", 2008; Romano and Wolf, "Stepwise multiple testing as formalized data snooping", 2005.
@@ -26,54 +25,54 @@ from typing import NamedTuple
 import numpy as np
 
 from tuner.core.numerics import Array, unit_diagonal
-from tuner.equation_error.model_accelerations import Linear, ModelAccelerations
+from tuner.equation_error.model_accelerations import LinearisedAccelerations, ModelAccelerations
 from tuner.equation_error.recorded_accelerations import Steps, rows_of
 from tuner.equation_error.regression import filtered_sums, whitening
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model
 
-MEMORY = 0.3
-"""s of errors from which the next one is predicted."""
-STRETCH = 1.0
-"""s whose scores are summed up: what is left of gusts in filtered errors has ended by then."""
-LEVEL = 0.005
+MEMORY_S = 0.3
+"""Length of the error's autoregressive model."""
+STRETCH_S = 1.0
+"""Length of a stretch, beyond the correlation of gusts in filtered errors."""
+FALSE_ALARM_LEVEL = 0.005
 """Probability of a false alarm among all features."""
-SIGNS = 2000
+BOOTSTRAP_DRAWS = 2000
 """Draws of the stretches' signs."""
-OWN = 0.05
-"""Share of a feature's information that no other column may have, or it is not told from those."""
-SHIFTS, MOVED = 4, 1e-3
-"""In how many ways a motor's curve and lags move rotor speeds, and by how much they are moved."""
-MOST = 5
-"""Features that are told at most."""
-LATE = ("rotor_speed", "late")
-"""What is told of the rotors' speeds: their lateness against the gyro, by all moments."""
+MIN_OWN_INFORMATION = 0.05
+"""Least share of a feature's information that other columns do not explain."""
+MOTOR_SHIFTS, SPEED_STEP = 4, 1e-3
+"""Number of ways in which a motor's curve and lags change rotor speeds, and their step."""
+MAX_LAWS = 5
+"""Largest number of features found."""
+SPEED_LAG = ("rotor_speed", "late")
+"""The column of a lag of rotor speeds behind the gyro, in all moments."""
 AXES = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z")
 
 
-class Pair(NamedTuple):
-    """The steps of a flight as they were recorded, and as the fit flies them.
+class StepsPair(NamedTuple):
+    """The steps of a flight as recorded and as simulated by the fit.
 
-    ``driven``: whether the recorded rotor speeds are those that the fit makes of commands; what
-    these may be off by is not told then.
+    ``by_command``: whether rotor speeds come from commands by the fit's motors, whose errors are
+    then nuisances.
     """
 
     recorded: Steps
     simulated: Steps
-    driven: bool
+    by_command: bool
 
 
 @dataclass(frozen=True)
 class Law:
-    """A law of which the model has nothing.
+    """A law that the model omits.
 
     Attributes
     ----------
     axis, feature
         Of `AXES`, and of its `FEATURES`.
     share
-        The size of its part of the accelerations over that of all that is modelled there (root mean
-        squares about the mean), with the sign of its coefficient.
+        Standard deviation of its acceleration over that of all modelled ones, with the sign of its
+        coefficient.
     """
 
     axis: str
@@ -82,18 +81,18 @@ class Law:
 
 
 @dataclass(frozen=True)
-class Unexplained:
-    """What no coefficient of a fit explains.
+class OmittedLaws:
+    """The laws that a fit omits.
 
     Attributes
     ----------
     laws
         The likeliest first.
     accelerations
-        Of each flight (N, 6), m/s² and rad/s², body axes, what all of them make.
+        Sum of the laws' accelerations of each flight (N, 6), m/s² and rad/s², body axes.
     speed_lag
-        s by which recorded rotor speeds come after the turning that they make: stamped late, or
-        filtered; zero if that is chance.
+        s by which recorded rotor speeds lag behind the turning that they cause: stamped late, or
+        filtered; zero if not significant.
     """
 
     laws: tuple[Law, ...]
@@ -103,13 +102,13 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class _Motion:
-    """What features are made of, at N steps: a flight's airspeed, body rates, and loads.
+    """The motion that features are computed from, at N steps.
 
     Attributes
     ----------
     v, w
         (N, 3) m/s and rad/s, body axes.
-    faster
+    speed_excess
         (N,) the rotors' mean speed over that of all flights, less one.
     modelled
         (N, 6) the model's accelerations.
@@ -117,11 +116,11 @@ class _Motion:
 
     v: Array
     w: Array
-    faster: Array
+    speed_excess: Array
     modelled: Array
 
 
-def _fast(m: _Motion) -> Array:
+def _airspeed(m: _Motion) -> Array:
     return np.asarray(np.linalg.norm(m.v, axis=1))
 
 
@@ -131,7 +130,7 @@ Feature = Callable[[_Motion], Array]
 def _force_across(axis: int) -> dict[str, Feature]:
     return {
         "airspeed": lambda m: m.v[:, axis],
-        "airspeed_squared": lambda m: m.v[:, axis] * _fast(m),
+        "airspeed_squared": lambda m: m.v[:, axis] * _airspeed(m),
         "airspeed_across": lambda m: m.v[:, 1 - axis],
     }
 
@@ -146,14 +145,14 @@ def _moment_across(axis: int) -> dict[str, Feature]:
     }
 
 
-#: Axis -> name -> what a force or moment along it may go with.
+#: Axis -> name -> feature of a force or moment along it.
 FEATURES: Mapping[str, Mapping[str, Feature]] = {
     "force_x": _force_across(0),
     "force_y": _force_across(1),
     "force_z": {
-        "rotor_speed": lambda m: m.modelled[:, 2] * m.faster,
+        "rotor_speed": lambda m: m.modelled[:, 2] * m.speed_excess,
         "airspeed": lambda m: m.v[:, 2],
-        "airspeed_squared": lambda m: m.v[:, 2] * _fast(m),
+        "airspeed_squared": lambda m: m.v[:, 2] * _airspeed(m),
         "airspeed_across": lambda m: m.v[:, 0] ** 2 + m.v[:, 1] ** 2,
     },
     "moment_x": _moment_across(0),
@@ -166,78 +165,73 @@ FEATURES: Mapping[str, Mapping[str, Feature]] = {
 }
 
 
-def unexplained(
-    model: Model,
-    parameters: Sequence[Parameter],
-    point: Array,
-    flights: Sequence[Pair],
-) -> Unexplained:
-    """Return what recorded accelerations hold that no fitted coefficient explains.
+def find_omitted_laws(
+    model: Model, parameters: Sequence[Parameter], point: Array, flights: Sequence[StepsPair]
+) -> OmittedLaws:
+    """Return the laws in recorded accelerations that no fitted coefficient explains.
 
-    Parameters
-    ----------
-    model, parameters, point
-        Of the fit: what does not move, its K parameters, and their scaled coordinates.
+    ``model``, ``parameters`` and ``point`` are the fit's: fixed coefficients, K parameters, and
+    their scaled coordinates.
     """
-    recorded, simulated, driven = zip(*flights, strict=True)
+    recorded, simulated, by_command = zip(*flights, strict=True)
     along = ModelAccelerations(model, tuple(parameters), simulated).noiseless.at(point)
-    moved = [other for part in simulated for other in _moved(part)]
+    moved = [other for part in simulated for other in _motor_shifts(part)]
     made = ModelAccelerations(model, (), (*recorded, *moved)).noiseless.at(np.zeros(0))
     mean = float(np.mean([part.rotor_speed.mean() for part in simulated]))
-    names = [*((axis, name) for axis, features in FEATURES.items() for name in features), LATE]
+    names = [*((axis, name) for axis, features in FEATURES.items() for name in features), SPEED_LAG]
     motions, tables, sums = list[_Motion](), list[Array](), list[tuple[Array, Array]]()
-    for number, (one, real, of_commands) in enumerate(zip(along, made, driven, strict=False)):
-        ends = made[len(recorded) + SHIFTS * number :][:SHIFTS]
-        shift = np.stack([(one.left - end.left) / MOVED for end in ends], 2)
+    for number, (one, real, of_commands) in enumerate(zip(along, made, by_command, strict=False)):
+        ends = made[len(recorded) + MOTOR_SHIFTS * number :][:MOTOR_SHIFTS]
+        shift = np.stack([(one.errors - end.errors) / SPEED_STEP for end in ends], 2)
         motion = _motion(one, mean)
         nuisances = _nuisances(one.steps, motion, (number, len(along)), of_commands)
-        table = np.concatenate([_features(motion), _late(shift) * (not of_commands)], axis=2)
+        table = np.concatenate([_features(motion), _lag_column(shift) * (not of_commands)], axis=2)
         columns = np.concatenate([one.columns, nuisances, shift * of_commands, table], axis=2)
-        units = len(columns) // max(1, round(STRETCH / real.steps.step))
-        filters = whitening(real, MEMORY)
+        units = len(columns) // max(1, round(STRETCH_S / real.steps.step))
+        filters = whitening(real, MEMORY_S)
         sums.append(filtered_sums(replace(real, columns=columns), filters, units)[:2])
         motions.append(motion)
         tables.append(table)
     first = sums[0][1].shape[1] - len(names)
     information, score = (np.concatenate(parts) for parts in zip(*sums, strict=True))
-    # lateness is no law: it is judged by itself, and first
-    told = _likeliest(information, score, range(first), [first + len(names) - 1])
-    while len(told) < MOST:
-        rest = [i for i in range(first, first + len(names) - 1) if i not in told]
-        likeliest = _likeliest(information, score, [*range(first), *told], rest)
+    # the lag of rotor speeds is no law: it is tested by itself, and first
+    chosen = _likeliest(information, score, range(first), [first + len(names) - 1])
+    while len(chosen) < MAX_LAWS:
+        rest = [i for i in range(first, first + len(names) - 1) if i not in chosen]
+        likeliest = _likeliest(information, score, [*range(first), *chosen], rest)
         if not likeliest:
             break
-        told += likeliest
+        chosen += likeliest
     sizes = np.zeros(len(names))
-    if told:
-        inside = [*range(first), *told]
+    if chosen:
+        inside = [*range(first), *chosen]
         solved = _solved(information.sum(axis=0), inside, score.sum(axis=0))
-        sizes[np.array(told) - first] = solved[first:]
+        sizes[np.array(chosen) - first] = solved[first:]
     modelled = np.concatenate([motion.modelled for motion in motions]).std(axis=0)
     parts, laws = np.concatenate(tables).std(axis=0), []
-    for number in (column - first for column in told):
+    for number in (column - first for column in chosen):
         axis, name = names[number]
-        if (axis, name) != LATE:
+        if (axis, name) != SPEED_LAG:
             row = AXES.index(axis)
             laws.append(Law(axis, name, float(parts[row, number] * sizes[number] / modelled[row])))
     made_of_laws = tuple(table[..., :-1] @ sizes[:-1] for table in tables)
-    return Unexplained(tuple(laws), made_of_laws, float(sizes[-1]))
+    return OmittedLaws(tuple(laws), made_of_laws, float(sizes[-1]))
 
 
-def _moved(part: Steps) -> list[Steps]:
-    """Return the steps with rotor speeds as a motor's curve and its lags move them."""
+def _motor_shifts(part: Steps) -> list[Steps]:
+    """Return the steps with rotor speeds changed as by a motor's curve and its lags."""
     speed, change = part.rotor_speed, part.rotor_acceleration
     ways = (np.ones_like(speed), speed, np.maximum(change, 0.0), np.minimum(change, 0.0))
-    return [replace(part, rotor_speed=speed + MOVED * way) for way in ways]
+    return [replace(part, rotor_speed=speed + SPEED_STEP * way) for way in ways]
 
 
-def _motion(one: Linear, mean: float) -> _Motion:
+def _motion(one: LinearisedAccelerations, mean: float) -> _Motion:
     motion = one.steps.motion
     return _Motion(
         v=rows_of(motion.attitude.to_body(motion.velocity)),
         w=rows_of(motion.body_rate),
-        faster=one.steps.rotor_speed.mean(axis=1) / mean - 1.0,
-        modelled=one.steps.accelerations - one.left,
+        speed_excess=one.steps.rotor_speed.mean(axis=1) / mean - 1.0,
+        modelled=one.steps.accelerations - one.errors,
     )
 
 
@@ -254,19 +248,19 @@ def _features(motion: _Motion) -> Array:
     return table
 
 
-def _late(shift: Array) -> Array:
-    """Return what moments (N, 6, 1) are short of for each s by which rotor speeds are late."""
+def _lag_column(shift: Array) -> Array:
+    """Return the change of moments (N, 6, 1) per s of lag of rotor speeds."""
     column = shift[..., 2:].sum(axis=2, keepdims=True)
     column[:, :3] = 0.0
     return np.asarray(column)
 
 
 def _nuisances(part: Steps, motion: _Motion, place: tuple[int, int], of_commands: bool) -> Array:
-    """Return (N, 6, n) what else errors may be, and is not told.
+    """Return the nuisance columns (N, 6, n) of errors.
 
-    A steady one of each axis in each flight (``place``: which of how many); what a thrust looks
-    like along x and y from an attitude that is tilted or late; what comes late of each force, whose
-    clock is another than the gyro's, and of each moment where rotor speeds are made of commands.
+    A constant of each axis in each flight (``place``: number and count); thrust along x and y by an
+    attitude that is tilted or late; a delay of each force, whose clock is not the gyro's, and of
+    each moment where rotor speeds come from commands.
     """
     number, flights = place
     table = np.zeros((len(motion.v), 6, 6 * flights + 12))
@@ -282,7 +276,7 @@ def _nuisances(part: Steps, motion: _Motion, place: tuple[int, int], of_commands
 
 
 def _solved(total: Array, inside: Sequence[int], right: Array) -> Array:
-    """Return what solves the normal equations of some columns; what they do not tell is zero."""
+    """Return the least-norm solution of the normal equations of some columns."""
     square = total[np.ix_(inside, inside)]
     unit = unit_diagonal(square)
     inverse = np.linalg.pinv(square * np.outer(unit, unit), rcond=1e-9, hermitian=True)
@@ -293,7 +287,7 @@ def _solved(total: Array, inside: Sequence[int], right: Array) -> Array:
 def _likeliest(
     information: Array, score: Array, model: Sequence[int], rest: Sequence[int]
 ) -> list[int]:
-    """Return the column whose efficient score is the largest; none where that may be chance."""
+    """Return the column with the largest efficient score; none where that is not significant."""
     total, model, rest = information.sum(axis=0), list(model), list(rest)
     estimate = _solved(total, model, score.sum(axis=0))
     follow = _solved(total, model, total[:, rest])
@@ -301,12 +295,12 @@ def _likeliest(
     efficient = left[:, rest] - left[:, model] @ follow
     own = np.diag(total)[rest]
     alone = own - np.einsum("mr,mr->r", total[np.ix_(model, rest)], follow)
-    tells = alone > OWN * own
-    if not tells.any():
+    determined = alone > MIN_OWN_INFORMATION * own
+    if not determined.any():
         return []
     sd = np.maximum(np.sqrt(np.sum(efficient**2, axis=0)), 1e-300)
-    size = np.where(tells, np.abs(efficient.sum(axis=0)) / sd, 0.0)
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], (SIGNS, len(efficient)))
-    chance = np.abs(signs @ efficient / sd)[:, tells].max(axis=1)
+    size = np.where(determined, np.abs(efficient.sum(axis=0)) / sd, 0.0)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (BOOTSTRAP_DRAWS, len(efficient)))
+    chance = np.abs(signs @ efficient / sd)[:, determined].max(axis=1)
     best = int(np.argmax(size))
-    return [rest[best]] if size[best] > np.quantile(chance, 1.0 - LEVEL) else []
+    return [rest[best]] if size[best] > np.quantile(chance, 1.0 - FALSE_ALARM_LEVEL) else []

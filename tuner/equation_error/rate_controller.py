@@ -1,15 +1,15 @@
-"""A rate controller as recorded, against the one of its file: gains and lag of each axis.
+"""Estimation of a rate controller's gains and latency from recorded commands.
 
 Each axis's torque set-point, as the mixer has it, is regressed on the error of the body rate, its
 integral, and the angular acceleration, of recorded flights and of the fit's own. Simulated signals
-are the instruments of both (Ljung, System Identification, 7.6): they know nothing of a gyro's noise
-and of gusts, and a loop that answers both biases nothing. What sampling and filters make of such a
-regression they make of both, so that the ratio of its coefficients is that of the gains (indirect
+are the instruments of both (Ljung, System Identification, 7.6): they are free of the recorded gyro
+noise and gusts, so that the loop's response to these causes no bias. Sampling and filters have the
+same effect on both regressions, so that the ratio of coefficients is that of the gains (indirect
 inference; Gourieroux, Monfort and Renault 1993).
 
-How far coefficients scatter is what is left of the regression, taken for stationary (Newey and West
-1987). What filters make of the step of a set-point is not: so scores of stretches of `STRETCH` have
-to speak against chance, too, by as many degrees of freedom as there are stretches that tell most.
+Standard errors are those of stationary residuals (Newey and West 1987). Responses of filters to
+steps of a set-point are not stationary: so estimates have to be significant by the scatter of the
+scores of stretches of `STRETCH_S`, too, with the effective number of stretches.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from scipy.special import ndtri, stdtrit  # scipy.stats takes a quarter of a sec
 
 from tuner.core.numerics import Array, unit_diagonal
 
-STRETCH = 1.0
-"""s whose scores are summed up."""
-MEMORY = 0.3
-"""s over which what is left is correlated."""
-LEVEL = 0.005
+STRETCH_S = 1.0
+"""Length of a stretch whose scores are summed."""
+MEMORY_S = 0.3
+"""Correlation length of residuals."""
+FALSE_ALARM_LEVEL = 0.005
 """Probability of a false alarm among all axes and parts."""
-AT_LEAST = 0.05
-"""That for each of them by the scores of stretches."""
+STRETCH_LEVEL = 0.05
+"""Probability of a false alarm of each by the scores of stretches."""
 AXES = ("roll", "pitch", "yaw")
 PARTS = ("P", "I", "late")
-SMALLEST = {"P": 0.02, "I": 0.1, "late": 5e-4}
-"""Change of a gain as a share of it, and s, below which nothing is found."""
-FOLLOWED = 0.5
-"""Slope of a flight's torque over that simulated from which this is an instrument: a loop near its
-edge swings, and no simulation keeps its phase."""
-APART = 1e-6
-"""Inverse condition from which columns are told apart."""
+MIN_CHANGE = {"P": 0.02, "I": 0.1, "late": 5e-4}
+"""Least difference that is reported: relative for gains, s for the latency."""
+MIN_INSTRUMENT_SLOPE = 0.5
+"""Least slope of recorded over simulated torque of a flight that is an instrument: near the limit
+of stability a loop oscillates, and a simulation loses its phase."""
+MIN_RECIPROCAL_CONDITION = 1e-6
+"""Least reciprocal condition number of the regression."""
 
 
 class Signals(NamedTuple):
-    """What a rate controller hears and says, (N, 3) roll, pitch, yaw in FRD, every ``step`` s.
+    """Inputs and output of a rate controller, (N, 3) roll, pitch, yaw in FRD, every ``step`` s.
 
     ``error`` is set-point minus gyro and ``rate`` the gyro, rad/s; ``torque`` is normalised.
     """
@@ -54,11 +54,11 @@ class Signals(NamedTuple):
 
 
 class ControllerEstimate(NamedTuple):
-    """How a gain compares with the file's.
+    """An estimate of a gain or latency relative to the file's.
 
-    ``part`` is of `PARTS`; ``value`` the gain over the file's, or s by which an axis answers its
-    gyro later than the file's filters and D let it; ``sd`` its standard error; ``differs`` whether
-    they differ by more than chance; ``flight`` the one that alone has that gain.
+    ``part`` is of `PARTS`; ``value`` the gain over the file's, or s by which an axis responds later
+    to its gyro than the file's filters and D explain; ``sd`` its standard error; ``differs``
+    whether the difference is significant and large enough; ``flight`` the only one with that gain.
     """
 
     axis: str
@@ -72,23 +72,21 @@ class ControllerEstimate(NamedTuple):
 def estimate_controller(
     recorded: Sequence[Signals], simulated: Sequence[Signals]
 ) -> tuple[ControllerEstimate, ...]:
-    """Return how each gain that flights tell compares with the file's.
+    """Return the estimates that flights determine.
 
-    Parameters
-    ----------
-    recorded, simulated
-        Of each flight, at the same times.
+    ``recorded`` and ``simulated`` are signals of each flight at the same times.
     """
-    known = [_of_axis(recorded, simulated, axis) for axis in range(3)]
-    _share_lateness(known)
-    told = sum(len(parts) for parts in known)
+    known = [_axis_estimates(recorded, simulated, axis) for axis in range(3)]
+    _share_latency(known)
+    tests = sum(len(parts) for parts in known)
     return tuple(
         ControllerEstimate(
             name,
             part,
             one.value,
             one.sd,
-            one.is_sure(LEVEL / told) and abs(one.value - one.neutral) > SMALLEST[part],
+            one.is_significant(FALSE_ALARM_LEVEL / tests)
+            and abs(one.value - one.neutral) > MIN_CHANGE[part],
         )
         for name, parts in zip(AXES, known, strict=True)
         for part, one in parts.items()
@@ -96,7 +94,7 @@ def estimate_controller(
 
 
 def others_gains(recorded: Sequence[Signals], simulated: Sequence[Signals]) -> tuple[int, ...]:
-    """Return the flights, of three or more, whose P is none that the others have.
+    """Return the flights, of three or more, whose P differs from that of the others.
 
     Parameters are those of `estimate_controller`.
     """
@@ -121,61 +119,63 @@ def _apart(
     rest: Sequence[int],
     axis: int,
 ) -> float:
-    """Return by how many standard errors a flight's P is off the others'; zero for chance."""
+    """Return the difference of a flight's P from the others' in standard errors; 0 for chance."""
     others = [other for other in rest if other != number]
     own, all_others = (
-        _of_axis([recorded[i] for i in some], [simulated[i] for i in some], axis).get("P")
+        _axis_estimates([recorded[i] for i in some], [simulated[i] for i in some], axis).get("P")
         for some in ([number], others)
     )
     if own is None or all_others is None:
         return 0.0
     sd, off = float(np.hypot(own.sd, all_others.sd)), abs(own.value - all_others.value)
     compared = own._replace(neutral=all_others.value, sd=sd)
-    sure = off > SMALLEST["P"] and compared.is_sure(LEVEL / (len(AXES) * len(rest)))
+    sure = off > MIN_CHANGE["P"] and compared.is_significant(
+        FALSE_ALARM_LEVEL / (len(AXES) * len(rest))
+    )
     return off / sd if sure else 0.0
 
 
 class _Part(NamedTuple):
-    """A part's value, its standard error, what the file says, and how stretches (S,) move it."""
+    """A part's value, the file's, its standard error, and contributions of stretches (S,)."""
 
     value: float
     neutral: float
     sd: float
     moves: Array
 
-    def is_sure(self, level: float) -> bool:
-        """Return whether it is not neutral, by what is left and by the stretches."""
+    def is_significant(self, level: float) -> bool:
+        """Return whether it differs from the file's, by its error and by the stretches' scatter."""
         square = self.moves**2
         count = float(square.sum() ** 2 / max((square**2).sum(), 1e-300))
         off, scatter = abs(self.value - self.neutral), float(np.sqrt(square.sum()))
         return (
             count > 2.0
             and off > float(ndtri(1.0 - 0.5 * level)) * self.sd
-            and off > float(stdtrit(count - 1.0, 1.0 - 0.5 * AT_LEAST)) * scatter
+            and off > float(stdtrit(count - 1.0, 1.0 - 0.5 * STRETCH_LEVEL)) * scatter
         )
 
 
-def _of_axis(
+def _axis_estimates(
     recorded: Sequence[Signals], simulated: Sequence[Signals], axis: int
 ) -> dict[str, _Part]:
-    """Return the parts of one axis; none where its flights do not tell them apart."""
+    """Return the parts of one axis; none where the regression is singular."""
     real = [_regression(signals, axis) for signals in recorded]
     made = [
-        _followed(_regression(signals, axis), torque)
+        _as_instrument(_regression(signals, axis), torque)
         for signals, (_, torque) in zip(simulated, real, strict=True)
     ]
     own = np.sum([z.T @ z for z, _ in made], axis=0)
     both = list(zip(made, real, strict=True))
     total = np.sum([z.T @ x for (z, _), (x, _) in both], axis=0)
-    if not own.any() or min(map(_condition, (own, total))) < APART:
+    if not own.any() or min(map(_condition, (own, total))) < MIN_RECIPROCAL_CONDITION:
         return {}
     of_file = np.linalg.solve(own, np.sum([z.T @ torque for z, torque in made], axis=0))
     gains = np.linalg.solve(total, np.sum([z.T @ torque for (z, _), (_, torque) in both], axis=0))
     scores, square = [], np.zeros((3, 3))
     for (z, _), (x, torque), signals in zip(made, real, recorded, strict=True):
         left = torque - x @ gains
-        square += _square_of_sum(z, left, max(1, round(MEMORY / signals.step)))
-        many = max(round(len(left) * signals.step / STRETCH), 1)
+        square += _square_of_sum(z, left, max(1, round(MEMORY_S / signals.step)))
+        many = max(round(len(left) * signals.step / STRETCH_S), 1)
         scores += [z[rows].T @ left[rows] for rows in np.array_split(np.arange(len(left)), many)]
     inverse = np.linalg.inv(total)
     late, of_filters = gains[2] / gains[0], of_file[2] / of_file[0]
@@ -192,15 +192,15 @@ def _of_axis(
     return parts
 
 
-def _followed(made: tuple[Array, Array], torque: Array) -> tuple[Array, Array]:
-    """Return a simulated flight's columns and torque, zero where none was recorded like them."""
+def _as_instrument(made: tuple[Array, Array], torque: Array) -> tuple[Array, Array]:
+    """Return a simulated flight's columns and torque, zero where the recorded ones differ."""
     columns, of_file = made
-    follows = float(of_file @ torque > FOLLOWED * (of_file @ of_file))
+    follows = float(of_file @ torque > MIN_INSTRUMENT_SLOPE * (of_file @ of_file))
     return follows * columns, follows * of_file
 
 
 def _square_of_sum(instruments: Array, left: Array, memory: int) -> Array:
-    """Return the mean square (3, 3) of the sum of instruments (N, 3) times what is left (N,)."""
+    """Return the mean square (3, 3) of the sum of instruments (N, 3) times residuals (N,)."""
     count = len(left)
     square = np.mean(left**2) * instruments.T @ instruments
     for apart in range(1, min(memory, count - 1) + 1):
@@ -210,10 +210,10 @@ def _square_of_sum(instruments: Array, left: Array, memory: int) -> Array:
     return np.asarray(square)
 
 
-def _share_lateness(known: list[dict[str, _Part]]) -> None:
-    """Give roll and pitch the mean of their latenesses, and yaw none: they share their filters.
+def _share_latency(known: list[dict[str, _Part]]) -> None:
+    """Give roll and pitch the mean of their latencies, and yaw none: they share their filters.
 
-    What yaw answers late it answers to few steps.
+    Yaw has too few steps to estimate its latency.
     """
     late = [parts.pop("late") for parts in known if parts]
     if not all(known[:2]):
@@ -228,9 +228,9 @@ def _share_lateness(known: list[dict[str, _Part]]) -> None:
 
 
 def _regression(signals: Signals, axis: int) -> tuple[Array, Array]:
-    """Return columns (N, 3) and torque (N,), about their trends.
+    """Return columns (N, 3) and torque (N,), detrended.
 
-    What a recorded gyro reads when at rest is not what the loop heard, and its integral is a ramp.
+    The recorded gyro's bias is not that of the loop, and its integral is a ramp.
     """
     error, step = signals.error[:, axis], signals.step
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (error[1:] + error[:-1]))]) * step

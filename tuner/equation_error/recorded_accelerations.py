@@ -1,4 +1,4 @@
-"""What a flight's recording says of its accelerations, step by step, and of what made them."""
+"""Recorded accelerations of a flight, step by step, with motion and rotor speeds."""
 
 from __future__ import annotations
 
@@ -22,17 +22,16 @@ from tuner.vehicle.model import Model
 
 Mask = NDArray[np.bool_]
 
-FASTEST = 100.0
-"""Hz of the steps at most: gyro and tachometers are averaged over as long, which takes off noise,
-and vibrations that a step would otherwise fold down to what it tells. A loop answers what disturbs
-it later than that by most of a rotor's lag."""
-GAP = 2.5
-"""Gaps between samples beyond which a signal is unknown."""
+MAX_RATE_HZ = 100.0
+"""Largest rate of steps: gyro and tachometers are averaged over a step, which removes noise and
+aliased vibrations. A step is shorter than a rotor's lag, so that the loop responds after it."""
+MAX_GAP_PERIODS = 2.5
+"""Largest gap of a known signal, in periods."""
 MIN_SAMPLES = 100
-"""Known steps below which nothing is said."""
+"""Least number of known steps of a flight."""
 
 Commands = tuple[Series, ...]
-"""Of each flight."""
+"""Commands of each flight."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +50,12 @@ class Steps:
         (N, 4) rad/s and rad/s².
     accelerations
         (N, 6) specific force in m/s² and angular acceleration in rad/s², body axes, over the step;
-        NaN where something was not recorded. Where a gyro is averaged, that is the change of means
-        about a step's ends, each as long as a step.
+        NaN where something was not recorded. With an averaged gyro, the change of means about a
+        step's ends, each as long as a step.
     weights
         (2, m) of a rotor's samples about mid-step, in its mean and, in 1/s, in its acceleration.
-    inside
-        How many of them are a step.
+    samples_per_step
+        Rotor samples per step.
     noise
         rad/s, standard deviation of the white noise of a rotor's samples.
     """
@@ -68,26 +67,26 @@ class Steps:
     rotor_acceleration: Array
     accelerations: Array
     weights: Array
-    inside: int
+    samples_per_step: int
     noise: float
 
     @property
     def known(self) -> Mask:
-        """Of each step (N,), whether all of it was recorded."""
+        """Whether all of each step (N,) was recorded."""
         return np.asarray(np.isfinite(self.accelerations).all(axis=1))
 
 
 def steps_of(flight: Flight, *, input_late: float = 0.0, averaged: bool = False) -> Steps | None:
-    """Return what a flight with rotor speeds and body rates says; None where it says too little.
+    """Return the steps of a flight with rotor speeds; None where too little was recorded.
 
     Parameters
     ----------
     flight
-        With a pose.
+        A flight with a pose.
     input_late
         s by which rotor speeds are stamped later than the state.
     averaged
-        Whether to take means of a gyro that has several samples a step: of tachometers, too.
+        Whether to average a gyro with several samples a step, and tachometers likewise.
     """
     rotors = flight.series.get("rotor_speed")
     if rotors is None:
@@ -102,15 +101,15 @@ def steps_of(flight: Flight, *, input_late: float = 0.0, averaged: bool = False)
 def steps_with(
     flight: Flight, rotors: Series, *, noise: float, averaged: bool = False
 ) -> Steps | None:
-    """Return the same with rotor speeds on the clock of the state, of so much white noise."""
+    """Return the same for rotor speeds on the clock of the state, with their white noise."""
     series = flight.series
     if not {"position", "attitude", "body_rate"} <= set(series):
         return None
     gyro = series["body_rate"]
     if not np.isfinite(gyro.values).all():
         return None
-    rate = min(FASTEST, gyro.rate, rotors.rate)
-    inside, readings = (max(1, round(series.rate / rate)) for series in (rotors, gyro))
+    rate = min(MAX_RATE_HZ, gyro.rate, rotors.rate)
+    samples_per_step, readings = (max(1, round(series.rate / rate)) for series in (rotors, gyro))
     averaged = averaged and readings > 1
     begin = max(0.0, gyro.time[0], rotors.time[0])
     end = min(flight.duration, gyro.time[-1], rotors.time[-1])
@@ -119,11 +118,11 @@ def steps_with(
         return None
     edges = begin + np.arange(count + 1) / rate
     middle = 0.5 * (edges[1:] + edges[:-1])
-    weights = np.stack([_means(inside), np.zeros(inside + 1)])
+    weights = np.stack([_mean_weights(samples_per_step), np.zeros(samples_per_step + 1)])
     weights[1, [0, -1]] = -rate, rate
-    about = _means(readings) if averaged else np.ones(1)
+    about = _mean_weights(readings) if averaged else np.ones(1)
     if averaged:
-        weights = np.stack([np.convolve(row, _means(inside)) for row in weights])
+        weights = np.stack([np.convolve(row, _mean_weights(samples_per_step)) for row in weights])
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import, seldom needed)
 
     state, velocity = states_at(series, middle), _velocity(series, edges)
@@ -146,7 +145,7 @@ def steps_with(
         rotor_acceleration=np.zeros((count, 4)),
         accelerations=accelerations,
         weights=weights,
-        inside=inside,
+        samples_per_step=samples_per_step,
         noise=noise,
     )
     part = with_rotors(part, rotors)
@@ -155,12 +154,12 @@ def steps_with(
 
 def with_rotors(part: Steps, rotors: Series) -> Steps:
     """Return the steps with other rotor speeds; where these are unknown, so is the step."""
-    mean, change = _weighed(rotors, part.time, part.weights, part.step / part.inside)
+    mean, change = _weighed(rotors, part.time, part.weights, part.step / part.samples_per_step)
     there = np.isfinite(mean)
     known, usual = there.all(axis=1, keepdims=True), np.nanmean(mean) if there.any() else 0.0
     return replace(
         part,
-        # where it is unknown, one that some rotor might have: derivatives by none are not finite
+        # a usual speed where it is unknown: derivatives at zero are not finite
         rotor_speed=np.where(there, mean, usual),
         rotor_acceleration=np.nan_to_num(change),
         accelerations=np.where(known, part.accelerations, np.nan),
@@ -168,7 +167,7 @@ def with_rotors(part: Steps, rotors: Series) -> Steps:
 
 
 def without_gaps_of(series: Series, part: Steps) -> Steps:
-    """Return the steps, of which those in a signal's gaps are unknown."""
+    """Return the steps with those in a signal's gaps unknown."""
     known = np.isfinite(_read(series, part.time)).all(axis=1, keepdims=True)
     return replace(part, accelerations=np.where(known, part.accelerations, np.nan))
 
@@ -178,12 +177,12 @@ def read_commands(
 ) -> tuple[tuple[Steps, ...], tuple[Commands, Commands]] | None:
     """Return the steps of some flights; their commands, and the same of every second sample.
 
-    None where a flight says too little.
+    None where too little was recorded of a flight.
 
     Parameters
     ----------
     model
-        Whose motors follow the commands.
+        Gives the motors.
     flights
         Each with the s by which its commands are stamped late.
     rate
@@ -204,7 +203,7 @@ def read_commands(
     return tuple(steps), (tuple(commands), tuple(coarser))
 
 
-def steps_fed(
+def steps_by_inlet(
     inlet: InletName,
     model: Model,
     flights: Sequence[tuple[Flight, float]],
@@ -212,9 +211,9 @@ def steps_fed(
     *,
     averaged: bool = False,
 ) -> tuple[tuple[Steps, ...], tuple[Commands, ...]] | None:
-    """Return the steps of flights that enter by an inlet, and as `read_commands` what drives them.
+    """Return the steps of flights with an inlet, and their commands as of `read_commands`.
 
-    None where neither rotor speeds nor commands are fed in, or a flight says too little. Parameters
+    None where neither rotor speeds nor commands are fed in, or too little was recorded. Parameters
     are those of `read_commands` and `steps_of`.
     """
     if inlet == "rotor_speed":
@@ -225,7 +224,7 @@ def steps_fed(
 
 
 def rotor_response(model: Model, command: Series) -> Series:
-    """Return the rotor speeds (n, 4) that follow commands on a clock."""
+    """Return the rotor speeds (n, 4) in response to commands on a clock."""
     motor, late = model.vehicle.motor, float(model.vehicle.setup.actuator_latency)
     lags = MotorLags(float(motor.time_constant_up), float(motor.time_constant_down), late)
     step = float(command.time[1] - command.time[0])
@@ -233,7 +232,7 @@ def rotor_response(model: Model, command: Series) -> Series:
 
 
 def _held(flight: Flight, recorded: Series, rate: float, every: int) -> Series:
-    """Return one of so many recorded commands of a flight, on the loop's clock or their own."""
+    """Return a flight's commands, one of ``every``, on the loop's clock or their own if faster."""
     taken = Series(recorded.time[::every], recorded.values[::every])
     read = zero_order_hold if taken.rate * MAX_PERIODS > rate else linear_interpolation
     rate = max(rate, recorded.rate)
@@ -246,17 +245,17 @@ def rows_of(vector: Vec3) -> Array:
     return np.stack([np.asarray(vector.x), np.asarray(vector.y), np.asarray(vector.z)], axis=1)
 
 
-def _means(count: int) -> Array:
-    """Return the weights (count + 1,) of samples, so many a step, in their mean over one."""
+def _mean_weights(count: int) -> Array:
+    """Return the weights (count + 1,) of samples in the mean over a step of ``count`` periods."""
     weights = np.ones(count + 1) / count
     weights[[0, -1]] *= 0.5
     return weights
 
 
 def _weighed(series: Series, times: Array, weights: Array, spacing: float) -> Array:
-    """Return sums (r, n, k) of a signal about some times, by rows of weights (r, m) so far apart.
+    """Return weighted sums (r, n, k) of a signal about some times; NaN in gaps.
 
-    NaN in gaps.
+    Samples are ``spacing`` s apart; ``weights`` are (r, m).
     """
     size = weights.shape[1]
     fine = times[:, None] + (np.arange(size) - 0.5 * (size - 1)) * spacing
@@ -269,7 +268,7 @@ def _read(series: Series, times: Array) -> Array:
     after = np.clip(np.searchsorted(series.time, times), 1, len(series.time) - 1)
     gap = series.time[after] - series.time[after - 1]
     table = np.column_stack([np.interp(times, series.time, column) for column in series.values.T])
-    table[gap > GAP / series.rate] = np.nan
+    table[gap > MAX_GAP_PERIODS / series.rate] = np.nan
     return np.asarray(table)
 
 
@@ -283,10 +282,9 @@ def _velocity(series: Mapping[str, Series], edges: Array) -> Array:
 def _noise(rotors: Series) -> float:
     """Return the standard deviation, rad/s, of the white noise of tachometers.
 
-    What is left of third differences is noise, as large in every second sample and in every fourth,
-    and what a rotor really does between samples. The variance of the latter grows with the gap by
-    one factor each time: two as of a process of first order, or more. It is no noise that every
-    second sample does not show.
+    Third differences hold noise, equal for strides of 1, 2 and 4 samples, and the rotor's own
+    motion, whose variance grows with the stride by a constant factor: two for a first-order
+    process, or more. Noise is at most that of every second sample.
     """
     one, two, four = (
         float(np.nanmedian(white_noise(Series(rotors.time[::n], rotors.values[::n])))) ** 2

@@ -1,21 +1,20 @@
-"""Coefficients that meet recorded accelerations best, and what a regression has to know for it.
+"""Regression of recorded accelerations on the model's, consistent in closed loop.
 
-Four things spoil a plain regression of accelerations on what recorded rotors make:
+Four things bias or spoil ordinary least squares:
 
-- What disturbs a vehicle is not white, and the loop's rotors answer it: their torque then seems to
-  do little, for what it does it takes back. An answer comes after what it answers. So where errors
-  are predicted from those before them, and only what is new in each is weighed, the answer is no
-  part of it (Ljung, System Identification, 13.4: prediction errors with a noise model are
-  consistent in closed loop). The model is autoregressive, for each flight and axis, estimated from
-  what the regression leaves (iterated generalised least squares).
-- Rotor speeds are noisy, and noise in a regressor shrinks what stands before it. How the noise of
-  tachometers moves products of regressors is taken off them (Fuller, Measurement Error Models,
-  1987, 2.2).
-- A loop knows more of what disturbs its vehicle than a noisy log tells, and an answer to what
-  earlier errors do not predict is a part of what is new. Then that goes with what rotors did some
-  steps before, too, as it does where the model lacks a lag (residual test; Ljung, 16.6). As far as
-  this would lead, the regression may have been led (`misled`).
-- What the flights do not tell stays where it was believed to be: each coordinate has its prior.
+- Disturbances are not white, and the loop's rotors respond to them: their torque then seems to have
+  little effect. A response comes after its disturbance. So errors are predicted from earlier ones,
+  and only the innovations are weighted, which hold no response (Ljung, System Identification, 13.4:
+  prediction errors with a noise model are consistent in closed loop). The noise model is
+  autoregressive for each flight and axis, estimated from the residuals (iterated generalised least
+  squares).
+- Noise of rotor speeds attenuates their coefficients. Its effect on products of regressors is
+  subtracted (Fuller, Measurement Error Models, 1987, 2.2).
+- A loop sees more of a disturbance than a noisy log shows, and a response to it may be a part of
+  the innovations. These then correlate with earlier rotor signals, too, as they do where the model
+  omits a lag (residual test; Ljung, 16.6). The size of that correlation estimates the possible bias
+  (`feedback_bias`).
+- Some directions are not determined by the flights: each coordinate has its prior.
 """
 
 from __future__ import annotations
@@ -29,26 +28,26 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
 from tuner.core.numerics import Z95, Array, huber_weights, robust_sd
-from tuner.equation_error.model_accelerations import Linear, ModelAccelerations
+from tuner.equation_error.model_accelerations import LinearisedAccelerations, ModelAccelerations
 from tuner.equation_error.recorded_accelerations import Mask, Steps
 
-MEMORY = 0.1
-"""s of errors from which the next one is predicted."""
-ROUNDS = 8
-"""Of solving at most: plainly, then weighed, then with the noise of rotor speeds."""
-LONGEST = 0.7
-"""Step of a logarithm, or of a number over its prior's deviation, in a round."""
-SETTLED = 1e-3
-"""Step, likewise, below which a round has arrived."""
-FEWEST_UNITS = 3
-"""Flights from which each is left out in turn; fewer are cut into so many parts each."""
-MOST = 0.5
-"""Share of a direction's information that is taken off as noise."""
-ROBUST = 3.0
+MEMORY_S = 0.1
+"""Length of the autoregressive model of errors."""
+MAX_ROUNDS = 8
+"""Largest number of Gauss-Newton steps."""
+MAX_STEP = 0.7
+"""Largest step of a logarithm, or of a number over its prior's deviation: the linear range."""
+STEP_TOLERANCE = 1e-3
+"""Step, likewise, below which the iteration has converged."""
+MIN_UNITS = 3
+"""Least number of flights to leave out in turn; fewer are cut into so many parts each."""
+MAX_NOISE_SHARE = 0.5
+"""Largest share of a direction's information that is subtracted as noise."""
+HUBER_LIMIT = 3.0
 """Standard deviations beyond which an error counts linearly."""
 
-Filter = Callable[[Linear], Sequence[Array]]
-"""Of a flight: for each axis, what errors are convolved with before they are weighed."""
+Filter = Callable[[LinearisedAccelerations], Sequence[Array]]
+"""Flight -> for each axis, the kernel that filters its errors."""
 
 
 @dataclass(frozen=True)
@@ -70,14 +69,9 @@ class NormalEquations:
     pull: Array
 
     def solved(self, free: Mask, units: Mask | slice, moved: Array | None = None) -> Array:
-        """Return the change (K,) that meets some units (U,) best, of coordinates (K,) that move.
+        """Return the change (K,) of least loss of some units (U,) along free coordinates (K,).
 
-        Parameters
-        ----------
-        free, units
-            Which coordinates move, and which units are met.
-        moved
-            (K,) the change of those that do not; none by default.
+        ``moved`` (K,) is the given change of the others; zero by default.
         """
         change = np.zeros(len(free)) if moved is None else np.where(free, 0.0, moved)
         information = self.information[units].sum(axis=0) + np.diag(self.prior)
@@ -96,14 +90,14 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class Regression:
-    """Where a regression ends.
+    """Result of a regression.
 
     Attributes
     ----------
     point
         (K,) scaled coordinates.
     sums
-        About it.
+        Normal equations about it.
     covariance
         (K, K) of the coordinates, priors included.
     """
@@ -118,21 +112,21 @@ def regress(
     begin: Array,
     *,
     free: Mask,
-    memory: float = MEMORY,
+    memory: float = MEMORY_S,
     near: bool = False,
 ) -> Regression:
-    """Return the coordinates that meet recorded accelerations best.
+    """Return the regression of recorded accelerations.
 
     Parameters
     ----------
     begin
-        (K,) scaled coordinates from which it begins.
+        (K,) scaled coordinates of the start.
     free
-        (K,) which of them move.
+        (K,) which of them are free.
     memory
-        s, as `MEMORY`.
+        s, as `MEMORY_S`.
     near
-        Whether it begins near its end, so that errors are filtered from the first step on.
+        Whether the start is near the end, so that errors are filtered from the first step on.
     """
     mean = np.array([p.prior_mean for p in made.parameters])
     whitened, quiet = partial(whitening, memory=memory), made.noiseless
@@ -149,7 +143,7 @@ def regress(
 def minimised(
     made: ModelAccelerations, begin: Array, filters: Filter, *, mean: Array, free: Mask
 ) -> Array:
-    """Return the coordinates (K,) whose filtered errors are the least, by Gauss and Newton's steps.
+    """Return the coordinates (K,) of least filtered errors, by Gauss-Newton steps.
 
     Inside their bounds, with priors about a mean (K,); ``begin`` and ``free`` are as of `regress`.
     """
@@ -157,11 +151,11 @@ def minimised(
     low = np.array([p.scaled(p.lower) for p in made.parameters])
     high = np.array([p.scaled(p.upper) for p in made.parameters])
     point = np.array(begin, float)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         change = _sums_at(made, point, filters, mean, free).solved(free, slice(None))
-        step = np.clip(change, -LONGEST * unit, LONGEST * unit)
+        step = np.clip(change, -MAX_STEP * unit, MAX_STEP * unit)
         point = np.clip(point + step, low, high)
-        if np.abs(step / unit).max() < SETTLED:
+        if np.abs(step / unit).max() < STEP_TOLERANCE:
             break
     return point
 
@@ -171,63 +165,65 @@ def _sums_at(
 ) -> NormalEquations:
     """Return the normal equations about a point (K,), with priors about a mean (K,).
 
-    What the noise of rotor speeds makes of them is taken off.
+    The effect of noise of rotor speeds is subtracted.
     """
     prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
-    parts = 1 if len(made.flights) >= FEWEST_UNITS else FEWEST_UNITS
+    parts = 1 if len(made.flights) >= MIN_UNITS else MIN_UNITS
     by = np.flatnonzero(free) if free.any() else np.arange(len(free))
     sums = [filtered_sums(one, filters(one), parts) for one in made.at(point, by)]
     information, slope, loss, noise, crossed = (
-        _among(len(free), by, np.concatenate(some)) for some in zip(*sums, strict=True)
+        _embedded(len(free), by, np.concatenate(some)) for some in zip(*sums, strict=True)
     )
     if made.noisy:
-        taken = _taken(information.sum(axis=0) + np.diag(prior), noise.sum(axis=0), free)
+        taken = _noise_limiter(information.sum(axis=0) + np.diag(prior), noise.sum(axis=0), free)
         information -= taken @ noise @ taken.T
         slope += crossed @ (taken @ taken).T
     return NormalEquations(information, slope, loss, prior, prior * (mean - point))
 
 
-def _among(count: int, by: NDArray[np.intp], sums: Array) -> Array:
-    """Return sums (U, k) or (U, k, k) among those of all K coordinates, of which others are 0."""
+def _embedded(count: int, by: NDArray[np.intp], sums: Array) -> Array:
+    """Return sums (U, k) or (U, k, k) in the space of all K coordinates, zero elsewhere."""
     whole = np.zeros((len(sums), *[count] * (sums.ndim - 1)))
     whole[np.ix_(np.arange(len(sums)), *[by] * (sums.ndim - 1))] = sums
     return whole
 
 
-def _taken(information: Array, noise: Array, free: Mask) -> Array:
-    """Return what (K, K) limits the part of information (K, K) that noise made, on both its sides.
+def _noise_limiter(information: Array, noise: Array, free: Mask) -> Array:
+    """Return the matrix (K, K) that limits noise (K, K), multiplied from both sides.
 
-    Of each direction of the coordinates that move no more than `MOST` of the information is noise:
-    where it is said to be more, as of signals that were smoothed, it is not white, and what is
-    left would have no minimum (Fuller, 2.5.1, limits the correction for that reason).
+    In each free direction at most `MAX_NOISE_SHARE` of the information is noise: a larger estimate
+    is of noise that is not white, as in smoothed signals, and the corrected loss would have no
+    minimum (Fuller, 2.5.1, limits the correction for that reason).
     """
     inside = np.ix_(free, free)
     unit = np.sqrt(np.diag(information)[free])
     root = np.linalg.cholesky(information[inside] / np.outer(unit, unit)) * unit[:, None]
     inverse = np.linalg.inv(root)
     shares, along = np.linalg.eigh(inverse @ noise[inside] @ inverse.T)
-    limit = np.sqrt(np.minimum(1.0, MOST / np.maximum(shares, MOST)))
+    limit = np.sqrt(np.minimum(1.0, MAX_NOISE_SHARE / np.maximum(shares, MAX_NOISE_SHARE)))
     taken = np.eye(len(free))
     taken[inside] = root @ (along * limit) @ along.T @ inverse
     return taken
 
 
-def misled(made: ModelAccelerations, found: Regression, *, free: Mask, memory: float) -> Array:
-    """Return how far (K,) what no model of noise predicts may have led a regression.
+def feedback_bias(
+    made: ModelAccelerations, found: Regression, *, free: Mask, memory: float
+) -> Array:
+    """Return the possible bias (K,) of a regression by responses of the loop.
 
-    The root mean square, over the steps of its memory, of the changes that it would make if new
-    errors went with what moves them now as they go with what moved them so many steps before. They
-    would not at all if the model were right and the log told all that the loop knows.
+    The root mean square, over the lags of the noise model, of the changes that the estimates would
+    make if innovations had the correlation with present regressors that they have with earlier
+    ones. That is zero for a correct model and a log of all that the loop sees.
     """
     slopes: dict[int, Array] = {}
     for one in made.at(found.point):
         for axis, kernel in enumerate(whitening(one, memory)):
-            table = np.column_stack([one.left[:, axis], one.columns[:, axis]])
+            table = np.column_stack([one.errors[:, axis], one.columns[:, axis]])
             rows = convolved(table, one.steps.known, kernel)
             if not len(rows):
                 continue
             rows /= spread(rows[:, 0])
-            errors, columns = rows[:, 0] * huber_weights(rows[:, 0], ROBUST), rows[:, 1:]
+            errors, columns = rows[:, 0] * huber_weights(rows[:, 0], HUBER_LIMIT), rows[:, 1:]
             for lag in range(1, len(kernel)):
                 slope = errors[lag:] @ columns[: len(columns) - lag]
                 slopes[lag] = slopes.get(lag, 0.0) + slope
@@ -240,18 +236,18 @@ def misled(made: ModelAccelerations, found: Regression, *, free: Mask, memory: f
 
 
 def filtered_sums(
-    one: Linear, kernels: Sequence[Array], parts: int
+    one: LinearisedAccelerations, kernels: Sequence[Array], parts: int
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return information (U, K, K), slope (U, K) and loss (U,) of a flight in so many parts.
 
-    Of errors that are filtered, each axis by a kernel of its own. Then what of information and
-    slope (U, K, K) and (U, K) the noise of rotor speeds makes.
+    Errors of each axis are filtered by its kernel. And the part of information and slope (U, K, K)
+    and (U, K) that noise of rotor speeds makes.
     """
     size, steps = one.columns.shape[-1], one.steps
     information, slope, loss = (np.zeros((parts, *k)) for k in ((size, size), (size,), ()))
     noise, crossed = (np.broadcast_to(0.0, made.shape) for made in (information, slope))
     for axis, kernel in enumerate(kernels):
-        table = np.column_stack([one.left[:, axis], one.columns[:, axis]])
+        table = np.column_stack([one.errors[:, axis], one.columns[:, axis]])
         rows = convolved(table, steps.known, kernel)
         if not len(rows):
             continue
@@ -259,7 +255,7 @@ def filtered_sums(
         counts = np.zeros(parts)
         for unit, stretch in enumerate(np.array_split(rows / sigma, parts)):
             errors, columns = stretch[:, 0], stretch[:, 1:]
-            robust = huber_weights(errors, ROBUST)
+            robust = huber_weights(errors, HUBER_LIMIT)
             weighed = columns * robust[:, None]
             loss[unit] += 0.5 * float(np.sum(robust * errors**2))
             information[unit] += weighed.T @ columns
@@ -267,15 +263,17 @@ def filtered_sums(
             counts[unit] = robust.sum()
         if steps.noise > 0.0:
             gain = (steps.noise / sigma) ** 2 * _noise_gain(kernel, steps)
-            noise = noise + np.multiply.outer(counts, np.tensordot(gain, one.moved[:, :, axis]))
+            noise = noise + np.multiply.outer(
+                counts, np.tensordot(gain, one.noise_products[:, :, axis])
+            )
             crossed = crossed + np.multiply.outer(
-                counts, np.tensordot(gain, one.crossed[:, :, axis])
+                counts, np.tensordot(gain, one.noise_cross[:, :, axis])
             )
     return information, slope, loss, noise, crossed
 
 
 def convolved(table: Array, known: Mask, kernel: Array) -> Array:
-    """Return the rows of a table (N, k) filtered by a kernel, where all that it spans is known."""
+    """Return the rows of a table (N, k) filtered by a kernel, where all rows in it are known."""
     if len(table) < len(kernel):
         return np.empty((0, table.shape[1]))
     table = np.where(known[:, None], table, 0.0)
@@ -294,20 +292,20 @@ def summing(step: float, seconds: float) -> Array:
     return np.ones(max(1, round(seconds / step))) * step
 
 
-def _plain(one: Linear) -> Sequence[Array]:
-    return [np.ones(1)] * one.left.shape[1]
+def _plain(one: LinearisedAccelerations) -> Sequence[Array]:
+    return [np.ones(1)] * one.errors.shape[1]
 
 
-def whitening(one: Linear, memory: float) -> Sequence[Array]:
-    """Return for each axis the filter that leaves of errors what those before do not predict."""
+def whitening(one: LinearisedAccelerations, memory: float) -> Sequence[Array]:
+    """Return the whitening filter of errors for each axis."""
     order = max(1, round(memory / one.steps.step))
-    return [whitening_filter(errors, one.steps.known, order) for errors in one.left.T]
+    return [whitening_filter(errors, one.steps.known, order) for errors in one.errors.T]
 
 
 def whitening_filter(errors: Array, known: Mask, order: int) -> Array:
-    """Return the filter that leaves of errors (N,) what so many before do not predict."""
+    """Return the filter from errors (N,) to innovations, by autoregression of an order."""
     whole = np.lib.stride_tricks.sliding_window_view(known, order + 1).all(axis=1)
-    limit = 2.0 * ROBUST * spread(errors[known])
+    limit = 2.0 * HUBER_LIMIT * spread(errors[known])
     errors = np.clip(np.where(known, errors, 0.0), -limit, limit)
     rows = np.lib.stride_tricks.sliding_window_view(errors, order + 1)[whole]
     predicted = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-9)[0]
@@ -315,21 +313,21 @@ def whitening_filter(errors: Array, known: Mask, order: int) -> Array:
 
 
 def _noise_gain(kernel: Array, steps: Steps) -> Array:
-    """Return the covariance (2, 2) of what is filtered over the variance of a rotor's sample.
+    """Return the covariance (2, 2) of filtered noise over the variance of a rotor's sample.
 
-    Of the mean of the rotor's samples in a step, and of their acceleration.
+    Noise of the mean of the rotor's samples in a step, and of their acceleration.
     """
-    each = np.zeros(steps.inside * (len(kernel) - 1) + 1)
-    each[:: steps.inside] = kernel
+    each = np.zeros(steps.samples_per_step * (len(kernel) - 1) + 1)
+    each[:: steps.samples_per_step] = kernel
     made = np.stack([np.convolve(each, samples[::-1]) for samples in steps.weights])
     return np.asarray(made @ made.T)
 
 
 def _covariance(sums: NormalEquations, free: Mask) -> Array:
-    """Return the coordinates' covariance: of what is new in errors, or of leaving units out.
+    """Return the coordinates' covariance: by innovations, or by leaving units out if larger.
 
-    The larger of both for each coordinate: errors that are not as their model has them scatter from
-    flight to flight, which a few flights tell roughly (Student). What does not move has none.
+    Errors that violate the noise model scatter from flight to flight; a few flights show that
+    roughly (Student). Fixed coordinates have no variance.
     """
     count, unit = len(sums.slope), sums.prior[free] ** -0.5
     information = sums.information.sum(axis=0) + np.diag(sums.prior)

@@ -21,7 +21,7 @@ from sim_jax.geometry import Vec3
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
 from tuner.equation_error.model_accelerations import ModelAccelerations
-from tuner.equation_error.recorded_accelerations import Steps, steps_fed
+from tuner.equation_error.recorded_accelerations import Steps, steps_by_inlet
 from tuner.objective.battery import with_reference_voltage
 from tuner.recordings.flight import Flight
 from tuner.vehicle import ControllerFile, VehicleFile
@@ -110,9 +110,9 @@ def _residual_acceleration(
     flight, inlet, late = fed
     model = model_of(with_reference_voltage(vehicle, [flight]), controller)
     rate = float(schedule_of(controller).rate_control_rate)
-    found = steps_fed(inlet, model, [(flight, late)], rate)
+    found = steps_by_inlet(inlet, model, [(flight, late)], rate)
     if found is None:
         return None
     (part,) = found[0]
     (one,) = ModelAccelerations(model, (), (part,)).noiseless.at(np.zeros(0))
-    return part, np.where(part.known[:, None], np.nan_to_num(one.left[:, 3:]), 0.0)
+    return part, np.where(part.known[:, None], np.nan_to_num(one.errors[:, 3:]), 0.0)

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.errors import ConfigError
-from tuner.equation_error.estimate import GAINS, Estimate, estimate
+from tuner.equation_error.estimate import TORQUE_GAINS, Estimate, estimate
 from tuner.equation_error.model_accelerations import moves_rotors
-from tuner.equation_error.recorded_accelerations import steps_fed
+from tuner.equation_error.recorded_accelerations import steps_by_inlet
 from tuner.findings.findings import Code, Finding
 from tuner.objective.space import extended
 from tuner.search.problem import Job, job_of
@@ -31,7 +31,7 @@ OF_INERTIA = (
     ROTOR_INERTIA,
     "moment_constant",
 )
-"""What a search of simulations could not tell from `GAINS`."""
+"""What a search of simulations could not tell from `TORQUE_GAINS`."""
 INFLOW = "max_relative_airspeed"
 """No term that a vehicle may lack, but one whose law many vehicles do not follow."""
 
@@ -49,16 +49,16 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
         return job, ()
     fitted = [(r.flight, r.input_late) for r in job.recordings if not r.holdout]
     rate = float(job.objective.schedule.rate_control_rate)
-    steps = steps_fed(job.inlets[0], job.objective.model, fitted, rate, averaged=True)
+    steps = steps_by_inlet(job.inlets[0], job.objective.model, fitted, rate, averaged=True)
     if steps is None:
         return job, ()
     candidates = dict(candidate_groups(job))
     if INFLOW not in (*job.space.free, *own.fixed):
         candidates[INFLOW] = (INFLOW,)
     names = [name for group in candidates.values() for name in group]
-    effects = neutral_values_of([n for n in (*names, *GAINS) if COEFFICIENTS[n].is_effect])
+    effects = neutral_values_of([n for n in (*names, *TORQUE_GAINS) if COEFFICIENTS[n].is_effect])
     given = initial_values(settings.vehicle, settings.controller, names)
-    space = extended(job.space, [*names, *GAINS], settings.job, {**given, **effects})
+    space = extended(job.space, [*names, *TORQUE_GAINS], settings.job, {**given, **effects})
     candidates.pop(ROTOR_INERTIA, None)
     found = estimate(job.objective.model, space, candidates, *steps)
     if found.turning >= ENOUGH:

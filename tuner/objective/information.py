@@ -427,7 +427,7 @@ def information_at(
 def _astray(
     objective: Objective, jacobian: Jacobian, crashed: NDArray[np.bool_]
 ) -> NDArray[np.bool_] | None:
-    """Return which segments (F,) crashed or are `ASTRAY_RATIO` in some channel, if the loop is closed.
+    """Return which segments (F,) of a closed loop crashed or exceed `ASTRAY_RATIO` in a channel.
 
     An attitude has no mean.
     """

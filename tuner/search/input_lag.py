@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sim_jax.constants import GRAVITY
 from tuner.core.numerics import Array
 from tuner.equation_error.recorded_accelerations import Mask, steps_with, with_rotors
-from tuner.equation_error.regression import MEMORY, convolved, whitening_filter
+from tuner.equation_error.regression import MEMORY_S, convolved, whitening_filter
 from tuner.objective.inlets import INLETS, linear_interpolation
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import states_at
@@ -113,7 +113,7 @@ def _turning_log_likelihoods(
         return [0.0] * len(at)
     parts = [with_rotors(steps, Series(rotors.time - late, rotors.values)) for late in at]
     known = np.all([part.known for part in parts], axis=0)
-    order = max(1, round(MEMORY / steps.step))
+    order = max(1, round(MEMORY_S / steps.step))
     new = [
         [
             _innovation_variance(steps.accelerations[:, 3 + axis], columns, known, order)

@@ -28,7 +28,7 @@ from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Array
-from tuner.equation_error.omitted_laws import Law, Pair, unexplained
+from tuner.equation_error.omitted_laws import Law, StepsPair, find_omitted_laws
 from tuner.equation_error.rate_controller import (
     AXES,
     PARTS,
@@ -192,7 +192,9 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
         if (gain := gain_by_commands(name, estimates)) is not None and abs(gain[0] - 1.0) > gain[1]:
             gain_shifts[name] = float(np.sqrt((gain[0] - 1.0) ** 2 - gain[1] ** 2))
     pairs = {
-        number: Pair(one, _simulated(one, flown.channels, conditions, number, rate), by_command)
+        number: StepsPair(
+            one, _simulated(one, flown.channels, conditions, number, rate), by_command
+        )
         for number, (one, by_command) in enumerate(zip(read, driven, strict=True))
         if one is not None and usable[number]
     }
@@ -200,7 +202,7 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
         return ModelErrors((), None, differing, gains=gain_shifts).or_none
     scaled = np.asarray(objective.space.scaled(point.coefficients))
     parameters = objective.space.parameters
-    found = unexplained(model, parameters, scaled, tuple(pairs.values()))
+    found = find_omitted_laws(model, parameters, scaled, tuple(pairs.values()))
     if not found.laws:
         return ModelErrors((), None, differing, found.speed_lag, gain_shifts).or_none
     body = model.vehicle.body

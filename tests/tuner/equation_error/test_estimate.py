@@ -11,20 +11,20 @@ import pytest
 from benchmarks import fast_flights
 from tuner.config import Options, resolve_settings
 from tuner.config.job import Search
-from tuner.equation_error.estimate import GAINS
-from tuner.equation_error.model_accelerations import Linear
+from tuner.equation_error.estimate import TORQUE_GAINS
+from tuner.equation_error.model_accelerations import LinearisedAccelerations
 from tuner.equation_error.recorded_accelerations import (
     read_commands,
-    steps_fed,
+    steps_by_inlet,
     steps_of,
     without_gaps_of,
 )
 from tuner.equation_error.regression import (
-    MEMORY,
+    MEMORY_S,
     NormalEquations,
     Regression,
+    feedback_bias,
     filtered_sums,
-    misled,
     regress,
     whitening,
 )
@@ -78,7 +78,7 @@ def test_errors_hold_tachometers_whose_noise_is_a_quarter_more(flown, begun, mon
     _, settings, recordings = flown
     found, job = begun[1].accelerations, job_of(settings, recordings)
     with monkeypatch.context() as known:
-        known.setattr("tuner.equation_error.estimate.NOISE_KNOWN", 0.0)
+        known.setattr("tuner.equation_error.estimate.NOISE_UNCERTAINTY", 0.0)
         certain = with_accelerations(job)[0].accelerations
 
     def noisier(flight, **given):
@@ -98,9 +98,9 @@ def test_errors_hold_tachometers_whose_noise_is_a_quarter_more(flown, begun, mon
 def test_errors_hold_what_another_memory_moves(flown, begun, monkeypatch, times):
     _, settings, recordings = flown
 
-    def moved(made, begin, *, memory=MEMORY, **given):
+    def moved(made, begin, *, memory=MEMORY_S, **given):
         found = regress(made, begin, memory=memory, **given)
-        return replace(found, point=found.point + (0.5 if memory == times * MEMORY else 0.0))
+        return replace(found, point=found.point + (0.5 if memory == times * MEMORY_S else 0.0))
 
     monkeypatch.setattr("tuner.equation_error.estimate.regress", moved)
     found = with_accelerations(job_of(settings, recordings))[0].accelerations
@@ -113,10 +113,10 @@ def test_errors_hold_how_far_a_regression_was_misled(flown, begun, monkeypatch):
     _, settings, recordings = flown
 
     def half(made, found, **given):
-        assert misled(made, found, **given).shape == found.point.shape
+        assert feedback_bias(made, found, **given).shape == found.point.shape
         return np.full_like(found.point, 0.5)
 
-    monkeypatch.setattr("tuner.equation_error.estimate.misled", half)
+    monkeypatch.setattr("tuner.equation_error.estimate.feedback_bias", half)
     found = with_accelerations(job_of(settings, recordings))[0].accelerations
     for name in TILTING:
         assert found.errors[name] > 0.4 > begun[1].accelerations.errors[name] + 0.1
@@ -134,7 +134,7 @@ def test_errors_of_others_hold_what_the_power_of_thrust_moves(flown, monkeypatch
         found = regress(made, begin, free=free, **given)
         return replace(found, point=found.point + (0.5 if without else 0.0))
 
-    monkeypatch.setattr("tuner.equation_error.estimate.POWER", "motor_constant")
+    monkeypatch.setattr("tuner.equation_error.estimate.THRUST_EXPONENT", "motor_constant")
     monkeypatch.setattr("tuner.equation_error.estimate.regress", moved)
     errors = with_accelerations(job_of(settings, recordings))[0].accelerations.errors
     assert all(errors[name] > 0.4 for name in TILTING)
@@ -217,13 +217,13 @@ def test_what_comes_a_step_late_is_in_the_errors(lags):
     left[:, 0] = lags * np.roll(moves, 1) + 0.5 * random.normal(size=size)
     columns[:, 0, 0] = moves
     steps = SimpleNamespace(step=0.01, known=np.ones(size, bool), noise=0.0)
-    one, memory = Linear(steps, left, columns, np.zeros(0), np.zeros(0)), 0.05
+    one, memory = LinearisedAccelerations(steps, left, columns, np.zeros(0), np.zeros(0)), 0.05
     sums = filtered_sums(one, whitening(one, memory), 1)[:3]
     found = Regression(
         np.zeros(1), NormalEquations(*sums, np.array([1e-6]), np.zeros(1)), np.zeros((1, 1))
     )
     made = SimpleNamespace(at=lambda _: (one,))
-    (error,) = misled(made, found, free=np.ones(1, bool), memory=memory)
+    (error,) = feedback_bias(made, found, free=np.ones(1, bool), memory=memory)
     chance = 0.5 / np.sqrt(size)
     assert error == pytest.approx(np.hypot(lags / np.sqrt(5.0), chance), abs=chance)
 
@@ -302,7 +302,9 @@ def test_rotor_speeds_that_are_stamped_late_are_taken_on_time(flown):
     flight, late = flown[2][0].flight, 0.02
     rotors = flight.series["rotor_speed"]
     stamped = {**flight.series, "rotor_speed": Series(rotors.time + late, rotors.values)}
-    (taken,), _ = steps_fed("rotor_speed", None, [(replace(flight, series=stamped), late)], 0.0)
+    (taken,), _ = steps_by_inlet(
+        "rotor_speed", None, [(replace(flight, series=stamped), late)], 0.0
+    )
     true = steps_of(flight)
     inside = (true.time > 1.0) & (true.time < SECONDS - 1.0)
     for row, time in zip(true.rotor_speed[inside], true.time[inside], strict=True):
@@ -336,7 +338,7 @@ def test_the_search_begins_there_and_leaves_inertia_alone(flown, begun):
     assert job.given.vehicle == settings.vehicle
     assert job.settings.vehicle.inertia.xx == job.accelerations.values["inertia_xx"]
     assert "rotor_inertia" in job.accelerations.values
-    assert set(GAINS) <= set(job.space.names)
+    assert set(TORQUE_GAINS) <= set(job.space.names)
     assert not set(job.space.names) & {*TILTING, "inertia_zz", "rotor_inertia", "moment_constant"}
     assert job.settings.job.search.window == finding.numbers["seconds"]
     assert 0.0 < finding.numbers["explained_x"] < 0.9
@@ -344,7 +346,7 @@ def test_the_search_begins_there_and_leaves_inertia_alone(flown, begun):
 
 def test_gains_are_less_than_all_of_the_turning(begun):
     _, job, _ = begun
-    gains = [job.accelerations.values[name] for name in GAINS]
+    gains = [job.accelerations.values[name] for name in TORQUE_GAINS]
     assert max(gains[:2]) < 0.8
     assert 0.8 < gains[2] < 1.2
 
