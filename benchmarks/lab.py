@@ -32,7 +32,7 @@ from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
 from tuner.findings.findings import Code, Finding, one_line
-from tuner.job.run import prepared
+from tuner.job.run import prepare
 from tuner.objective.battery import VOLTAGE, log_voltage_of
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight
@@ -255,7 +255,7 @@ def _task(seed: int, report: Report) -> Trial:
 def job_at(lab: Lab, folder: Path, *, seed: int) -> tuple[Job, tuple[Finding, ...]]:
     """Fly a laboratory; return the job of fitting its flights, and what is said before."""
     paths = write(lab, folder, seed=seed)
-    return prepared(
+    return prepare(
         resolve_settings(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
     )
 

@@ -1,12 +1,12 @@
-"""The covariance of a Kalman filter of one segment, row by row: what kernels compute in loops.
+"""The covariance of a Kalman filter of one segment, row by row, for loops of compiled kernels.
 
-Propagated column by column, through the loop's own derivative: F P Fᵀ takes twice as many steps of
-the linearised loop as the state has numbers, where products of matrices would take many times the
-operations. The m samples of a tick, whose noise is independent, are taken one after the other
+It is propagated column by column through the loop's own derivative: F P Fᵀ takes twice as many
+steps of the linearised loop as the state has numbers, many times fewer operations than matrix
+products. The m samples of a tick, whose noise is independent, are processed one after the other
 (Anderson and Moore, "Optimal filtering", 1979, 6.4), which is the Cholesky factorisation of their
-covariance, row by row; what all of them tell is taken off the covariance as it is propagated.
-It is made symmetric now and then: no sample corrects a difference between its halves, which an
-unstable vehicle lets grow from rounding errors until variances are negative.
+covariance, row by row; their information is subtracted as the covariance is propagated. It is made
+symmetric now and then: with an unstable vehicle rounding errors between its halves, which no sample
+corrects, would grow until variances are negative.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from jax import Array, lax
 
 from lanes import dependent
 
-MADE_SYMMETRIC = 16
+SYMMETRISED_EVERY = 16
 """Ticks after which the covariance is made symmetric again."""
-BESIDE = 16
-"""Numbers of a row that stay in registers while others are added to them."""
+ROW_BLOCK = 16
+"""Numbers of a row that are summed in registers at a time."""
 
 
 class Sparse(NamedTuple):
@@ -35,9 +35,9 @@ class Sparse(NamedTuple):
     rows
         Each row's columns that are not zero.
     groups
-        Of each column: those of one group meet in no row.
+        Group of each column: no two of a group have a common row.
     values
-        (groups, rows) each row's number in the column of a group that it has.
+        (groups, rows) each row's value in its column of a group.
     """
 
     rows: tuple[tuple[int, ...], ...]
@@ -46,10 +46,10 @@ class Sparse(NamedTuple):
 
     @staticmethod
     def of(push: Callable[[list[Array]], list[Array]], columns: int) -> Sparse:
-        """Return the matrix of a linear map of so many numbers, given each by itself, to vectors.
+        """Return the matrix of a linear map of ``columns`` numbers, given one by one, to vectors.
 
-        A group of columns is pushed at once: Curtis, Powell and Reid, "On the estimation of sparse
-        Jacobian matrices", 1974.
+        A group of columns is evaluated at once: Curtis, Powell and Reid, "On the estimation of
+        sparse Jacobian matrices", 1974.
         """
         closed = jax.make_jaxpr(push)([jnp.zeros(())] * columns)
         found = dependent(closed.jaxpr, [1 << number for number in range(columns)])
@@ -77,30 +77,30 @@ class Samples(NamedTuple):
     ----------
     error, variance
         (m,) their errors and the variances of their noise.
-    seen
+    derivatives
         (m, s) errors' derivatives by the first s numbers of the state.
-    order, many
-        Which there are in any lane, by a number below ``many``: others are skipped.
+    order, used
+        Function from a number below ``used`` to the row of a sample that some lane has.
     """
 
     error: Array
     variance: Array
-    seen: Sparse
+    derivatives: Sparse
     order: Callable[[Array], Array]
-    many: Array
+    used: Array
 
 
 class Innovations(NamedTuple):
-    """What the samples of a tick tell.
+    """The innovations of a tick's samples.
 
     Attributes
     ----------
     table
-        (m, m + 2): the triangular root of their covariance, innovations that it whitens, and the
+        (m, m + 2): the triangular root of their covariance, the whitened innovations, and the
         variances of noise.
     gain
-        (m, n) corrections for one standard deviation of each; of samples that were skipped those of
-        a tick before.
+        (m, n) corrections for one standard deviation of each; those of skipped samples are of an
+        earlier tick.
     """
 
     table: Array
@@ -117,7 +117,7 @@ class Innovations(NamedTuple):
         return self.table[:, -2]
 
     def corrections(self, samples: Samples, weights: Array) -> Array:
-        """Return the sum (n,) of the gains of what was sampled, each times its weight (m,)."""
+        """Return the sum (n,) of the samples' gains, each times its weight (m,)."""
         wide, size = self.gain.shape
         # in memory, where a loop reads them by number
         table = lax.dynamic_update_slice(self.table, weights[:, None], (0, wide + 1))
@@ -127,35 +127,35 @@ class Innovations(NamedTuple):
                 i = samples.order(number)
                 return so_far + _entry(table, i, wide + 1) * _part(self.gain, i, first, count)
 
-            found: Array = lax.fori_loop(0, samples.many, add, jnp.zeros(count))
+            found: Array = lax.fori_loop(0, samples.used, add, jnp.zeros(count))
             return found
 
         return jnp.concatenate([total(*part) for part in _side_by_side(size)])
 
 
 def innovations_of(covariance: Array, gain: Array, samples: Samples) -> Innovations:
-    """Return what samples tell of a state (n,) of known covariance; ``gain`` is written over."""
+    """Return the innovations of samples for a state's covariance; ``gain`` is overwritten."""
     wide, size = gain.shape
-    most = max(map(len, samples.seen.rows))
-    # how many columns of each row are not zero, which, and of which group
+    most = max(map(len, samples.derivatives.rows))
+    # count of each row's nonzero columns, the columns, and their groups
     known = [
-        [len(row), *row, *[0] * (most - len(row)), *(samples.seen.groups[k] for k in row)]
-        for row in samples.seen.rows
+        [len(row), *row, *[0] * (most - len(row)), *(samples.derivatives.groups[k] for k in row)]
+        for row in samples.derivatives.rows
     ]
     places = jnp.asarray(np.array([row + [0] * (2 * most + 1 - len(row)) for row in known]))
 
     def by_state(i: Array, of: Callable[[Array, Array], Array], start: Array) -> Array:
-        """Add up what is made of each derivative of a sample and its place in the state."""
+        """Sum a function of each derivative of a sample and its place in the state."""
 
         def add(number: Array, total: Array) -> Array:
             place, group = _entry(places, i, number + 1), _entry(places, i, number + 1 + most)
-            return total + of(_entry(samples.seen.values, group, i), place)
+            return total + of(_entry(samples.derivatives.values, group, i), place)
 
         total: Array = lax.fori_loop(0, _entry(places, i, 0), add, start)
         return total
 
-    def take(number: Array, told: Innovations) -> Innovations:
-        table, gain = told
+    def take(number: Array, update: Innovations) -> Innovations:
+        table, gain = update
         i = samples.order(number)
 
         def factor(earlier: Array, table: Array) -> Array:
@@ -188,32 +188,32 @@ def innovations_of(covariance: Array, gain: Array, samples: Samples) -> Innovati
 
     unit = jnp.where(jnp.arange(wide)[:, None] == jnp.arange(wide), 1.0, 0.0)
     table = jnp.concatenate([unit, samples.error[:, None], samples.variance[:, None]], axis=1)
-    told: Innovations = lax.fori_loop(0, samples.many, take, Innovations(table, gain))
-    return told
+    update: Innovations = lax.fori_loop(0, samples.used, take, Innovations(table, gain))
+    return update
 
 
 def propagated(
     matrices: tuple[Array, Array],
-    told: Innovations,
+    update: Innovations,
     samples: Samples,
-    follow: Callable[[Array], Array],
-    unrest: Array,
+    transition: Callable[[Array], Array],
+    process_noise: Array,
     *,
-    keeps: Array,
+    retention: Array,
     tick: Array,
 ) -> tuple[Array, Array]:
-    """Return F (P - W Wᵀ) Fᵀ + Q: a tick later, when samples have told what they do.
+    """Return the covariance a tick later, F (P - W Wᵀ) Fᵀ + Q.
 
     Parameters
     ----------
     matrices
-        P (n, n), and one of the same size which is written over, as P is; both are returned.
-    told, samples
-        Whose gains are W.
-    follow, unrest
+        P (n, n), and scratch of the same size; both are overwritten and returned.
+    update, samples
+        Their gains are W.
+    transition, process_noise
         F, as a function of a column, and the diagonal (n,) of Q.
-    keeps
-        (D,) the share that each of the last numbers keeps of itself, all that F does to them.
+    retention
+        (D,) factors of F on the last numbers of the state, the disturbances.
     tick
         Its number.
     """
@@ -223,35 +223,35 @@ def propagated(
     def known_better(j: Array, first: int, count: int) -> Array:
         def less(number: Array, rest: Array) -> Array:
             i = samples.order(number)
-            return rest - _entry(told.gain, i, j) * _part(told.gain, i, first, count)
+            return rest - _entry(update.gain, i, j) * _part(update.gain, i, first, count)
 
-        rest: Array = lax.fori_loop(0, samples.many, less, _part(covariance, j, first, count))
+        rest: Array = lax.fori_loop(0, samples.used, less, _part(covariance, j, first, count))
         return rest
 
     def first(j: Array, into: Array) -> Array:
         rest = [known_better(j, *part) for part in _side_by_side(size)]
-        return _with_row(into, j, follow(jnp.concatenate(rest)))
+        return _with_row(into, j, transition(jnp.concatenate(rest)))
 
     scratch = lax.fori_loop(0, size, first, scratch)
 
     def second(i: Array, into: Array) -> Array:
-        return _with_row(into, i, follow(_column(scratch, i)))
+        return _with_row(into, i, transition(_column(scratch, i)))
 
     def kept(number: Array, into: Array) -> Array:
-        i = number + size - len(keeps)
-        return _with_row(into, i, at(keeps, number) * row(scratch, i, size))
+        i = number + size - len(retention)
+        return _with_row(into, i, at(retention, number) * row(scratch, i, size))
 
     def added(i: Array, matrix: Array) -> Array:
-        return _with_entry(matrix, i, i, _entry(matrix, i, i) + at(unrest, i))
+        return _with_entry(matrix, i, i, _entry(matrix, i, i) + at(process_noise, i))
 
-    covariance = lax.fori_loop(0, size - len(keeps), second, covariance)
-    covariance = lax.fori_loop(0, len(keeps), kept, covariance)
+    covariance = lax.fori_loop(0, size - len(retention), second, covariance)
+    covariance = lax.fori_loop(0, len(retention), kept, covariance)
     covariance = lax.fori_loop(0, size, added, covariance)
-    return _symmetric(covariance, jnp.where(tick % MADE_SYMMETRIC == 0, size, 0)), scratch
+    return _symmetric(covariance, jnp.where(tick % SYMMETRISED_EVERY == 0, size, 0)), scratch
 
 
 def _symmetric(matrix: Array, count: Array) -> Array:
-    """Return a square matrix whose first rows and columns, so many, are the mean of both."""
+    """Return a square matrix with its first ``count`` rows and columns made symmetric."""
 
     def mean(i: Array, matrix: Array) -> Array:
         both = 0.5 * (row(matrix, i, len(matrix)) + _column(matrix, i))
@@ -262,7 +262,7 @@ def _symmetric(matrix: Array, count: Array) -> Array:
 
 
 def rows_of(function: Callable[[Array], Array], count: int) -> Array:
-    """Return the rows that a function gives for each number, computed in a loop."""
+    """Return the rows of a function of each number, computed in a loop."""
     rows: Array = lax.scan(lambda _, i: (None, function(i)), None, jnp.arange(count))[1]
     return rows
 
@@ -279,8 +279,8 @@ def at(vector: Array, number: Array) -> Array:
 
 
 def _side_by_side(size: int) -> list[tuple[int, int]]:
-    """Return where the parts of a row begin, and how long they are."""
-    return [(first, min(BESIDE, size - first)) for first in range(0, size, BESIDE)]
+    """Return begin and length of each part of a row."""
+    return [(first, min(ROW_BLOCK, size - first)) for first in range(0, size, ROW_BLOCK)]
 
 
 def _part(matrix: Array, number: Array, first: int, count: int) -> Array:

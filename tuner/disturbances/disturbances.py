@@ -1,12 +1,11 @@
-"""What disturbs a flight: forces and moments, each a first-order Gauss-Markov process.
+"""Disturbances of a flight: forces and moments, each a first-order Gauss-Markov process.
 
-Gusts push as the world has it, slowly; thrust wanders fast, at each rotor by itself, which is a
-thrust and three moments in the body. Each process d has a standard deviation σ and a time constant
-τ: from one tick to the next it keeps exp(-h/τ) of itself.
+Gusts act slowly, along the world's axes; thrust fluctuates fast, at each rotor independently, which
+is a thrust and three moments in the body. Each process has a standard deviation σ and a time
+constant τ: from one tick to the next it keeps exp(-h/τ) of itself.
 
-They are counted as the accelerations that they cause, for that is what samples tell of: gains that
-stay while mass and inertia move then correct a motion by as much as before, and tell nothing of
-mass and inertia themselves.
+They are accelerations, not forces: fixed gains then correct a motion by the same amount while mass
+and inertia move, and have no information on mass and inertia.
 
 Source: Gelb, "Applied optimal estimation", 1974, ch. 2 (Gauss-Markov process).
 """
@@ -36,22 +35,21 @@ STRENGTHS = (
     "turbulence_lasts",
     "command_noise",
 )
-"""What is estimated of them: shares of the weight by which gusts push sideways and upwards, and
-which they would need at a rotor's arm to turn the vehicle as they do; the share of itself by which
-a rotor's thrust wanders; the s that both last. And how noisy recorded commands are, as a factor:
-they answer to what pushes and hardly err, so that a filter leans on them, and inertias follow by
-4 % where they are taken for a quarter noisier than they are."""
+"""Estimated strengths: gusts' forces sideways and upwards as shares of the weight, and their moment
+as the share at a rotor's arm; relative fluctuation of a rotor's thrust; correlation times of both
+in s. And a factor on the noise of recorded commands: these respond to disturbances nearly without
+noise, so that the filter relies on them, and inertias are 4 % off for a factor of 1.25."""
 COMMAND_NOISE = STRENGTHS.index("command_noise")
-USUAL = np.log([0.003, 0.001, 0.001, 0.003, 1.0, 0.03, 1.0])
-"""Logarithms of what they are before anything is known."""
-LEAST = np.log([3e-5, 3e-5, 3e-5, 3e-5, 0.2, 0.005, 0.02])
-MOST = np.log([0.1, 0.1, 0.1, 0.1, 5.0, 0.15, 10.0])
-"""Logarithms between which they are looked for."""
-STRONGEST = 1.0
-"""m/s, the strongest gusts along the rotors' axes by which a lift is explained."""
+INITIAL_STRENGTHS = np.log([0.003, 0.001, 0.001, 0.003, 1.0, 0.03, 1.0])
+"""Logarithms of the strengths at the start."""
+MIN_STRENGTHS = np.log([3e-5, 3e-5, 3e-5, 3e-5, 0.2, 0.005, 0.02])
+MAX_STRENGTHS = np.log([0.1, 0.1, 0.1, 0.1, 5.0, 0.15, 10.0])
+"""Bounds of their logarithms."""
+MAX_GUST_M_S = 1.0
+"""Largest standard deviation of gusts along the rotors' axes."""
 SLOW = ("force_x", "force_y", "force_z", "moment_x", "moment_y")
 FAST = ("thrust", "moment_x", "moment_y", "moment_z")
-COUNT = len(SLOW) + len(FAST)
+PROCESSES = len(SLOW) + len(FAST)
 
 
 class Processes(eqx.Module):
@@ -62,8 +60,8 @@ class Processes(eqx.Module):
     sd
         (D, F) in m/s² and rad/s², each segment's own.
     acts
-        (D,) kg and kg m²: what a unit of each process acts by, in N and N m.
-    keeps
+        (D,) kg and kg m²: force and moment of each process over its acceleration.
+    retention
         (D, F) share that a process keeps from one tick to the next.
     draught
         (F,) m/s, standard deviation of the gusts along the rotors' axes.
@@ -71,13 +69,13 @@ class Processes(eqx.Module):
 
     sd: Float[Array, "D *F"]
     acts: Float[Array, " D"]
-    keeps: Float[Array, "D *F"]
+    retention: Float[Array, "D *F"]
     draught: Scalar
 
     @property
     def added(self) -> Float[Array, "D *F"]:
-        """The variances (D, F) that come anew with every tick."""
-        return self.sd**2 * (1.0 - self.keeps**2)
+        """The variances (D, F) of the driving noise of each tick."""
+        return self.sd**2 * (1.0 - self.retention**2)
 
 
 def processes_of(vehicle: Vehicle, strengths: Float[Array, "7 *F"], rate: float) -> Processes:
@@ -86,7 +84,7 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, "7 *F"], rate: float)
     Parameters
     ----------
     vehicle
-        Whose weight, arms and moment constant say what a share of a thrust is.
+        Gives weight, arms and moment constant.
     strengths
         (7, F) logarithms of `STRENGTHS`, each segment's own; (7,) where all share them.
     rate
@@ -105,13 +103,13 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, "7 *F"], rate: float)
     lasts = [gust_lasts] * len(SLOW) + [turbulence_lasts] * len(FAST)
     acts = [body.mass, body.mass, body.mass, *turns[:2], body.mass, *turns]
     accelerations = [each / act for each, act in zip(sd, acts, strict=True)]
-    draught = jnp.minimum(lift * vehicle.aerodynamics.max_relative_airspeed, STRONGEST)
-    keeps = jnp.exp(-1.0 / rate / jnp.stack(lasts))
-    return Processes(jnp.stack(accelerations), jnp.stack(acts), keeps, draught)
+    draught = jnp.minimum(lift * vehicle.aerodynamics.max_relative_airspeed, MAX_GUST_M_S)
+    retention = jnp.exp(-1.0 / rate / jnp.stack(lasts))
+    return Processes(jnp.stack(accelerations), jnp.stack(acts), retention, draught)
 
 
 def disturbance_of(values: Float[Array, "D F"]) -> Disturbance:
-    """Return the disturbance that values in N and N m are, the same throughout a tick."""
+    """Return the disturbance of values in N and N m, constant over a tick."""
     rows: dict[str, Array] = {}
     for name, value in zip((*SLOW, *FAST), values, strict=True):
         rows[name] = rows[name] + value if name in rows else value
@@ -123,6 +121,6 @@ def disturbance_of(values: Float[Array, "D F"]) -> Disturbance:
     return Disturbance(force=along("force"), thrust=rows["thrust"][None], moment=along("moment"))
 
 
-def within(strengths: Sequence[float] | np.ndarray) -> np.ndarray:
+def clipped(strengths: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return strengths (7,), logarithms, inside their limits."""
-    return np.clip(strengths, LEAST, MOST)
+    return np.clip(strengths, MIN_STRENGTHS, MAX_STRENGTHS)

@@ -1,9 +1,9 @@
-"""A simulation that recorded samples correct, as a Kalman filter does.
+"""Extended Kalman filter of a simulation.
 
 At each tick the samples since the one before correct motion, rotor speeds, the controller's memory
 and the disturbances. `filtered` linearises the loop about the corrected simulation and propagates
-its covariance (extended Kalman filter); `innovations` flies with gains that are given, so that its
-derivative is that of a simulation: a predictor of fixed structure (Ljung 1999, 7.2).
+its covariance; `innovations` simulates with given gains, so that its derivative is that of a
+simulation: a predictor of fixed structure (Ljung 1999, 7.2).
 
 Innovations are whitened: with S = L Lᵀ their covariance (Cholesky), L⁻¹ times them is white and of
 unit variance if the model holds.
@@ -29,17 +29,11 @@ from sim_jax.numeric import row_of
 from sim_jax.schedule import Schedule
 from sim_jax.state import State
 from sim_jax.terms import total
-from tuner.disturbances.covariance import (
-    Samples,
-    Sparse,
-    at,
-    innovations_of,
-    propagated,
-)
-from tuner.disturbances.disturbances import COUNT
+from tuner.disturbances.covariance import Samples, Sparse, at, innovations_of, propagated
+from tuner.disturbances.disturbances import PROCESSES
 from tuner.disturbances.observer import (
-    Expected,
-    Feed,
+    AssumedModel,
+    FilterInput,
     Observer,
     commands_in_flight,
     first_errors,
@@ -48,27 +42,27 @@ from tuner.objective.criterion import AnyArray
 from tuner.objective.simulation import CODE, flown_part, laid_out
 
 GATE = 4.0
-"""Standard deviations beyond which an innovation corrects no further: an outlier."""
-WIDER = 4.0
-"""Times, each innovation in a row that lies beyond."""
-WIDEST = 5
-"""In a row beyond which the gate grows no further."""
+"""Standard deviations at which an innovation's correction is clipped: an outlier."""
+GATE_GROWTH = 4.0
+"""Factor on the gate for each outlier in a row."""
+MAX_GATE_STEPS = 5
+"""Outliers in a row after which the gate stays the same."""
 
 
-def gated(white: Array, beyond: Array) -> tuple[Array, Array]:
-    """Return what whitened innovations correct by, and how many in a row lie beyond the gate.
+def gate_innovations(white: Array, beyond: Array) -> tuple[Array, Array]:
+    """Return gated innovations, and the number of outliers in a row.
 
-    One is an outlier; the next ones say that the filter has lost the flight, which at its gate it
-    would never find again: each in a row widens it, so after a few they correct as they are.
+    One is an outlier; several show that the filter has lost the flight, which it would never find
+    again within its gate: each in a row widens the gate, so that after a few they correct in full.
 
     Parameters
     ----------
     white
-        (m, F); zero where nothing was sampled.
+        (m, F) whitened innovations; zero where nothing was sampled.
     beyond
-        (m, F) how many in a row before these.
+        (m, F) outliers in a row before these.
     """
-    gate = GATE * WIDER ** jnp.minimum(beyond, WIDEST)
+    gate = GATE * GATE_GROWTH ** jnp.minimum(beyond, MAX_GATE_STEPS)
     outside = jnp.where(jnp.abs(white) > GATE, beyond + 1, 0)
     return jnp.clip(white, -gate, gate), jnp.where(white != 0.0, outside, beyond)
 
@@ -76,48 +70,48 @@ def gated(white: Array, beyond: Array) -> tuple[Array, Array]:
 def deviance(white: Array) -> Array:
     """Return twice the negative log-likelihood of whitened innovations, but for a constant.
 
-    Beyond the gate it grows linearly (Huber): an outlier is no strong disturbance.
+    Beyond the gate it grows linearly (Huber), so that outliers do not count as disturbances.
     """
     size = jnp.abs(white)
     return jnp.where(size <= GATE, white**2, 2.0 * GATE * size - GATE**2)
 
 
 class Gains(eqx.Module):
-    """Of an observer, on T ticks; n numbers of the state are corrected by m samples.
+    """Gains of a filter on T ticks; m samples correct n numbers of the state.
 
     Attributes
     ----------
     gain
-        (F, T, m, n) correction for one standard deviation of each whitened innovation; of what was
-        not sampled any number.
+        (F, T, m, n) correction for one standard deviation of each whitened innovation; arbitrary
+        where nothing was sampled.
     factors
         (F, T, m, m) L, lower triangular.
     rate
-        Hz of the physics that was filtered. In steps so many times finer as many times as many
-        commands are on their way to the motors: each stands for those of its time.
+        Hz of the filter's physics steps. With finer steps there are more commands in flight: the
+        correction of each is repeated for those of its time.
     """
 
     gain: Float[AnyArray, "F T m n"]
     factors: Float[AnyArray, "F T m m"]
     rate: int = eqx.field(static=True)
 
-    def among(self, flights: NDArray[np.intp]) -> Gains:
+    def of_flights(self, flights: NDArray[np.intp]) -> Gains:
         """Return those of some flights."""
         return replace(self, gain=self.gain[flights], factors=self.factors[flights])
 
 
 class Filtered(eqx.Module):
-    """What a filter makes of recordings.
+    """Result of a filter.
 
     Attributes
     ----------
     white, root
-        (T, m, F) whitened innovations, and the standard deviation of each before it was, the ones
-        before it in its tick known: the diagonal of L.
+        (T, m, F) whitened innovations, and the standard deviation of each given earlier ones of its
+        tick: the diagonal of L.
     loss
         (T, F) negative log-likelihood of each tick's samples, but for a constant.
     gains
-        See `Gains`; None where they were not asked for.
+        See `Gains`; None if not kept.
     """
 
     white: Float[AnyArray, "T m F"]
@@ -139,43 +133,42 @@ def _undelayed(schedule: Schedule) -> Schedule:
 
 
 def _shortly_delayed(
-    schedule: Schedule, expected: Expected, latency: float = 0.0
+    schedule: Schedule, assumed: AssumedModel, latency: float = 0.0
 ) -> tuple[Schedule, int]:
-    """Return a schedule whose delay line of commands is no longer than needed.
+    """Return a schedule with the shortest delay line of commands, and the commands in it.
 
-    And how many commands are on their way to the motors when a step begins: to correct each of them
-    costs as much as a rotor's speed.
+    The correction of each command in flight costs as much as that of a rotor's speed.
     """
     if schedule.longest_actuator_latency == 0.0:
         return schedule, 0
-    latency = max(float(expected.coefficients["actuator_latency"]), latency)
+    latency = max(float(assumed.coefficients["actuator_latency"]), latency)
     count = max(int(np.ceil(latency / schedule.step - 1e-9)), 1)
     return replace(schedule, longest_actuator_latency=count * schedule.step), count
 
 
 def filtered(
     schedule: Schedule,
-    feed: Feed,
-    expected: Expected,
+    inputs: FilterInput,
+    assumed: AssumedModel,
     *,
     gains: bool = True,
     latency: float = 0.0,
 ) -> Filtered:
-    """Return the Kalman gains, the innovations, and how likely they are.
+    """Return Kalman gains, innovations, and their likelihood.
 
     Parameters
     ----------
-    schedule, feed, expected
-        Of the simulation, the recordings, and what is taken for true.
+    schedule, inputs, assumed
+        Rates of the simulation, the recordings, and the model.
     gains
         Whether gains are kept, which take most of the memory.
     latency
-        s that commands took at most before. Those that have arrived change nothing: with as many on
-        their way as then, one program filters again.
+        Largest latency of commands so far, s. Corrections of commands that have arrived have no
+        effect: with the same number in flight, one program serves all filters.
     """
-    short, in_flight = _shortly_delayed(_undelayed(schedule), expected, latency)
+    short, in_flight = _shortly_delayed(_undelayed(schedule), assumed, latency)
     wanted = (*[True] * 3, *[gains] * 2)
-    *rows, gain, factors = _run((short, in_flight), _given(feed, expected), wanted).values
+    *rows, gain, factors = _run((short, in_flight), _given(inputs, assumed), wanted).values
     white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)
     kept = Gains(gain, factors, schedule.physics_rate) if gains else None
     return Filtered(white, root, loss, kept)
@@ -183,21 +176,21 @@ def filtered(
 
 def innovations(
     schedule: Schedule,
-    feed: Feed,
+    inputs: FilterInput,
     gains: Gains,
-    expected: Expected,
+    assumed: AssumedModel,
     tangents: Mapping[str, NDArray[np.float64]] | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
     """Return whitened innovations (T, m, F) with given gains, and derivatives; None for none.
 
-    Those are left as they were laid, (F, Q, T, m): see `lanes.Run`.
+    The derivatives keep the kernel's layout (F, Q, T, m): see `lanes.Run`.
 
     Parameters
     ----------
-    schedule, feed, expected
+    schedule, inputs, assumed
         As of `filtered`.
     gains
-        Of the observer.
+        Gains of the filter.
     tangents
         Directions along which is differentiated: coefficient -> (Q,), and ``"offsets"`` ->
         (Q, offsets). None differentiates by nothing.
@@ -205,32 +198,32 @@ def innovations(
     moved = None
     if tangents is not None:
         still = np.zeros(len(tangents["offsets"]))
-        names = sorted(expected.coefficients)  # the order of the leaves
+        names = sorted(assumed.coefficients)  # the order of the leaves
         moved = [tangents["offsets"], *(tangents.get(name, still) for name in names)]
     wanted = (True, False) if moved is None else ((True, False), (False, True))
-    run = _run((_undelayed(schedule),), _given(feed, expected, gains), wanted, moved)
+    run = _run((_undelayed(schedule),), _given(inputs, assumed, gains), wanted, moved)
     return np.moveaxis(run.values[0], 0, -1), run.columns and run.columns[1]
 
 
 class _Given(NamedTuple):
-    """What a program is given: of each segment, of what is taken for true, and of the samples.
+    """Input of a program.
 
-    ``order`` says at each tick (T, m + 1) which rows are sampled in any segment, and how many.
+    ``order`` (T, m + 1) are each tick's rows that are sampled in any segment, then their number.
     """
 
-    feed: Feed
-    expected: Expected
+    inputs: FilterInput
+    assumed: AssumedModel
     order: Any
     gains: Gains | None
 
 
-def _given(feed: Feed, expected: Expected, gains: Gains | None = None) -> _Given:
-    weights = [np.asarray(feed.samples[name].weight) for name in feed.widths]
+def _given(inputs: FilterInput, assumed: AssumedModel, gains: Gains | None = None) -> _Given:
+    weights = [np.asarray(inputs.samples[name].weight) for name in inputs.widths]
     sampled = np.concatenate([(weight > 0).any(axis=-1) for weight in weights], axis=1)
     first = np.argsort(~sampled, axis=1, kind="stable")
     order = np.concatenate([first, np.count_nonzero(sampled, axis=1)[:, None]], axis=1)
-    feed = replace(feed, segments=flown_part(feed.segments))
-    given: _Given = jax.tree.map(np.asarray, _Given(feed, expected, order, gains))
+    inputs = replace(inputs, segments=flown_part(inputs.segments))
+    given: _Given = jax.tree.map(np.asarray, _Given(inputs, assumed, order, gains))
     return given
 
 
@@ -240,7 +233,7 @@ def _run(
     wanted: Any,
     tangents: list[NDArray[np.float64]] | None = None,
 ) -> Run:
-    """Fly all segments with given gains; without any, filter them."""
+    """Simulate all segments with given gains; without any, filter them."""
 
     def table(leaf: Any) -> Argument:
         shape = np.shape(leaf)[1:-1]
@@ -250,21 +243,21 @@ def _run(
         shape = ("ticks", *np.shape(leaf)[2:])
         return Argument(shape, np.result_type(leaf), lanes=True, apart=True)
 
-    feed, expected, moves = given.feed, given.expected, tangents is not None
+    inputs, assumed, moves = given.inputs, given.assumed, tangents is not None
     arguments = _Given(
-        Feed(
-            segments=laid_out(feed.segments),
-            offsets=Argument.of(feed.offsets, lanes=True, moves=moves),
-            samples=jax.tree.map(table, feed.samples),
-            conditions=feed.conditions,
+        FilterInput(
+            segments=laid_out(inputs.segments),
+            offsets=Argument.of(inputs.offsets, lanes=True, moves=moves),
+            samples=jax.tree.map(table, inputs.samples),
+            conditions=inputs.conditions,
         ),
-        Expected(
-            model=jax.tree.map(partial(Argument.of, lanes=False), expected.model),
+        AssumedModel(
+            model=jax.tree.map(partial(Argument.of, lanes=False), assumed.model),
             coefficients=jax.tree.map(
-                partial(Argument.of, lanes=False, moves=moves), expected.coefficients
+                partial(Argument.of, lanes=False, moves=moves), assumed.coefficients
             ),
-            strengths=Argument.of(expected.strengths, lanes=True),
-            noise=Argument.of(expected.noise, lanes=True),
+            strengths=Argument.of(assumed.strengths, lanes=True),
+            noise=Argument.of(assumed.noise, lanes=True),
         ),
         order=Argument(("ticks", *given.order.shape[1:]), int, lanes=False),
         gains=jax.tree.map(apart, given.gains),
@@ -278,12 +271,12 @@ def _run(
         made_of=(kind, static, moves, total.TERMS),
         packages=CODE,
     )
-    count, ticks = feed.offsets.shape[-1], len(given.order)
+    count, ticks = inputs.offsets.shape[-1], len(given.order)
     return program(given, tangents, lanes=count, turns=ticks, wanted=wanted)
 
 
 def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Array]:
-    """Return which rows of a tick are sampled, by a number below their count."""
+    """Return the function from number to sampled row of a tick, and the count of rows."""
 
     def order(number: Array) -> Array:
         return lax.dynamic_slice(given.order, (tick, number), (1, 1))[0, 0]
@@ -293,67 +286,67 @@ def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Arra
 
 def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[str, int]) -> Any:
     """Filter one segment: white, root and loss of `Filtered`, gains and factors of `Gains`."""
-    observer, first = Observer.of(schedule, given.feed, given.expected)
+    observer, first = Observer.of(schedule, given.inputs, given.assumed)
     processes = observer.processes
     first_sd = jnp.asarray(first_errors(first, in_flight))
-    size, wide = len(first_sd) + COUNT, len(given.expected.noise)
+    size, wide = len(first_sd) + PROCESSES, len(given.assumed.noise)
     shown = len(first_errors(first, 0))  # to samples: commands on their way are not, nor pushes
-    unrest = jnp.concatenate([jnp.zeros(size - COUNT), processes.added])
+    process_noise = jnp.concatenate([jnp.zeros(size - PROCESSES), processes.added])
 
     def tick(carried: Any, number: Array) -> Any:
         state, pushed, matrices, before, beyond = carried
         covariance, gain, scratch = matrices
-        read = row_of(given.feed.samples, number)
+        read = row_of(given.inputs.samples, number)
 
         def compare(change: list[Array]) -> list[Array]:
-            now = observer.seen(observer.corrected(state, change, number, 0), number)
-            # a sample between two ticks tells of the state, however near the first it was taken
+            now = observer.outputs(observer.corrected(state, change, number, 0), number)
+            # a sample between two ticks is an observation of the second, wherever it lies
             along = jax.tree.map(lambda at, to: at + to - lax.stop_gradient(to), before, now)
             return observer.errors(now, along, read)
 
         error, changes = jax.linearize(compare, [jnp.zeros(())] * shown)
-        variance = jnp.where(observer.sampled(read), given.expected.noise**2, 1.0)
+        variance = jnp.where(observer.sampled(read), given.assumed.noise**2, 1.0)
         samples = Samples(
             jnp.concatenate(error), variance, Sparse.of(changes, shown), *_sampled(given, number)
         )
-        told = innovations_of(covariance, gain, samples)
-        white, factors = told.white, told.factors
+        update = innovations_of(covariance, gain, samples)
+        white, factors = update.white, update.factors
         root = jnp.stack([factors[i, i] for i in range(wide)])
         loss = 0.5 * jnp.sum(deviance(white)) + jnp.sum(jnp.log(root))
-        corrects, beyond = gated(white, beyond)
-        change = -told.corrections(samples, corrects)
-        state = observer.corrected(state, change[:-COUNT], number, in_flight)
-        pushed = pushed + change[-COUNT:]
-        before = observer.seen(state, number)
+        corrects, beyond = gate_innovations(white, beyond)
+        change = -update.corrections(samples, corrects)
+        state = observer.corrected(state, change[:-PROCESSES], number, in_flight)
+        pushed = pushed + change[-PROCESSES:]
+        before = observer.outputs(state, number)
 
         def advance(change: Array) -> tuple[Array, State]:
-            moved = observer.corrected(state, change[:-COUNT], number, in_flight)
-            after = observer.next(moved, pushed + change[-COUNT:], number)
+            moved = observer.corrected(state, change[:-PROCESSES], number, in_flight)
+            after = observer.next(moved, pushed + change[-PROCESSES:], number)
             numbers = observer.numbers(after, number + 1, in_flight)
-            return jnp.concatenate([numbers, processes.keeps * change[-COUNT:]]), after
+            return jnp.concatenate([numbers, processes.retention * change[-PROCESSES:]]), after
 
-        _, follow, after = jax.linearize(advance, jnp.zeros(size), has_aux=True)
+        _, transition, after = jax.linearize(advance, jnp.zeros(size), has_aux=True)
         covariance, scratch = propagated(
             (covariance, scratch),
-            told,
+            update,
             samples,
-            follow,
-            unrest,
-            keeps=processes.keeps,
+            transition,
+            process_noise,
+            retention=processes.retention,
             tick=number,
         )
-        gains = told.gain.astype(jnp.float32)
-        matrices = covariance, told.gain, scratch
-        carried = after, pushed * processes.keeps, matrices, before, beyond
+        gains = update.gain.astype(jnp.float32)
+        matrices = covariance, update.gain, scratch
+        carried = after, pushed * processes.retention, matrices, before, beyond
         return carried, (white, root, loss, gains, factors.astype(jnp.float32))
 
     sd = jnp.concatenate([first_sd, processes.sd])
     diagonal = jnp.arange(size)[:, None] == jnp.arange(size)
     begin = (
         first,
-        jnp.zeros(COUNT),
+        jnp.zeros(PROCESSES),
         (jnp.where(diagonal, sd**2, 0.0), jnp.zeros((wide, size)), jnp.zeros((size, size))),
-        observer.seen(first, jnp.asarray(0)),
+        observer.outputs(first, jnp.asarray(0)),
         jnp.zeros(wide, int),
     )
     return lax.scan(tick, begin, jnp.arange(lengths["turns"]))[1]
@@ -362,29 +355,29 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
 def _innovations(
     schedule: Schedule, given: _Given, lengths: Mapping[str, int]
 ) -> tuple[Array, Array]:
-    """Fly one segment with gains that are given: its whitened innovations (ticks, m).
+    """Return one segment's whitened innovations (ticks, m) with given gains.
 
-    And the same in single precision, of which derivatives are taken: they take most of the memory.
+    And the same in single precision for derivatives, which take most of the memory.
     """
     assert given.gains is not None
-    observer, first = Observer.of(schedule, given.feed, given.expected)
+    observer, first = Observer.of(schedule, given.inputs, given.assumed)
     gains, factors = given.gains.gain, given.gains.factors
     wide, size = gains.shape[1:]
-    in_flight, finer = commands_in_flight(first, size - COUNT), 1
+    in_flight, finer = commands_in_flight(first, size - PROCESSES), 1
     if in_flight:
         finer = schedule.physics_rate // given.gains.rate
 
     def for_each_step(change: Array) -> Array:
-        """Return a correction of all commands on their way from that of the filter's steps."""
-        begin = size - COUNT - in_flight * len(first.rotor_speed)
-        commands = change[begin:-COUNT].reshape(in_flight, -1)
+        """Return a correction of all commands in flight from that of the filter's steps."""
+        begin = size - PROCESSES - in_flight * len(first.rotor_speed)
+        commands = change[begin:-PROCESSES].reshape(in_flight, -1)
         commands = jnp.repeat(commands, finer, axis=0).ravel()
-        return jnp.concatenate([change[:begin], commands, change[-COUNT:]])
+        return jnp.concatenate([change[:begin], commands, change[-PROCESSES:]])
 
     def tick(carried: Any, number: Array) -> tuple[Any, tuple[Array, Array]]:
         state, pushed, before, beyond = carried
-        read = row_of(given.feed.samples, number)
-        error = jnp.concatenate(observer.errors(observer.seen(state, number), before, read))
+        read = row_of(given.inputs.samples, number)
+        error = jnp.concatenate(observer.errors(observer.outputs(state, number), before, read))
         order, count = _sampled(given, number)
 
         def row_of_tick(table: Array, i: Array, count: int) -> Array:
@@ -403,17 +396,22 @@ def _innovations(
             return change - at(corrects, i) * row_of_tick(gains, i, size)
 
         white = lax.fori_loop(0, count, whitened, jnp.zeros(wide))
-        corrects, beyond = gated(white, beyond)
+        corrects, beyond = gate_innovations(white, beyond)
         change = lax.fori_loop(0, count, corrected, jnp.zeros(size))
         if finer > 1:
             change = for_each_step(change)
-        state = observer.corrected(state, change[:-COUNT], number, in_flight * finer)
-        pushed = pushed + change[-COUNT:]
-        before = observer.seen(state, number)
+        state = observer.corrected(state, change[:-PROCESSES], number, in_flight * finer)
+        pushed = pushed + change[-PROCESSES:]
+        before = observer.outputs(state, number)
         after = observer.next(state, pushed, number)
-        carried = after, pushed * observer.processes.keeps, before, beyond
+        carried = after, pushed * observer.processes.retention, before, beyond
         return carried, (white, white.astype(jnp.float32))
 
-    begin = first, jnp.zeros(COUNT), observer.seen(first, jnp.asarray(0)), jnp.zeros(wide, int)
+    begin = (
+        first,
+        jnp.zeros(PROCESSES),
+        observer.outputs(first, jnp.asarray(0)),
+        jnp.zeros(wide, int),
+    )
     rows: tuple[Array, Array] = lax.scan(tick, begin, jnp.arange(lengths["turns"]))[1]
     return rows

@@ -1,15 +1,14 @@
-"""The coefficients and disturbances that make the recordings likeliest.
+"""Maximum-likelihood estimation of coefficients, clocks and strengths of disturbances together.
 
-Gauss and Newton's steps on the innovations' likelihood, of coefficients, clocks and the strengths
-of the disturbances together: what least squares leaves of the disturbances in its coefficients
-makes them look stronger and slower than they are, and where they are taken for that the
-coefficients are biased in turn. Learnt one after the other they approach each other slowly.
+Gauss-Newton steps on the likelihood of the innovations. Biased coefficients make disturbances look
+stronger and slower than they are, and wrong strengths bias the coefficients in turn: estimated one
+after the other they converge slowly.
 
-Innovations are differentiated with gains that stay: at the likeliest point the gains' own
-derivatives are met by innovations that nothing of the past explains. How likely a step's end is,
-the filter says with gains of its own. Close to the estimate the two differ by as much as a step
-gains; there one more step of the equations is as good as any (Le Cam's one-step estimate; van der
-Vaart, "Asymptotic statistics", 1998, 5.7).
+Innovations are differentiated with fixed gains: at the maximum the gains' own derivatives multiply
+innovations that are independent of the past. The likelihood at a step's end comes from a filter
+with its own gains. Close to the estimate the two differ by as much as a step gains; there one more
+step is as good as any (Le Cam's one-step estimate; van der Vaart, "Asymptotic statistics", 1998,
+5.7).
 """
 
 from __future__ import annotations
@@ -22,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Array, scaled_solve
-from tuner.disturbances.disturbances import LEAST, MOST, within
+from tuner.disturbances.disturbances import MAX_STRENGTHS, MIN_STRENGTHS, clipped
 from tuner.disturbances.predictor import Predictor, unscaled
-from tuner.disturbances.ticks import gathered
+from tuner.disturbances.ticks import samples_of_ticks
 from tuner.objective.criterion import OFFSET_SD, OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal_equations import Objective, normal_equations
 from tuner.objective.residuals import gauss_newton, huber_loss
@@ -34,44 +33,44 @@ from tuner.recordings.flight import Flight
 
 Mask = NDArray[np.bool_]
 
-STEPS = 16
-"""At most, by default."""
-DAMPED = (0.0, 0.1, 1.0, 10.0, 100.0)
-"""Shares of the Hessian's diagonal that are added to it until a step leads down (Levenberg)."""
-FURTHEST = float(np.log(4.0))
-"""That a strength moves at a time: beyond, the likelihood is no parabola."""
-ASIDE = 0.25
-"""Share of a tick by which a clock moves before samples are laid on ticks again: until then they
-are met by the straight line through the two ticks that they were laid between."""
-ENOUGH = 0.1
-"""Predicted gain of a step, in half a unit of χ², below which it is not worth taking."""
-NEAR, SETTLED = 1.0, 0.3
-"""Likewise, below which it is taken as it is, and below which it is the last."""
+MAX_STEPS = 16
+"""Default largest number of steps."""
+DAMPING_LEVELS = (0.0, 0.1, 1.0, 10.0, 100.0)
+"""Shares of the Hessian's diagonal added to it until a step lowers the loss (Levenberg)."""
+MAX_STRENGTH_STEP = float(np.log(4.0))
+"""Largest step of a strength's logarithm: beyond it the likelihood is not quadratic."""
+MAX_CLOCK_SHIFT = 0.25
+"""Share of a tick by which a clock moves before samples are assigned to ticks again: until then the
+line through their old two ticks is extrapolated."""
+MIN_STEP_GAIN = 0.1
+"""Least predicted gain of a step, in the log-likelihood."""
+NEAR_GAIN, FINAL_GAIN = 1.0, 0.3
+"""Predicted gains below which a step is taken untested, and below which it is the last."""
 
 
-def with_least_innovations(
+def maximise_likelihood(
     predictor: Predictor,
     flights: Sequence[Flight],
     problem: tuple[Objective, Point, Criterion],
     free: Mask,
-    steps: int = STEPS,
+    steps: int = MAX_STEPS,
 ) -> tuple[Predictor, Point]:
-    """Return the predictor to which the recordings are likeliest, and the point where they are.
+    """Return predictor and point of the maximum likelihood.
 
     Parameters
     ----------
     predictor, flights
-        The predictor of N flights, with the strengths to begin from.
+        The predictor of N flights, with the initial strengths.
     problem
-        With the point where the descent begins, and its criterion.
+        Objective, initial point and criterion.
     free
-        (K + offsets·N,) what may move.
+        (K + offsets·N,) which parameters may move.
     steps
-        At most.
+        Largest number of steps.
     """
     objective, point, criterion = problem
     criterion = unscaled(criterion)
-    point = Point(point.coefficients, predictor.feed.offsets)
+    point = Point(point.coefficients, predictor.inputs.offsets)
     laid, rate, gain = point.offsets, float(objective.schedule.log_rate), np.inf
     predictor = predictor.at(objective, point)
     for _ in range(steps):
@@ -79,19 +78,21 @@ def with_least_innovations(
         change = equations.step(objective.space, point)
         if change is None:
             break
-        predictor = predictor.without_gains  # those of two points at a time are too much
+        predictor = predictor.without_gains  # memory holds those of one point
         gain, before = equations.gain(change), gain
-        lower = _lower(equations, predictor, objective, point, criterion, near=gain < NEAR)
+        lower = _damped_step(
+            equations, predictor, objective, point, criterion, near=gain < NEAR_GAIN
+        )
         if lower is None:
             return predictor.at(objective, point), point
-        if gain < SETTLED or 0.5 * before < gain < NEAR:  # they shrink no more
+        if gain < FINAL_GAIN or 0.5 * before < gain < NEAR_GAIN:  # they shrink no more
             return lower
         predictor, point = lower
         del lower
-        noise, moved = predictor.noise_seen, np.abs(point.offsets - laid)[: len(CLOCKS)].max()
-        if noise != predictor.noise or moved * OFFSET_UNIT * rate > ASIDE:
+        noise, moved = predictor.estimated_noise, np.abs(point.offsets - laid)[: len(CLOCKS)].max()
+        if noise != predictor.noise or moved * OFFSET_UNIT * rate > MAX_CLOCK_SHIFT:
             predictor = predictor.without_gains
-            if moved * OFFSET_UNIT * rate > ASIDE:
+            if moved * OFFSET_UNIT * rate > MAX_CLOCK_SHIFT:
                 laid = point.offsets
                 predictor = predictor.laid(objective, point, flights)
             predictor = replace(predictor, noise=noise).at(objective, point)
@@ -108,24 +109,20 @@ def _loss(predictor: Predictor, objective: Objective, point: Point, criterion: C
 
 
 class _Equations(NamedTuple):
-    """Gradient (P + 7,) and Hessian of the loss, by P parameters and then by the strengths.
-
-    And which of them may move.
-    """
+    """Gradient (P + 7,) and Hessian of the loss, by P parameters and then by the strengths."""
 
     gradient: Array
     hessian: Array
     free: Mask
 
     def gain(self, change: Array) -> float:
-        """Return by how much a step is predicted to lower the loss."""
+        """Return the predicted reduction of the loss by a step."""
         return -0.5 * float(self.gradient @ change)
 
     def step(self, space: Space, point: Point, damping: float = 0.0) -> Array | None:
-        """Return the Gauss-Newton step in which what would leave its bounds stays where it is.
+        """Return the damped Gauss-Newton step; parameters that would leave their bounds stay.
 
-        A share of the Hessian's diagonal is added to it. None where it is not worth taking, or is
-        none, since the filter has lost a flight.
+        None where its gain is too small, or not a number as the filter has lost a flight.
         """
         free = self.free.copy()
         hessian = self.hessian + damping * np.diag(np.diag(self.hessian))
@@ -136,16 +133,12 @@ class _Equations(NamedTuple):
             share = _share_after(space, point, change)
             leaves = np.flatnonzero(free[: len(space)] & ((share <= 0.0) | (share >= 1.0)))
             if not len(leaves):
-                return change if self.gain(change) >= ENOUGH else None
+                return change if self.gain(change) >= MIN_STEP_GAIN else None
             free[leaves] = False
 
 
 def _equations(
-    predictor: Predictor,
-    objective: Objective,
-    point: Point,
-    criterion: Criterion,
-    free: Mask,
+    predictor: Predictor, objective: Objective, point: Point, criterion: Criterion, free: Mask
 ) -> _Equations:
     space, flight = objective.space, np.asarray(objective.segments.flight)
     (kinds, flights), count = point.offsets.shape, len(space)
@@ -153,7 +146,7 @@ def _equations(
     by_kind = free[count:].reshape(kinds, flights).any(axis=1)
     moved = [*np.flatnonzero(free[:count]), *(count + np.flatnonzero(by_kind))]
     slope, information, moves = predictor.slopes(objective, point)
-    by_strengths = gathered(moves, predictor.feed.widths, predictor.rows)
+    by_strengths = samples_of_ticks(moves, predictor.inputs.widths, predictor.rows)
     del moves  # derivatives take most of the memory
     jacobian = predictor.jacobian(objective, point, moved)
     segments, total = jacobian.crash_time.shape[0], size + len(slope)
@@ -184,7 +177,9 @@ def _equations(
     across = np.concatenate([across[:count].sum(axis=-1), of_flights])
     bend = information + 1e-9 * np.eye(len(slope))
     strengths = predictor.strengths
-    held = (strengths <= LEAST) & (slope > 0.0) | (strengths >= MOST) & (slope < 0.0)
+    held = (strengths <= MIN_STRENGTHS) & (slope > 0.0) | (strengths >= MAX_STRENGTHS) & (
+        slope < 0.0
+    )
     return _Equations(
         np.concatenate([own, slope]),
         np.block([[among, across], [across.T, bend]]),
@@ -192,7 +187,7 @@ def _equations(
     )
 
 
-def _lower(
+def _damped_step(
     equations: _Equations,
     predictor: Predictor,
     objective: Objective,
@@ -201,19 +196,19 @@ def _lower(
     *,
     near: bool,
 ) -> tuple[Predictor, Point] | None:
-    """Return what predicts at the end of a step, and where that is; None if nothing is gained.
+    """Return predictor and point after a step that lowers the loss; None if there is none.
 
     Where the estimate is ``near`` a step need not lower the loss.
     """
     space, strengths = objective.space, predictor.strengths
     here = _loss(predictor, objective, point, criterion)
-    for damping in DAMPED:
+    for damping in DAMPING_LEVELS:
         change = equations.step(space, point, damping)
         if change is None:
             return None
-        by_strengths = np.clip(change[-len(strengths) :], -FURTHEST, FURTHEST)
+        by_strengths = np.clip(change[-len(strengths) :], -MAX_STRENGTH_STEP, MAX_STRENGTH_STEP)
         to = _moved(space, point, change[: -len(strengths)])
-        tried = replace(predictor, strengths=within(strengths + by_strengths)).at(objective, to)
+        tried = replace(predictor, strengths=clipped(strengths + by_strengths)).at(objective, to)
         if _loss(tried, objective, to, criterion) < here or (near and not tried.is_lost):
             return tried, to
         del tried  # its gains are large
@@ -221,9 +216,9 @@ def _lower(
 
 
 def _share_after(space: Space, point: Point, change: Array) -> Array:
-    """Return where between their bounds the coefficients lie after a step, linear in scaled ones.
+    """Return the coefficients' places between their bounds after a step in scaled coordinates.
 
-    The search's own coordinate is logistic: next to a bound a step in it goes nowhere.
+    The search's own coordinate is logistic: next to a bound a step in it has no effect.
     """
     vector = np.asarray(point.coefficients)
     moved = space.slope(vector) * change[: len(vector)] / space.width

@@ -1,7 +1,4 @@
-"""The state-space model of the filter: the loop of rate control, a tick at a time.
-
-Fed with recorded set-points; what a filter corrects of its state, and what samples say of that.
-"""
+"""The state-space model of the filter: the rate loop with recorded set-points, a tick at a time."""
 
 from __future__ import annotations
 
@@ -25,44 +22,40 @@ from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroMemory
 from sim_jax.state import AIRBORNE, State
-from tuner.disturbances.disturbances import (
-    Processes,
-    disturbance_of,
-    processes_of,
-)
-from tuner.disturbances.ticks import Sampled
+from tuner.disturbances.disturbances import Processes, disturbance_of, processes_of
+from tuner.disturbances.ticks import TickSamples
 from tuner.objective.criterion import OFFSET_UNIT, AnyArray, units_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
 from tuner.objective.simulation import beginning_of
 from tuner.vehicle.model import Model, with_coefficients
 
 CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
-"""What corrects, in this order: a dictionary's own order is lost where jax takes it apart."""
+"""Channels of samples, in order: jax sorts the keys of a dictionary."""
 
 
-class Feed(eqx.Module):
-    """What an observer needs of its segments, F of which lie along the last axis.
+class FilterInput(eqx.Module):
+    """Segments and samples of a filter, F segments along the last axis.
 
     Attributes
     ----------
     segments
-        Their inlet takes set-points.
+        Segments whose inlet takes set-points.
     offsets
         (offsets, F) of the point.
     samples
         Channel -> its samples on ticks.
     conditions
-        What surrounds each flight and moves, in the last rows of ``offsets``.
+        Names of free per-flight conditions, the last rows of ``offsets``.
     """
 
     segments: Segments
     offsets: Float[AnyArray, "O F"]
-    samples: dict[str, Sampled]
+    samples: dict[str, TickSamples]
     conditions: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def widths(self) -> dict[str, int]:
-        """Channel -> how many columns it has, in the order of `CHANNELS`."""
+        """Channel -> number of columns, in the order of `CHANNELS`."""
         return {
             name: int(self.samples[name].weight.shape[1])
             for name in CHANNELS
@@ -70,15 +63,15 @@ class Feed(eqx.Module):
         }
 
 
-class Expected(eqx.Module):
-    """What an observer takes for true.
+class AssumedModel(eqx.Module):
+    """The model of a filter.
 
     Attributes
     ----------
     model
-        What flies.
+        Vehicle and controller.
     coefficients
-        Name -> value that replaces the model's, of all that it has.
+        Name -> value of every coefficient; replaces the model's.
     strengths
         (7, F) of the disturbances, each segment's own.
     noise
@@ -92,7 +85,7 @@ class Expected(eqx.Module):
 
 
 class Observer(eqx.Module):
-    """The stepped loop with its disturbances and its samples."""
+    """The loop with its disturbances and its samples, a tick at a time."""
 
     plant: Plant
     processes: Processes
@@ -101,16 +94,18 @@ class Observer(eqx.Module):
     rate: float = eqx.field(static=True)
 
     @staticmethod
-    def of(schedule: Schedule, feed: Feed, expected: Expected) -> tuple[Observer, State]:
+    def of(
+        schedule: Schedule, inputs: FilterInput, assumed: AssumedModel
+    ) -> tuple[Observer, State]:
         """Return the observer of a model, and the state in which the segments begin."""
-        model = with_coefficients(expected.model, expected.coefficients)
-        units = units_of(feed.conditions)
+        model = with_coefficients(assumed.model, assumed.coefficients)
+        units = units_of(inputs.conditions)
         conditions = {
-            name: feed.offsets[len(OFFSETS) + row] * units[row]
-            for row, name in enumerate(feed.conditions)
+            name: inputs.offsets[len(OFFSETS) + row] * units[row]
+            for row, name in enumerate(inputs.conditions)
         }
         start, inlet, environment = beginning_of(
-            model, feed.segments, schedule, conditions=conditions
+            model, inputs.segments, schedule, conditions=conditions
         )
         plant, state = start_simulation(
             model.vehicle,
@@ -122,12 +117,12 @@ class Observer(eqx.Module):
             limits=AIRBORNE,  # a height that no sample corrects drifts, and ends no flight
         )
         rate = float(schedule.log_rate)
-        processes = processes_of(model.vehicle, expected.strengths, rate)
-        late = feed.offsets[: len(OFFSETS)] * OFFSET_UNIT
-        return Observer(plant, processes, late, tuple(feed.widths), rate), state
+        processes = processes_of(model.vehicle, assumed.strengths, rate)
+        late = inputs.offsets[: len(OFFSETS)] * OFFSET_UNIT
+        return Observer(plant, processes, late, tuple(inputs.widths), rate), state
 
     def numbers(self, state: State, tick: Array, in_flight: int) -> Array:
-        """Return what is corrected of a state, (n, F): so many commands in flight at its end."""
+        """Return the corrected numbers of a state, (n, F), the commands in flight last."""
         rows = jnp.stack(jax.tree.leaves(_parts(state)))
         line = state.reference_history
         if line is None or not in_flight:
@@ -174,7 +169,7 @@ class Observer(eqx.Module):
         return tick * round(schedule.physics_rate / schedule.log_rate)
 
     def next(self, state: State, pushed: Array, tick: Array) -> State:
-        """Return the state a tick later, pushed by the processes' values (D, *F)."""
+        """Return the state a tick later, with disturbances of values (D, *F)."""
         acting = disturbance_of((self.processes.acts * pushed.T).T)
         if self.plant.environment.disturbance is not None:
             known: Disturbance = row_of(self.plant.environment.disturbance, tick)
@@ -189,8 +184,8 @@ class Observer(eqx.Module):
         after: State = plant.sample(state, tick)[0]
         return after
 
-    def seen(self, state: State, tick: Array) -> dict[str, Array]:
-        """Return channel -> (c, F), what a recording would hold."""
+    def outputs(self, state: State, tick: Array) -> dict[str, Array]:
+        """Return channel -> (c, F), the values that a recording would have."""
         position, attitude = markers_of(self.plant.vehicle).recorded(state.motion)
         command = state.command
         if "command" in self.channels:
@@ -209,25 +204,22 @@ class Observer(eqx.Module):
             for name in self.channels
         }
 
-    def sampled(self, samples: dict[str, Sampled]) -> Array:
-        """Return which rows of `errors` (m, F) there are samples of."""
+    def sampled(self, samples: dict[str, TickSamples]) -> Array:
+        """Return which rows of `errors` (m, F) have samples."""
         return jnp.concatenate([samples[name].weight > 0 for name in self.channels])
 
     def errors(
-        self, now: dict[str, Array], before: dict[str, Array], samples: dict[str, Sampled]
+        self, now: dict[str, Array], before: dict[str, Array], samples: dict[str, TickSamples]
     ) -> list[Array]:
-        """Return what is seen minus what was sampled, channel by channel, in standard deviations.
-
-        Their rows are m in all.
-        """
+        """Return outputs minus samples, channel by channel, in standard deviations: m rows."""
         rows = []
         for name in self.channels:
             sample = samples[name]
             place = sample.place - self.late[CLOCK_OF[name]] * self.rate
             there = before[name] + place * (now[name] - before[name])
             if name == "attitude":
-                seen = Quaternion.of(there).normalized()
-                error = Quaternion.of(sample.values).rotation_vector_to(seen).stacked()
+                outputs = Quaternion.of(there).normalized()
+                error = Quaternion.of(sample.values).rotation_vector_to(outputs).stacked()
             elif name == "command":
                 error = now[name] - sample.values
             elif name == "body_rate":
@@ -239,7 +231,7 @@ class Observer(eqx.Module):
 
 
 def _parts(state: State) -> tuple[Motion, Any, Vec3, GyroMemory, Any, Any]:
-    """Return what is corrected of a state: 32 numbers with both gyro filters.
+    """Return the corrected parts of a state: 32 numbers with both gyro filters.
 
     And four with a second lag of the motors, four with one of the tachometers.
     """
@@ -248,12 +240,12 @@ def _parts(state: State) -> tuple[Motion, Any, Vec3, GyroMemory, Any, Any]:
 
 
 def commands_in_flight(state: State, count: int) -> int:
-    """Return how many commands on their way to the motors are among so many corrected numbers."""
+    """Return the number of commands in flight among ``count`` corrected numbers."""
     return (count - len(jax.tree.leaves(_parts(state)))) // len(state.rotor_speed)
 
 
 def first_errors(state: State, in_flight: int) -> np.ndarray[Any, Any]:
-    """Return the standard deviations (n,) of the state in which a flight begins."""
+    """Return the standard deviations (n,) of a flight's initial state."""
 
     def filled(tree: Any, sd: float) -> Any:
         return jax.tree.map(lambda _: sd, tree)

@@ -1,9 +1,8 @@
-"""The one-step predictor of a fit: its innovations and what they say of the coefficients.
+"""The one-step predictor of a fit, its innovations and their Fisher information.
 
-And of the strengths of the disturbances: how strong they are and how long they last is what makes
-the recordings likeliest (Schweppe 1965). Strengths trade off: gusts and turbulence explain the same
-innovations, and where they are too large or too small together, that biases the coefficients. So
-they all move together, and with the coefficients: by Gauss and Newton's steps with Fisher's
+Sizes and correlation times of the disturbances maximise the likelihood (Schweppe 1965). They trade
+off: gusts and turbulence explain the same innovations, and wrong sizes of both bias the
+coefficients. So they move together with the coefficients, by Gauss-Newton steps with the Fisher
 information of innovations and their covariance (Maine and Iliff, "Formulation and implementation of
 a practical algorithm for parameter estimation with process and measurement noise", 1980; Harvey,
 "Forecasting, structural time series models and the Kalman filter", 1989, 3.4.5).
@@ -24,17 +23,23 @@ from lanes import joined
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.schedule import Schedule
 from tuner.core.numerics import Array, robust_sd, scaled_solve
-from tuner.disturbances.disturbances import COMMAND_NOISE, LEAST, MOST, STRENGTHS, USUAL
+from tuner.disturbances.disturbances import (
+    COMMAND_NOISE,
+    INITIAL_STRENGTHS,
+    MAX_STRENGTHS,
+    MIN_STRENGTHS,
+    STRENGTHS,
+)
 from tuner.disturbances.extended_kalman_filter import GATE, Filtered, filtered, innovations
-from tuner.disturbances.observer import CHANNELS, Expected, Feed
+from tuner.disturbances.observer import CHANNELS, AssumedModel, FilterInput
 from tuner.disturbances.ticks import (
     FLIGHT_CONTROLLER,
-    Sampled,
-    each_reading,
-    gathered,
+    TickSamples,
+    derivatives_of_samples,
     sampled,
+    samples_of_ticks,
     setpoints_on_ticks,
-    taken_from,
+    with_equal_weights,
 )
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_at, with_secants
@@ -44,37 +49,37 @@ from tuner.objective.segments import CLOCKS
 from tuner.recordings.flight import Flight
 from tuner.vehicle.model import coefficients_in, with_terms_computed
 
-AT_ONCE = 16
-"""Parameters by which is differentiated at a time."""
-LOST = 0.05
-"""Share of a channel's innovations beyond the gate from which the filter has lost a flight."""
-LEARNT_FROM = 18.0
-"""s of each flight from which strengths are learnt: each of the seven takes a filter of its own."""
-SEGMENTS = 8
-"""That are filtered side by side while strengths are differentiated by."""
-NUMBERS = 65
-"""Of a state and its disturbances that samples correct, with four commands on their way and those
-that a second lag and the tachometers' hold."""
-STRETCH, SURE = 2.0, 1.5
-"""s of the stretches by which likelihoods are compared, and by how many standard errors one has to
-gain: half as many as those by which the coefficient that gains it differs from neutral."""
-NOISIER = 1.05
-"""Innovations of a channel over what they are assumed to be, from which it is noisier than that."""
-USUALLY = 1.5
-"""Standard deviation a priori of a strength's logarithm about what it is learnt to be: what says
-nothing of a strength says nothing against a coefficient."""
+PARAMETERS_AT_ONCE = 16
+"""Number of parameters differentiated by at a time."""
+MAX_OUTLIER_SHARE = 0.05
+"""Share of a channel's innovations beyond the gate above which the filter has lost a flight."""
+STRENGTHS_FROM_S = 18.0
+"""Part of each flight that strengths are estimated from: each of the seven takes another filter."""
+SEGMENTS_AT_ONCE = 8
+"""Segments filtered side by side for derivatives by the strengths."""
+STATE_SIZE = 65
+"""Numbers of state and disturbances that samples correct, with four commands in flight, a second
+lag of motors and the lag of tachometers: for an estimate of memory."""
+STRETCH_S, MIN_GAIN_SE = 2.0, 1.5
+"""Stretches by which likelihoods are compared, and the least gain in standard errors: half the
+standard errors by which the coefficient that gains it differs from neutral."""
+MIN_NOISE_RATIO = 1.05
+"""Ratio of a channel's innovations to their assumed size from which its noise is increased."""
+STRENGTH_PRIOR_SD = 1.5
+"""Prior standard deviation of a strength's logarithm about its estimate: an undetermined strength
+takes little information from the coefficients."""
 
 
 @dataclass(frozen=True)
 class Predictor:
-    """Predicts each sample of some flights from those before it.
+    """A one-step predictor of the samples of some flights.
 
     Attributes
     ----------
     schedule
-        Of the simulation.
-    feed
-        The recordings, and the offsets at which they are met best.
+        Rates of the simulation.
+    inputs
+        The recordings, and the best offsets.
     rows
         Channel -> (n, F) the tick of each sample, -1 for one that is not used.
     strengths
@@ -82,15 +87,15 @@ class Predictor:
     noise
         Channel -> factor on the samples' standard deviations.
     computed
-        Terms that are flown even where a model lacks them, so that one program serves all models.
+        Terms that are computed even where a model lacks them, so that one program serves all.
     latency
-        s that commands were on their way at most, at any point so far.
+        Largest latency of commands at any point so far, s.
     found
-        What the filter makes of the recordings: None before it has run.
+        The filter's result; None before it has run.
     """
 
     schedule: Schedule
-    feed: Feed
+    inputs: FilterInput
     rows: Mapping[str, NDArray[np.intp]]
     strengths: Array
     noise: Mapping[str, float]
@@ -105,19 +110,19 @@ class Predictor:
         flights: Sequence[Flight],
         computed: tuple[str, ...] = (),
     ) -> Predictor | None:
-        """Return the predictor of some flights before anything is learnt.
+        """Return the predictor of some flights with initial strengths.
 
-        None where their set-points were not all recorded, or not all in closed loop. The flight
-        controller's clock, by which set-points come in, is the simulation's own.
+        None where not all set-points were recorded, or not all flights are in closed loop. The
+        flight controller's clock, that of the set-points, is the simulation's own.
 
         Parameters
         ----------
         objective, point
-            Whole flights, and where their clocks stand.
+            Whole flights, and their clock offsets.
         flights
             F flights in the order of the segments.
         computed
-            Terms to be flown even where a model lacks them.
+            Terms to compute even where a model lacks them.
         """
         segments, schedule = objective.segments, objective.schedule
         offsets = np.array(point.offsets)
@@ -131,115 +136,111 @@ class Predictor:
             return None
         read = dict(segments.measured)
         if "command" in read:
-            read["command"] = each_reading(read["command"])
+            read["command"] = with_equal_weights(read["command"])
         laid = {
             name: sampled(name, read[name], late, objective.samples, float(schedule.log_rate))
             for name in channels
         }
         return Predictor(
             schedule=schedule,
-            feed=Feed(
+            inputs=FilterInput(
                 segments=replace(segments, inlet=inlet, measured={}),
                 offsets=offsets,
                 samples={name: samples for name, (samples, _) in laid.items()},
                 conditions=objective.conditions,
             ),
             rows={name: rows for name, (_, rows) in laid.items()},
-            strengths=USUAL,
+            strengths=INITIAL_STRENGTHS,
             noise=dict.fromkeys(channels, 1.0),
             computed=computed,
         )
 
     def laid(self, objective: Objective, point: Point, flights: Sequence[Flight]) -> Predictor:
-        """Return the same with samples at the ticks where a point's clocks have them.
-
-        Before it has run.
-        """
+        """Return the same with samples on ticks by a point's clocks, before its filter runs."""
         laid = Predictor.of(objective, point, flights, self.computed)
         assert laid is not None
         return replace(laid, strengths=self.strengths, noise=self.noise, latency=self.latency)
 
     def slopes(self, objective: Objective, point: Point) -> Slopes:
-        """Return how the likelihood changes with the strengths; innovations lie on ticks.
+        """Return the derivatives of the likelihood by the strengths, with innovations on ticks.
 
-        All are that of the first `LEARNT_FROM` of each flight, times as much as there is.
+        They are those of the first `STRENGTHS_FROM_S` of each flight, scaled to all samples.
         """
         assert self.found is not None
-        some = min(round(LEARNT_FROM * float(objective.schedule.log_rate)), self.ticks)
+        some = min(round(STRENGTHS_FROM_S * float(objective.schedule.log_rate)), self.ticks)
         whole = np.asarray(self.found.white)
         share = np.count_nonzero(whole[:some]) / max(int(np.count_nonzero(whole)), 1)
-        steps = steps_from(self.strengths)
+        steps = difference_steps(self.strengths)
         here = self.found.first(some)
         slope, information, moved = slopes_of(
-            here, self._beside(objective, point, steps, some), steps
+            here, self._with_steps(objective, point, steps, some), steps
         )
         ticks = np.zeros((len(moved), *whole.shape))
         np.divide(moved, share, out=ticks[:, :some])
         return Slopes(slope / share, information / share, ticks)
 
-    def _beside(
+    def _with_steps(
         self, objective: Objective, point: Point, steps: Array, ticks: int
     ) -> Iterator[Filtered]:
-        """Return how likely the first ticks are with each of the strengths a step away, in turn.
+        """Yield the filter's results for the first ticks with each strength a step away.
 
-        As many are filtered side by side as fill a kernel's block of segments.
+        Filters run side by side as far as they fill a kernel's block of segments.
         """
-        count = self.feed.offsets.shape[-1]
-        feed = self._fed(point)
-        samples = jax.tree.map(lambda rows: rows[:ticks], feed.samples)
+        count = self.inputs.offsets.shape[-1]
+        inputs = self._inputs_at(point)
+        samples = jax.tree.map(lambda rows: rows[:ticks], inputs.samples)
         strengths = self.strengths[:, None] + np.diag(steps)
-        together = max(SEGMENTS // count, 1)
+        together = max(SEGMENTS_AT_ONCE // count, 1)
         for first in range(0, len(steps), together):
             some = strengths[:, first : first + together]
             tiled = jax.tree.map(
                 lambda rows, times=some.shape[1]: np.tile(rows, times),
-                replace(feed, samples=samples),
+                replace(inputs, samples=samples),
             )
-            expected = self._expected(objective, point, np.repeat(some, count, axis=-1))
-            found = filtered(self.schedule, tiled, expected, gains=False, latency=self.latency)
+            assumed = self._assumed(objective, point, np.repeat(some, count, axis=-1))
+            found = filtered(self.schedule, tiled, assumed, gains=False, latency=self.latency)
             for number in range(some.shape[1]):
                 segments = slice(number * count, (number + 1) * count)
                 yield found.first(ticks, segments)
 
     @property
-    def noise_seen(self) -> dict[str, float]:
+    def estimated_noise(self) -> dict[str, float]:
         """The factors on the samples' standard deviations with which innovations are white."""
         noise = dict(self.noise)
         for name, white in self._sizes():
             if name == "command":
-                continue  # how noisy it is is learnt
+                continue  # a strength of its own
             spread = noise[name] * float(robust_sd(white)) if len(white) else 1.0
-            noise[name] = spread if spread > NOISIER else 1.0
+            noise[name] = spread if spread > MIN_NOISE_RATIO else 1.0
         return noise
 
     @property
     def keeps_track(self) -> bool:
-        """Whether few innovations of any channel are outliers, and all are finite.
-
-        Outliers are rare; many are samples of what the model does not do.
-        """
+        """Whether few innovations of any channel are outliers, and all are finite."""
         return all(
-            np.mean(~(white <= GATE)) <= LOST for _, white in self._sizes() if len(white) > 0
+            np.mean(~(white <= GATE)) <= MAX_OUTLIER_SHARE
+            for _, white in self._sizes()
+            if len(white) > 0
         )
 
     @property
     def is_lost(self) -> bool:
-        """Whether some innovation is no number: a flight left the recorded one for good."""
+        """Whether some innovation is not finite: the filter has diverged from a flight."""
         return not all(np.isfinite(white).all() for _, white in self._sizes())
 
     def _sizes(self) -> Iterator[tuple[str, Array]]:
         assert self.found is not None
         white = np.asarray(self.found.white, float)
-        for name, rows in gathered(white, self.feed.widths, self.rows).items():
+        for name, rows in samples_of_ticks(white, self.inputs.widths, self.rows).items():
             yield name, np.abs(rows[rows != 0.0])
 
     @property
     def loss(self) -> float:
-        """Half the sum of squares of the whitened innovations, those beyond the gate as at it."""
+        """Half the sum of squares of the whitened innovations, clipped at the gate."""
         return 0.5 * float(sum(np.sum(np.minimum(size, GATE) ** 2) for _, size in self._sizes()))
 
     def is_likelier_than(self, other: Predictor) -> bool:
-        """Return whether its recordings are surely likelier than another's, which sees the same.
+        """Return whether its likelihood is significantly larger than another's of the same samples.
 
         The gain of all stretches exceeds zero by more than it scatters from stretch to stretch
         (Vuong, "Likelihood ratio tests for model selection and non-nested hypotheses",
@@ -248,9 +249,9 @@ class Predictor:
         assert self.found is not None
         assert other.found is not None
         gain = np.asarray(other.found.loss) - np.asarray(self.found.loss)
-        length = round(STRETCH * float(self.schedule.log_rate))
+        length = round(STRETCH_S * float(self.schedule.log_rate))
         sums = np.add.reduceat(gain, np.arange(0, len(gain), length), axis=0)
-        return bool(sums.sum() > SURE * np.sqrt(sums.size) * sums.std(ddof=1))
+        return bool(sums.sum() > MIN_GAIN_SE * np.sqrt(sums.size) * sums.std(ddof=1))
 
     @property
     def without_gains(self) -> Predictor:
@@ -260,54 +261,56 @@ class Predictor:
 
     def at(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor once its filter has run at a point."""
-        feed = self._fed(point)
-        expected = self._expected(objective, point)
-        latency = max(float(expected.coefficients["actuator_latency"]), self.latency)
-        found = filtered(self.schedule, feed, expected, latency=latency)
-        return replace(self, feed=feed, found=found, latency=latency)
+        inputs = self._inputs_at(point)
+        assumed = self._assumed(objective, point)
+        latency = max(float(assumed.coefficients["actuator_latency"]), self.latency)
+        found = filtered(self.schedule, inputs, assumed, latency=latency)
+        return replace(self, inputs=inputs, found=found, latency=latency)
 
     @property
     def ticks(self) -> int:
-        """How many there are."""
-        return int(next(iter(self.feed.samples.values())).values.shape[0])
+        """Number of ticks."""
+        return int(next(iter(self.inputs.samples.values())).values.shape[0])
 
     @property
     def memory(self) -> int:
-        """Bytes that gains take."""
-        flights, wide = self.feed.offsets.shape[-1], sum(self.feed.widths.values())
-        return int(self.ticks * flights * wide * (NUMBERS + wide) * np.dtype(np.float32).itemsize)
+        """Size of the gains in bytes."""
+        flights, wide = self.inputs.offsets.shape[-1], sum(self.inputs.widths.values())
+        return int(
+            self.ticks * flights * wide * (STATE_SIZE + wide) * np.dtype(np.float32).itemsize
+        )
 
-    def _fed(self, point: Point) -> Feed:
-        return replace(self.feed, offsets=np.asarray(point.offsets))
+    def _inputs_at(self, point: Point) -> FilterInput:
+        return replace(self.inputs, offsets=np.asarray(point.offsets))
 
-    def _expected(
+    def _assumed(
         self, objective: Objective, point: Point, strengths: Array | None = None
-    ) -> Expected:
-        """Return what is expected with strengths (7, segments), or the flights' own."""
+    ) -> AssumedModel:
+        """Return the model at a point with strengths (7, segments), or the flights' own."""
         if strengths is None:
-            strengths = np.tile(self.strengths[:, None], self.feed.offsets.shape[-1])
-        widths, shape = self.feed.widths, strengths.shape[1:]
+            strengths = np.tile(self.strengths[:, None], self.inputs.offsets.shape[-1])
+        widths, shape = self.inputs.widths, strengths.shape[1:]
         factors = {**self.noise, "command": np.exp(strengths[COMMAND_NOISE])}
         noise = np.stack([np.broadcast_to(factors[name], shape) for name in widths])
         noise = noise.repeat(list(widths.values()), axis=0)
         model = with_terms_computed(objective.model, self.computed)
         values = {**coefficients_in(model), **objective.space.values(point.coefficients)}
         values = {name: np.asarray(value, float) for name, value in values.items()}
-        return Expected(model, values, strengths, noise)
+        return AssumedModel(model, values, strengths, noise)
 
-    def among(self, flights: NDArray[np.intp]) -> Predictor:
+    def of_flights(self, flights: NDArray[np.intp]) -> Predictor:
         """Return the predictor of some flights alone."""
         assert self.found is not None
-        if len(flights) == self.feed.offsets.shape[-1]:
+        if len(flights) == self.inputs.offsets.shape[-1]:
             return self  # gains are large, and would be copied
         gains = self.found.gains
-        feed, found = jax.tree.map(
+        inputs, found = jax.tree.map(
             lambda leaf: np.asarray(leaf)[..., flights],
-            (self.feed, replace(self.found, gains=None)),
+            (self.inputs, replace(self.found, gains=None)),
         )
-        found = replace(found, gains=None if gains is None else gains.among(flights))
+        found = replace(found, gains=None if gains is None else gains.of_flights(flights))
         rows = {name: tick[:, flights] for name, tick in self.rows.items()}
-        return replace(self, feed=feed, found=found, rows=rows)
+        return replace(self, inputs=inputs, found=found, rows=rows)
 
     def information(
         self,
@@ -317,15 +320,15 @@ class Predictor:
         alternatives: Mapping[str, Objective] = MappingProxyType({}),
         by_strengths: Array | None = None,
     ) -> FisherInformation:
-        """Return what the innovations of these flights say at a point, see `with_hidden`.
+        """Return the information of these flights' innovations at a point.
 
-        Its criterion gives no scales: innovations are whitened. ``alternatives``: what might be
-        simulated differently -> the problem so simulated; gains stay. With derivatives by the
-        strengths (`Slopes.moved`) those are changes, too: see `with_strengths`.
+        The criterion's scales are not used: innovations are whitened. ``alternatives``: source of
+        error -> the problem simulated with it changed; gains stay. Derivatives by the strengths
+        (`Slopes.moved`) are changes, too: see `with_strengths`.
         """
-        moved = np.flatnonzero(~hidden(objective.space.names))
+        moved = np.flatnonzero(~hidden_by_setpoints(objective.space.names))
         offsets = np.arange(len(point.offsets)) + len(objective.space)
-        own = Point(point.coefficients, self.feed.offsets)
+        own = Point(point.coefficients, self.inputs.offsets)
 
         def flown(predictor: Predictor, objective: Objective, there: Point) -> dict[str, Any]:
             return dict(predictor.jacobian(objective, there, []).residuals)
@@ -337,10 +340,10 @@ class Predictor:
             lambda there: flown(self, objective, there),
         )
         changed = {
-            name: flown(self.stepped(other), other, own) for name, other in alternatives.items()
+            name: flown(self.for_problem(other), other, own) for name, other in alternatives.items()
         }
         if by_strengths is not None:
-            moves = gathered(by_strengths, self.feed.widths, self.rows)
+            moves = samples_of_ticks(by_strengths, self.inputs.widths, self.rows)
             for number, name in enumerate(STRENGTHS):
                 changed[name] = {
                     channel: residuals + moves[channel][number]
@@ -348,16 +351,16 @@ class Predictor:
                 }
         return information_at(objective, own, unscaled(criterion), jacobian, alternatives=changed)
 
-    def stepped(self, other: Objective) -> Predictor:
-        """Return the predictor of another problem: finer steps, pushed along, other readings."""
-        segments = self.feed.segments
+    def for_problem(self, other: Objective) -> Predictor:
+        """Return the predictor of another problem: finer steps, disturbances, other readings."""
+        segments = self.inputs.segments
         times = other.schedule.physics_rate // self.schedule.physics_rate
         inlet = jax.tree.map(lambda rows: np.repeat(rows, times, axis=0), segments.inlet)
         return replace(
             self,
             schedule=other.schedule,
-            feed=replace(
-                self.feed,
+            inputs=replace(
+                self.inputs,
                 segments=replace(
                     segments,
                     inlet=inlet,
@@ -366,14 +369,14 @@ class Predictor:
                 ),
                 samples={
                     name: self._placed(name, other.segments.measured[name].time)
-                    for name in self.feed.samples
+                    for name in self.inputs.samples
                 },
             ),
         )
 
-    def _placed(self, name: str, time: Any) -> Sampled:
-        """Return a channel's samples where (n, F) stamps in s have them, each at its own tick."""
-        laid, rows = self.feed.samples[name], self.rows[name]
+    def _placed(self, name: str, time: Any) -> TickSamples:
+        """Return a channel's samples placed by stamps (n, F) in s, each at its own tick."""
+        laid, rows = self.inputs.samples[name], self.rows[name]
         place = np.array(laid.place)
         sample, flight = np.nonzero(rows >= 0)
         tick, rate = rows[sample, flight], float(self.schedule.log_rate)
@@ -389,53 +392,53 @@ class Predictor:
         assert self.found.gains is not None
         count = len(point.coefficients)
         size = count + len(point.offsets)
-        feed, expected = self._fed(point), self._expected(objective, point)
+        inputs, assumed = self._inputs_at(point), self._assumed(objective, point)
         slopes = objective.space.slopes(point.coefficients)
         columns = {
             name: np.zeros((self.rows[name].shape[1], len(self.rows[name]), width, size))
-            for name, width in feed.widths.items()
+            for name, width in inputs.widths.items()
         }
         residuals: dict[str, Any] = {}
-        for first in range(0, max(len(moved), 1), AT_ONCE):
-            some = list(moved[first : first + AT_ONCE])
+        for first in range(0, max(len(moved), 1), PARAMETERS_AT_ONCE):
+            some = list(moved[first : first + PARAMETERS_AT_ONCE])
             along = np.eye(size)[some]
             tangents = {name: along[:, :count] @ slope for name, slope in slopes.items()}
             tangents["offsets"] = along[:, count:]
             errors, laid = innovations(
-                self.schedule, feed, self.found.gains, expected, tangents if some else None
+                self.schedule, inputs, self.found.gains, assumed, tangents if some else None
             )
-            residuals = gathered(errors, feed.widths, self.rows)
+            residuals = samples_of_ticks(errors, inputs.widths, self.rows)
             if laid is not None:
-                for name, segment, part in taken_from(laid, feed.widths, self.rows):
+                for name, segment, part in derivatives_of_samples(laid, inputs.widths, self.rows):
                     columns[name][segment][..., some] = joined(part[None])[0]
         return Jacobian(
             residuals,
             {name: np.moveaxis(part, (-1, 0), (0, -1)) for name, part in columns.items()},
-            np.full(self.feed.segments.count, np.inf),
+            np.full(self.inputs.segments.count, np.inf),
         )
 
 
 def unscaled(criterion: Criterion) -> Criterion:
-    """Return a criterion for residuals that are whitened already, a filter knowing the start."""
+    """Return a criterion for whitened residuals, without free initial states."""
     ones = {name: np.ones_like(scale) for name, scale in criterion.scale.items()}
     return replace(criterion, scale=ones, states=None)
 
 
 STEP = 0.02
-"""Of a logarithm, over which is differentiated."""
+"""Step of a strength's logarithm in finite differences."""
 
 
 class Slopes(NamedTuple):
-    """How the negative log-likelihood changes with the strengths, logarithms.
+    """Derivatives of the negative log-likelihood by the strengths' logarithms.
 
     Attributes
     ----------
     slope
-        (7,) its derivatives.
+        (7,) gradient.
     information
-        (7, 7) Fisher's.
+        (7, 7) Fisher information.
     moved
-        (7, T, m, F) derivatives of the innovations over the standard deviations that they had.
+        (7, T, m, F) derivatives of the innovations in units of their standard deviations.
     """
 
     slope: Array
@@ -443,22 +446,22 @@ class Slopes(NamedTuple):
     moved: Array
 
 
-def steps_from(strengths: Array) -> Array:
-    """Return the steps (7,) over which is differentiated by each of the strengths, logarithms."""
-    return np.where(strengths + STEP <= MOST, STEP, -STEP)
+def difference_steps(strengths: Array) -> Array:
+    """Return the finite-difference steps (7,) of the strengths' logarithms, inside the bounds."""
+    return np.where(strengths + STEP <= MAX_STRENGTHS, STEP, -STEP)
 
 
 def slopes_of(here: Filtered, beside: Iterable[Filtered], steps: Array) -> Slopes:
-    """Return how the likelihood changes with the strengths, by differences.
+    """Return the derivatives of the likelihood by the strengths, by finite differences.
 
     Parameters
     ----------
     here
-        At the strengths.
+        The filter's result at the strengths.
     beside
-        Where one of them is a step away, each in turn.
+        The results with each of them a step away.
     steps
-        (7,) see `steps_from`.
+        (7,) see `difference_steps`.
     """
     moves, spreads = np.zeros((2, len(steps), *here.white.shape))
     slope, loss = np.zeros(len(steps)), float(np.sum(here.loss))
@@ -474,31 +477,31 @@ def slopes_of(here: Filtered, beside: Iterable[Filtered], steps: Array) -> Slope
     return Slopes(slope, sum(part @ part.T for part in flat), moves)
 
 
-def hidden(names: Sequence[str]) -> NDArray[np.bool_]:
-    """Return (K,) which coefficients recorded set-points hide: what lies upstream of them.
+def hidden_by_setpoints(names: Sequence[str]) -> NDArray[np.bool_]:
+    """Return (K,) which coefficients act upstream of recorded set-points, without effect here.
 
-    And how high the markers sit: a loop holds its height to the millimetre, whereas a filter
-    begins at the height of the first sample.
+    And the markers' height: a closed loop holds its height to the millimetre, whereas a filter
+    starts at the height of the first sample.
     """
     return np.isin(names, [*INLETS["body_rate"].bypasses, "marker_offset_z"])
 
 
-def with_hidden(
+def with_hidden_coefficients(
     predicted: FisherInformation, looped: FisherInformation, names: Sequence[str], fitted: int
 ) -> FisherInformation:
-    """Return what innovations say, and of what set-points hide what least squares said of it.
+    """Return the information of innovations, with least squares' of coefficients hidden from them.
 
-    That is what it said while all others were estimated too: given what the filter says of these,
-    gusts would scatter it more (no noise model knows them there).
+    The latter is that with all other coefficients eliminated: given the filter's estimates of
+    these, gusts, which least squares has no noise model for, would scatter it more.
 
     Parameters
     ----------
     predicted, looped
-        Of innovations, and of the closed loop's simulation, in the same channels.
+        Information of innovations, and of the closed-loop simulation, in the same channels.
     names, fitted
-        Of the K coefficients, of which the first were fitted.
+        The K coefficients, and how many of them, the first, were fitted.
     """
-    upstream = hidden(names)
+    upstream = hidden_by_setpoints(names)
     others = np.flatnonzero(~upstream[:fitted])
     upper = looped.total[np.ix_(others, np.flatnonzero(upstream))]
     clear = np.eye(len(names))
@@ -523,12 +526,12 @@ def with_hidden(
 def with_strengths(
     information: FisherInformation, of_strengths: Array, strengths: Array
 ) -> FisherInformation:
-    """Return what innovations say of coefficients while the disturbances' strengths are learnt too.
+    """Return the information about coefficients with the strengths of disturbances eliminated.
 
-    With the strengths as they are innovations would know some coefficients better than they do: how
-    quickly a vehicle turns against how strongly turbulence turns it, above all. Eliminated like all
-    that is estimated beside them, the strengths take A B⁻¹ Aᵀ from the information of all flights,
-    A what innovations say of both together and B what they say of the strengths.
+    With known strengths, some standard errors would be too small, those of moments of inertia above
+    all, which trade off with the strength of turbulence. Elimination subtracts A B⁻¹ Aᵀ from the
+    information of all flights, with A the information about both together and B that about the
+    strengths.
 
     Parameters
     ----------
@@ -537,10 +540,10 @@ def with_strengths(
     of_strengths
         (7, 7) B, the innovations' covariance included.
     strengths
-        (7,) logarithms: one at its limit is not learnt.
+        (7,) logarithms: one at its bound is fixed.
     """
-    learnt = np.flatnonzero((strengths > LEAST) & (strengths < MOST))
+    learnt = np.flatnonzero((strengths > MIN_STRENGTHS) & (strengths < MAX_STRENGTHS))
     changes = dict(information.changes)
     across = np.array([changes.pop(name).gradient for name in STRENGTHS])[learnt]
-    own = of_strengths[np.ix_(learnt, learnt)] + np.eye(len(learnt)) / USUALLY**2
+    own = of_strengths[np.ix_(learnt, learnt)] + np.eye(len(learnt)) / STRENGTH_PRIOR_SD**2
     return replace(information, lost=across.T @ scaled_solve(own, across), changes=changes)

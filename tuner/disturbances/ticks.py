@@ -1,4 +1,4 @@
-"""Recordings laid out on the simulation's ticks: set-points that go in, samples that correct it."""
+"""Recorded set-points and samples on the ticks of the simulation."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured
 from tuner.recordings.flight import Flight
 
 SETPOINTS = ("rate_setpoint", "thrust_setpoint")
-MISSING = 0.1
-"""Share of the set-points that may be missing: they are interpolated."""
-OFF_TICK = 0.25
-"""Share of a period of position control by which set-points may be stamped beside its ticks."""
+MAX_MISSING_SHARE = 0.1
+"""Largest share of missing set-points, which are interpolated."""
+MAX_TICK_OFFSET = 0.25
+"""Largest median distance of set-points' stamps from ticks of position control, in periods."""
 FLIGHT_CONTROLLER = CLOCKS.index("flight_controller")
 
 
-class Sampled(eqx.Module):
+class TickSamples(eqx.Module):
     """One channel on T ticks: the sample between a tick and the one before, if there is one.
 
     Attributes
@@ -37,7 +37,7 @@ class Sampled(eqx.Module):
     weight
         (T, k, F) one over the standard deviation; zero where nothing was measured.
     place
-        (T, F) where between both ticks it was taken, 0..1, were its clock right.
+        (T, F) its place between both ticks, 0..1, without clock offset.
     """
 
     values: Float[AnyArray, "T c F"]
@@ -47,25 +47,25 @@ class Sampled(eqx.Module):
 
 def sampled(
     channel: str, measured: Measured, late: Array, ticks: int, rate: float
-) -> tuple[Sampled, NDArray[np.intp]]:
-    """Lay a channel's samples out on ticks.
+) -> tuple[TickSamples, NDArray[np.intp]]:
+    """Assign a channel's samples to ticks.
 
     Parameters
     ----------
     channel
-        A command holds: it is that of the tick before its stamp, others lie between two ticks.
+        A command belongs to the tick before its stamp, others lie between two ticks.
     measured
         The n samples of F segments.
     late
         (clocks, F) s by which stamps are late.
     ticks, rate
-        How many there are, and how many a second.
+        Number of ticks, and ticks per second.
 
     Returns
     -------
     tuple
-        The channel, and each sample's tick (n, F); -1 for one without: of several between two ticks
-        the last counts.
+        The channel, and each sample's tick (n, F), or -1: of several between two ticks the last is
+        used.
     """
     time, weight = np.asarray(measured.time), np.asarray(measured.weight)
     values = np.asarray(measured.values)
@@ -86,15 +86,15 @@ def sampled(
         laid[1][filled, :, segment] = weight[sample, :, segment]
         place[filled, segment] = 1.0 - filled + time[sample, segment] * rate
         rows[sample, segment] = filled
-    return Sampled(*laid, place), rows
+    return TickSamples(*laid, place), rows
 
 
-def each_reading(commands: Measured) -> Measured:
-    """Return commands each of which weighs as one reading, however long it rests.
+def with_equal_weights(commands: Measured) -> Measured:
+    """Return commands with equal weights, without the reduction for repeated values.
 
-    Simulated flights take equal values in a row for one reading (`repeat_counts`). Whether it rests
-    depends on what comes after it, and innovations that are weighed by that are no longer chance:
-    a filter takes all alike, and learns how noisy they are.
+    Least squares takes equal values in a row for one reading (`repeat_counts`). A run's length
+    depends on later values, and innovations with such weights would not be white: a filter weights
+    all equally, and estimates their noise.
     """
     values = np.asarray(commands.values)
     rests = np.stack([repeat_counts(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
@@ -104,20 +104,20 @@ def each_reading(commands: Measured) -> Measured:
 def setpoints_on_ticks(
     flights: Sequence[Flight], schedule: Schedule, samples: int
 ) -> BodyRateInlet | None:
-    """Return rate and thrust set-points at the ticks of position control at which they were made.
+    """Return rate and thrust set-points at the ticks of position control.
 
-    None where they were not all recorded, or are stamped beside the ticks. They are published
-    after they were made: each is taken to be that of the nearest tick, where a zero-order hold
-    would make it a step late.
+    None where not all were recorded, or stamps are too far from ticks. They are published after
+    their computation: each belongs to the nearest tick, where a zero-order hold would delay it by
+    a step.
 
     Parameters
     ----------
     flights
         F flights.
     schedule
-        Whose ticks.
+        Gives the ticks.
     samples
-        Of the simulation's log, for which they have to last.
+        Number of samples of the simulation's log.
     """
     rate = float(schedule.position_control_rate)
     ticks = np.arange(int(np.ceil(samples / schedule.log_rate * rate)) + 2)
@@ -133,8 +133,8 @@ def setpoints_on_ticks(
             flown = (tick >= 0) & (tick <= flight.duration * rate)
             expected = flight.duration * rate
             if (
-                np.count_nonzero(flown) < (1.0 - MISSING) * expected
-                or np.median(np.abs(at - tick)[flown]) > OFF_TICK
+                np.count_nonzero(flown) < (1.0 - MAX_MISSING_SHARE) * expected
+                or np.median(np.abs(at - tick)[flown]) > MAX_TICK_OFFSET
             ):
                 return None
             rows += [np.interp(ticks, tick, column) for column in series.values.T]
@@ -146,7 +146,7 @@ def setpoints_on_ticks(
     return BodyRateInlet(Vec3(x, y, z), thrust)
 
 
-def gathered(
+def samples_of_ticks(
     table: Array, widths: Mapping[str, int], rows: Mapping[str, NDArray[np.intp]]
 ) -> dict[str, Array]:
     """Return channel -> (\\*leading, n, k, F) of a table (\\*leading, T, m, F) on ticks.
@@ -156,9 +156,9 @@ def gathered(
     table
         The channels' columns, one channel after the other.
     widths
-        Channel -> how many columns it has.
+        Channel -> number of columns.
     rows
-        Channel -> (n, F) each sample's tick; zero stands where there is none.
+        Channel -> (n, F) each sample's tick; samples without one are zero.
     """
     channels, first = {}, 0
     for name, width in widths.items():
@@ -172,7 +172,7 @@ def gathered(
     return channels
 
 
-def taken_from(
+def derivatives_of_samples(
     laid: NDArray[np.float32], widths: Mapping[str, int], rows: Mapping[str, NDArray[np.intp]]
 ) -> Iterator[tuple[str, int, NDArray[np.float32]]]:
     """Return channel, segment and the samples' (Q, n, k) of derivatives on ticks.
@@ -182,7 +182,7 @@ def taken_from(
     laid
         (F, Q, T, m), the channels' rows one channel after the other.
     widths, rows
-        As of `gathered`.
+        As of `samples_of_ticks`.
     """
     first = 0
     for name, width in widths.items():

@@ -1,9 +1,9 @@
-"""A job whose search begins with what its flights' accelerations say, where inputs explain little.
+"""Regression of accelerations before the search, where inputs explain little of the turning.
 
-Where disturbances that no input shows turn a vehicle, and its loop's rotors answer them, a fit of
-simulations takes the answer for a heavy vehicle. The regression of `tuner.equation_error` does
-not. So moments of inertia are its, the search of simulations begins where it ends and moves, beside
-the rest, what share of the turning is predicted, and nothing physical is known better than by it.
+Where unrecorded disturbances turn a vehicle and its loop responds with the rotors, a fit of
+simulations finds moments of inertia that are too large. The regression of `tuner.equation_error`
+is not biased by that. So it gives the moments of inertia; the search of simulations starts there,
+with factors on the moments free, and quoted errors are no smaller than those of the regression.
 """
 
 from __future__ import annotations
@@ -18,29 +18,28 @@ from tuner.equation_error.model_accelerations import moves_rotors
 from tuner.equation_error.recorded_accelerations import steps_by_inlet
 from tuner.findings.findings import Code, Finding
 from tuner.objective.space import extended
+from tuner.search.findings import MIN_TURNING_EXPLAINED
 from tuner.search.problem import Job, job_of
 from tuner.terms.candidates import candidate_groups, neutral_values_of
 from tuner.vehicle import COEFFICIENTS, initial_values, with_values
 
-ENOUGH = 0.9
-"""Share of roll's and pitch's angular acceleration from which simulations tell inertia as well."""
 ROTOR_INERTIA = "rotor_inertia"
-"""No term that a vehicle may lack: every rotor that turns faster turns the vehicle against it."""
-OF_INERTIA = (
+"""A coefficient of every vehicle: the reaction to a rotor's acceleration."""
+REGRESSED_COEFFICIENTS = (
     *(f"inertia_{axes}" for axes in ("xx", "yy", "zz")),
     ROTOR_INERTIA,
     "moment_constant",
 )
-"""What a search of simulations could not tell from `TORQUE_GAINS`."""
+"""Coefficients that simulations cannot separate from `TORQUE_GAINS`."""
 INFLOW = "max_relative_airspeed"
-"""No term that a vehicle may lack, but one whose law many vehicles do not follow."""
+"""A coefficient of every vehicle, whose law many do not follow: it is a candidate here."""
 
 
 def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
-    """Return the job that begins with what accelerations say, or as it is; what to say of it.
+    """Return the job started from a regression of accelerations, or unchanged; and findings.
 
-    Only where all fitted flights enter by rotor speed, or all by commands, the job leaves the
-    choice of coefficients and terms, and little of the turning is explained.
+    It changes only where all fitted flights have the rotor-speed inlet or all the actuator inlet,
+    the job leaves the choice of coefficients and terms, and little of the turning is explained.
     """
     settings = job.settings
     own = settings.job
@@ -61,16 +60,18 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     space = extended(job.space, [*names, *TORQUE_GAINS], settings.job, {**given, **effects})
     candidates.pop(ROTOR_INERTIA, None)
     found = estimate(job.objective.model, space, candidates, *steps)
-    if found.turning >= ENOUGH:
+    if found.turning >= MIN_TURNING_EXPLAINED:
         return job, ()
-    begun = _begun(job, found)
-    return (job, ()) if begun is None else (begun, (_finding(found),))
+    regressed = _regressed_job(job, found)
+    return (job, ()) if regressed is None else (regressed, (_finding(found),))
 
 
-def _begun(job: Job, found: Estimate) -> Job | None:
+def _regressed_job(job: Job, found: Estimate) -> Job | None:
     """Return the job with its search's coefficients, start and windows; None for no rigid body."""
     settings = job.settings
-    moving = tuple(n for n in found.values if n not in OF_INERTIA and not moves_rotors(n))
+    moving = tuple(
+        n for n in found.values if n not in REGRESSED_COEFFICIENTS and not moves_rotors(n)
+    )
     try:
         vehicle = with_values(settings.vehicle, found.values)
     except ConfigError:
@@ -79,12 +80,12 @@ def _begun(job: Job, found: Estimate) -> Job | None:
     if search.window is None and found.horizon is not None:
         search = search.model_copy(update={"window": found.horizon})
     changed = settings.job.model_copy(update={"free": moving, "fixed": (), "search": search})
-    begun = job_of(replace(settings, vehicle=vehicle, job=changed), job.recordings)
-    return replace(begun, user_settings=job.settings, accelerations=found)
+    regressed = job_of(replace(settings, vehicle=vehicle, job=changed), job.recordings)
+    return replace(regressed, user_settings=job.settings, accelerations=found)
 
 
 def _finding(found: Estimate) -> Finding:
-    """Return what is explained of the turning, and how far ahead it can be predicted."""
+    """Return the finding on the explained share of turning, and the horizon of its prediction."""
     shares = np.clip(found.explained[3:], 0.0, 1.0).tolist()
     numbers = {f"explained_{axis}": share for axis, share in zip("xyz", shares, strict=True)}
     numbers |= {f"gain_{axis}": found.values.get(f"torque_gain_{axis}", 1.0) for axis in "xyz"}

@@ -43,13 +43,13 @@ from tuner.vehicle import (
 )
 from tuner.vehicle.vehicle import scaled_to_size, size_of
 
-RELINEARISATIONS = 3
-"""Times that yaw spins are linearised at the motor constant that all experiments give."""
+MAX_RELINEARISATIONS = 3
+"""Number of times that yaw spins are linearised at the current motor constant."""
 
 
 @dataclass(frozen=True)
 class BenchResult:
-    """What the ground measurements gave, and the folder that holds it.
+    """The result of ground measurements, and its folder.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class BenchResult:
     result
         The content of ``result.json``.
     measurements
-        Of each experiment, in the order of ``bench.yaml``.
+        One for each experiment, in the order of ``bench.yaml``.
     """
 
     folder: Path
@@ -88,8 +88,8 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
         raise InputError("--out", f"{out} holds the result of a fit", "name another folder")
     given = read_vehicle(find_config("vehicles", plan.vehicle, path.parent))
     start = given if plan.weighed_mass is None else given.replace(mass=plan.weighed_mass)
-    measurements, combination, vehicle = _estimate(path, plan, start)
-    return written(
+    measurements, combination, vehicle = _measure_all(path, plan, start)
+    return write_measurements(
         out,
         given,
         vehicle.replace(name=f"{start.name}_bench"),
@@ -103,7 +103,7 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
     )
 
 
-def written(
+def write_measurements(
     out: Path | None,
     given: VehicleFile,
     vehicle: VehicleFile,
@@ -116,16 +116,16 @@ def written(
     header: str,
     began: float,
 ) -> BenchResult:
-    """Write a result folder of measurements, and return what it holds.
+    """Write a result folder of measurements, and return its content.
 
     Parameters
     ----------
     out
         The folder; None makes one under ``runs/``.
     given, vehicle
-        As the user has it, and with the measured coefficients.
+        The user's, and with the measured coefficients.
     measurements, combination, findings
-        What was measured, what it says together, and what a user should know of it.
+        Single measurements, their combination, and findings on both.
     settings, source
         For ``result.json``, beside the vehicle, and for ``best_fit.yaml``.
     header
@@ -162,10 +162,10 @@ def written(
     return BenchResult(folder, result, measurements, combination)
 
 
-def _estimate(
+def _measure_all(
     path: Path, plan: BenchFile, start: VehicleFile
 ) -> tuple[tuple[Measurement, ...], Combination, VehicleFile]:
-    """Return each measurement, what they say together, and the vehicle that follows."""
+    """Return each measurement, their combination, and the measured vehicle."""
     experiments = dict(zip(names_of(plan.experiments), plan.experiments, strict=True))
     spins = {name: spin for name, spin in experiments.items() if isinstance(spin, YawSpin)}
     known, base, vehicle = known_of(start), path.parent, start
@@ -174,7 +174,7 @@ def _estimate(
         for name, experiment in experiments.items()
         if name not in spins
     }
-    for _ in range(RELINEARISATIONS if spins else 1):
+    for _ in range(MAX_RELINEARISATIONS if spins else 1):
         if measured:
             vehicle = vehicle_of(path, start, combine(tuple(measured.values()), known))
         measured |= {name: measure(name, spin, vehicle, base) for name, spin in spins.items()}
@@ -184,7 +184,7 @@ def _estimate(
 
 
 def known_of(vehicle: VehicleFile) -> dict[str, float]:
-    """Return coefficient -> scaled coordinate in a vehicle file, or where its term vanishes."""
+    """Return coefficient -> scaled coordinate in a vehicle file, or its neutral value."""
     neutral = {n: row.neutral for n, row in COEFFICIENTS.items() if row.neutral is not None}
     values = neutral | values_of(vehicle)
     return {
@@ -197,12 +197,12 @@ def known_of(vehicle: VehicleFile) -> dict[str, float]:
 def vehicle_of(path: Path, start: VehicleFile, combination: Combination) -> VehicleFile:
     """Return the vehicle with the measured coefficients.
 
-    A lag is zero where experiments that each have it near zero combine to less.
+    A lag is at least zero, even if experiments combine to less.
 
     Raises
     ------
     ConfigError
-        They are those of no vehicle.
+        They are impossible.
     """
     values = {
         name: value_of(name, float(scaled))
@@ -238,8 +238,8 @@ def _coefficients(
             )
             continue
         place = places[name]
-        least = least_noticed(name, start)
-        verdict, reason = _judged(name, place, combination, measurements, least)
+        resolution = resolution_of(name, start)
+        verdict, reason = _judged(name, place, combination, measurements, resolution)
         known = bool(combination.determined[place])
         scaled = float(combination.scaled[place])
         deviation = float(np.sqrt(combination.covariance[place, place]))
@@ -257,8 +257,8 @@ def _coefficients(
     return coefficients
 
 
-def least_noticed(name: str, vehicle: VehicleFile) -> float:
-    """Return the size of a coefficient that is no logarithm below which nobody notices it."""
+def resolution_of(name: str, vehicle: VehicleFile) -> float:
+    """Return the size of a linear coefficient below which it makes no difference."""
     return scaled_to_size(COEFFICIENTS[name], size_of(vehicle)).step
 
 
@@ -267,9 +267,9 @@ def _judged(
     place: int,
     combination: Combination,
     measurements: Sequence[Measurement],
-    least: float,
+    resolution: float,
 ) -> tuple[Verdict, Reason]:
-    """Return how well the experiments determine a coefficient, and why."""
+    """Return the verdict on a coefficient by the experiments, and its reason."""
     if not combination.determined[place]:
         rows = sorted((row for m in measurements for row in m.rows if name in row), key=len)
         partners = [n for row in rows for n in row if n != name]
@@ -280,7 +280,7 @@ def _judged(
         return Verdict.NOT_IDENTIFIABLE, reason
     row, scaled = COEFFICIENTS[name], float(combination.scaled[place])
     deviation = float(np.sqrt(combination.covariance[place, place]))
-    relative = deviation if row.scale == "log" else deviation / max(abs(scaled), least)
+    relative = deviation if row.scale == "log" else deviation / max(abs(scaled), resolution)
     return judge_by_error(
         deviation,
         relative,
@@ -292,7 +292,7 @@ def _judged(
 
 
 def _weight(name: str, measurement: Measurement, combination: Combination) -> float:
-    """Return an experiment's information on a coefficient, given what is known of the others."""
+    """Return an experiment's information on a coefficient, given the errors of the others."""
     total = 0.0
     for row, variance in zip(measurement.rows, np.diag(measurement.covariance), strict=True):
         others = np.array([row.get(n, 0.0) if n != name else 0.0 for n in combination.names])

@@ -1,4 +1,4 @@
-"""What would go wrong, noticed before the search: no excitation, no effect, singular directions."""
+"""Checks of a job before the search: excitation, effect, singular directions, settings."""
 
 from __future__ import annotations
 
@@ -23,50 +23,45 @@ from tuner.search.problem import Job
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import COEFFICIENTS, VehicleFile
 
-HORIZON = 12.0
-"""s from the start that are looked at: far enough to move, near enough to stay on the path."""
-DEAD = 1e-3
+HORIZON_S = 12.0
+"""Horizon of the information at the start: long enough to move, short enough not to diverge."""
+MIN_INFORMATION_RATIO = 1e-3
 """Information over that of the prior below which a coefficient counts as without effect."""
-SINGULAR = 1e-6
-"""Smallest over largest eigenvalue of the normalised information below which it is singular."""
-SHARE = 0.25
-"""A coefficient takes part in a direction from this share of the largest component."""
-MOVES = {"x": 0.2, "y": 0.2, "roll": 1.0, "pitch": 1.0}
-"""m and degrees of spread below which an axis is not excited."""
-TURNS = 0.5
-"""rad/s of yaw rate below which yaw is not excited."""
-NAMED = 3
-"""Flights that a finding names one by one, at most."""
-FOREIGN = 3.0
-"""Times that a vehicle file's lift and weight may differ: commands lift more on a full battery, and
-scaling laws know thrust to a few tens of percent."""
-IDLE = 0.7
-"""Share of the weight from which a vehicle that idles cannot descend."""
-APART = 1.07
-"""Factor between flights of the acceleration that one speed of the rotors lifts in hover: simulated
+MIN_EIGENVALUE_RATIO = 1e-6
+"""Least ratio of eigenvalues of the normalised information that is not singular."""
+MIN_COMPONENT = 0.25
+"""Least component of a coefficient in a direction, relative to the largest."""
+MIN_SPREADS = {"x": 0.2, "y": 0.2, "roll": 1.0, "pitch": 1.0}
+"""Least range of an excited axis, m and degrees."""
+MIN_YAW_RATE = 0.5
+"""Least yaw rate of excited yaw, rad/s."""
+MAX_NAMED_FLIGHTS = 3
+"""Largest number of flights that a finding names one by one."""
+MAX_LIFT_RATIO = 3.0
+"""Largest ratio of lift and weight, either way: commands lift more on a full battery, and scaling
+laws give thrust to a few tens of percent."""
+MAX_IDLE_LIFT = 0.7
+"""Largest lift over weight of idling rotors: with more a vehicle cannot descend."""
+MIN_LIFT_GAP = 1.07
+"""Least ratio between flights of the lift in hover at one rotor speed that is reported: simulated
 flights of one vehicle differ by 1 %, real ones with one battery after the other by 4 %."""
-SLOW, LEVEL, SMOOTHED = 1.0, 0.1, 31
-"""m/s, share of gravity and samples within which, averaged, a vehicle nearly hovers."""
-GAP = 0.25
-"""s without a pose inside a mission that a user should know of."""
+HOVER_SPEED, HOVER_ACCELERATION, HOVER_SAMPLES = 1.0, 0.1, 31
+"""Largest speed, m/s, and acceleration over gravity of a hover, and samples of its average."""
+MIN_POSE_GAP_S = 0.25
+"""Shortest gap of the pose that is reported."""
 
 
 def check_recordings(job: Job) -> tuple[Finding, ...]:
-    """Look at what was recorded, and at where the search would begin, without a simulation."""
+    """Return findings on recordings, settings and start values, without a simulation."""
     return (
-        *said_once(
-            (
-                *_recordings(job),
-                *_sparse_inputs(job),
-                *_motor_orders(job),
-                *_controllers(job),
-            )
+        *merged_by_flight(
+            (*_recordings(job), *_sparse_inputs(job), *_motor_orders(job), *_controllers(job))
         ),
         *_recorded_twice(job),
-        *_not_given(job),
+        *_default_mass(job),
         *_wrong_vehicle(job),
         *_commands_as_dshot(job),
-        *_lifting_otherwise(job),
+        *_lift_changes(job),
         *_excitation(job),
         *_unused_settings(job),
         *_bounds(job),
@@ -74,15 +69,15 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
     )
 
 
-def said_once(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings with those that hold for several flights alike as one of all of these."""
+def merged_by_flight(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings with equal ones of several flights merged into one."""
     subjects: dict[tuple[object, ...], list[Finding]] = {}
     for finding in findings:
         alike = (finding.code, finding.level, finding.names, tuple(finding.numbers.items()))
         subjects.setdefault(alike, []).append(finding)
     return tuple(
         replace(same[0], subject=", ".join(finding.subject for finding in same))
-        if len(same) <= NAMED
+        if len(same) <= MAX_NAMED_FLIGHTS
         else replace(same[0], subject=f"{len(same)} flights")
         for same in subjects.values()
     )
@@ -108,15 +103,12 @@ def _recordings(job: Job) -> Iterator[Finding]:
         if missing:
             yield Finding(Code.MISSING_SIGNALS, "warning", flight.name, names=tuple(missing))
         gap = float(np.max(np.diff(flight.series["position"].time), initial=0.0))
-        if gap > GAP:
+        if gap > MIN_POSE_GAP_S:
             yield Finding(Code.POSE_GAP, "warning", flight.name, {"seconds": gap})
 
 
 def _sparse_inputs(job: Job) -> Iterator[Finding]:
-    """Warn of inputs that were recorded less often than the loop that computes them ran.
-
-    How often that was, only a controller file of this vehicle says.
-    """
+    """Warn of inputs recorded less often than their loop ran, by the vehicle's controller file."""
     origin = job.settings.origin
     if _is_default(origin, "controller") and not _is_default(origin, "vehicle"):
         return
@@ -137,8 +129,8 @@ def _recorded_twice(job: Job) -> Iterator[Finding]:
             yield Finding(Code.SAME_RECORDING, "warning", flight.name, names=(other,))
 
 
-def _not_given(job: Job) -> Iterator[Finding]:
-    """Warn of a mass that no user gave: in all that has a force the scale is the mass's."""
+def _default_mass(job: Job) -> Iterator[Finding]:
+    """Warn of a default mass: all coefficients of force scale with it."""
     settings = job.settings
     if settings.weighed or "mass" in job.space.free:
         return
@@ -150,26 +142,26 @@ def _not_given(job: Job) -> Iterator[Finding]:
 
 
 def _wrong_vehicle(job: Job) -> Iterator[Finding]:
-    """Warn of a vehicle file whose rotors, turning as recorded, lift many times what it weighs.
+    """Warn of a vehicle file with a mean lift at recorded rotor speeds far from the weight.
 
-    Or a small part of it: over a flight the mean lift is the weight. A default vehicle that is not
-    the one that flew does so, and from there no search arrives.
+    Over a flight both are equal. A default vehicle may be that wrong, and no search converges from
+    there.
     """
     vehicle = job.settings.vehicle
     weight, lifts = vehicle.mass * GRAVITY, [_lift(flight, vehicle) for flight in job.fitted]
     lift = float(np.median(lifts))
     numbers = {"lift": lift, "weight": weight, "mass": vehicle.mass}
-    if not weight / FOREIGN < lift < FOREIGN * weight:
+    if not weight / MAX_LIFT_RATIO < lift < MAX_LIFT_RATIO * weight:
         yield Finding(Code.WRONG_VEHICLE, "warning", vehicle.name, numbers)
     elif "input_scaling" not in bypassed_by(job.inlets, job.fitted):
         idle, full = (_lift_of(np.full((1, ROTORS), u), vehicle, "command") for u in (0.0, 1.0))
-        if idle > IDLE * weight or full < weight:
+        if idle > MAX_IDLE_LIFT * weight or full < weight:
             numbers = {"idle": idle, "full": full, "weight": weight, "mass": vehicle.mass}
             yield Finding(Code.CANNOT_HOVER, "warning", vehicle.name, numbers)
 
 
 def _commands_as_dshot(job: Job) -> Iterator[Finding]:
-    """Warn of commands that were taken for pulses and carry the vehicle better as DShot."""
+    """Warn of commands read as pulses whose lift is nearer the weight as DShot."""
     for flight in job.flights:
         if lifts := dshot_lift(flight, job.settings.vehicle):
             numbers = dict(zip(("pulses", "dshot"), lifts, strict=True))
@@ -177,7 +169,7 @@ def _commands_as_dshot(job: Job) -> Iterator[Finding]:
 
 
 def _lift(flight: Flight, vehicle: VehicleFile) -> float:
-    """Return the mean lift in N of rotors that turn as recorded; the weight if none was."""
+    """Return the mean lift in N of the recorded rotors; the weight if none was recorded."""
     for source in get_args(Source):
         if flight.has(source):
             return _lift_of(flight.signals[source], vehicle, source)
@@ -189,14 +181,14 @@ def _lift_of(recorded: Array, vehicle: VehicleFile, source: Source) -> float:
     return float(np.nanmean(squares)) * vehicle.aerodynamics.motor_constant
 
 
-def _lifting_otherwise(job: Job) -> Iterator[Finding]:
-    """Warn of flights in whose hover rotors lift another acceleration at the same speed.
+def _lift_changes(job: Job) -> Iterator[Finding]:
+    """Warn of flights with another lift in hover at the same rotor speed.
 
-    Of one vehicle with one payload that is the same from flight to flight; by commands it goes with
-    the square of the battery's voltage at most, and not at all where speeds are controlled.
+    It is the same for one vehicle with one payload; by commands it varies at most with the square
+    of the battery's voltage, and not at all where speeds are controlled.
     """
     vehicle = job.settings.vehicle
-    seen = {f.name: there for f in job.flights if (there := _hovering(f, vehicle))}
+    seen = {f.name: there for f in job.flights if (there := _hover_lift(f, vehicle))}
     source: Source = "rotor_speed" if all("rotor_speed" in s for s in seen.values()) else "command"
     lifts = {name: there[source] for name, there in seen.items() if source in there}
     volts = {
@@ -204,9 +196,9 @@ def _lifting_otherwise(job: Job) -> Iterator[Finding]:
         for flight in job.flights
         if flight.name in lifts and VOLTAGE in flight.series
     }
-    found = _apart(lifts)
+    found = _split_by_lift(lifts)
     if found is not None and source == "command" and len(volts) == len(lifts):
-        charged = _apart({name: lift / volts[name] ** 2 for name, lift in lifts.items()})
+        charged = _split_by_lift({name: lift / volts[name] ** 2 for name, lift in lifts.items()})
         found = None if charged is None else found
     if found is not None:
         odd, more = found
@@ -214,11 +206,11 @@ def _lifting_otherwise(job: Job) -> Iterator[Finding]:
         yield Finding(Code.LIFTS_OTHERWISE, "warning", ", ".join(odd), {"more": more}, names)
 
 
-def _apart(lifts: Mapping[str, float]) -> tuple[list[str], float] | None:
-    """Return the smaller part of flights that a gap of `APART` divides, and what it lifts more."""
+def _split_by_lift(lifts: Mapping[str, float]) -> tuple[list[str], float] | None:
+    """Return the smaller group of flights split at `MIN_LIFT_GAP`, and its relative excess lift."""
     ranked = sorted(lifts, key=lambda name: lifts[name])
     gaps = [lifts[above] / lifts[below] for below, above in pairwise(ranked)]
-    if max(gaps, default=1.0) < APART:
+    if max(gaps, default=1.0) < MIN_LIFT_GAP:
         return None
     cut = int(np.argmax(gaps)) + 1
     odd, others = sorted((ranked[:cut], ranked[cut:]), key=len)
@@ -226,11 +218,8 @@ def _apart(lifts: Mapping[str, float]) -> tuple[list[str], float] | None:
     return odd, float(of_odd / of_others) - 1.0
 
 
-def _hovering(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
-    """Return by which signals a flight tells what its rotors lift where it nearly hovers.
-
-    m/s² per (rad/s)² of all rotors.
-    """
+def _hover_lift(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
+    """Return rotor signal -> lift of a flight near hover, m/s² per (rad/s)² of all rotors."""
     found: dict[Source, float] = {}
     for source in get_args(Source):
         series = flight.series.get(source)
@@ -242,9 +231,9 @@ def _hovering(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
         if steps is None:
             continue
         pull = np.nan_to_num(steps.accelerations[:, 2])
-        smooth = np.convolve(pull, np.full(SMOOTHED, 1.0 / SMOOTHED), "same")
-        slow = np.linalg.norm(rows_of(steps.motion.velocity), axis=1) < SLOW
-        hovers = steps.known & slow & (np.abs(smooth / GRAVITY - 1.0) < LEVEL)
+        smooth = np.convolve(pull, np.full(HOVER_SAMPLES, 1.0 / HOVER_SAMPLES), "same")
+        slow = np.linalg.norm(rows_of(steps.motion.velocity), axis=1) < HOVER_SPEED
+        hovers = steps.known & slow & (np.abs(smooth / GRAVITY - 1.0) < HOVER_ACCELERATION)
         if hovers.sum() >= MIN_SAMPLES:
             squares = np.square(steps.rotor_speed[hovers]).sum()
             found[source] = float(pull[hovers].sum() / squares)
@@ -252,7 +241,7 @@ def _hovering(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
 
 
 def _motor_orders(job: Job) -> Iterator[Finding]:
-    """Warn of commands or rotor speeds that turn the vehicle as those of other rotors would."""
+    """Warn of commands or rotor speeds in another order than the vehicle file's."""
     for flight, inlet in zip(job.fitted, job.inlets, strict=True):
         speeds = inlet == "rotor_speed" or "command" not in flight.series
         sources: list[Source] = ["rotor_speed", "command"] if speeds else ["command", "rotor_speed"]
@@ -266,7 +255,7 @@ def _motor_orders(job: Job) -> Iterator[Finding]:
 
 
 def _controllers(job: Job) -> Iterator[Finding]:
-    """Warn of flights whose set-points are not those of the controller file that simulates them."""
+    """Warn of flights whose set-points are not those of the controller file."""
     for flight, inlet in zip(job.fitted, job.inlets, strict=True):
         if INLETS[inlet].closed_loop:
             yield from setpoint_findings(flight, job.settings.controller)
@@ -277,8 +266,8 @@ def _is_default(origin: Mapping[str, str], setting: str) -> bool:
 
 
 def _excitation(job: Job) -> Iterator[Finding]:
-    spread = {axis: max(_spread(flight, axis) for flight in job.fitted) for axis in MOVES}
-    still = tuple(axis for axis, least in MOVES.items() if spread[axis] < least)
+    spread = {axis: max(_spread(flight, axis) for flight in job.fitted) for axis in MIN_SPREADS}
+    still = tuple(axis for axis, least in MIN_SPREADS.items() if spread[axis] < least)
     if still:
         yield Finding(Code.STILL_AXES, "warning", "excitation", names=still)
     rate = max(
@@ -290,7 +279,7 @@ def _excitation(job: Job) -> Iterator[Finding]:
         default=0.0,
     )
     turns = {"inertia_zz", "moment_constant"} & set(job.space.free)
-    if rate < TURNS and turns:
+    if rate < MIN_YAW_RATE and turns:
         yield Finding(Code.NO_YAW, "warning", "excitation", {"rate": rate})
 
 
@@ -306,7 +295,7 @@ def _spread(flight: Flight, axis: str) -> float:
 
 
 def _unused_settings(job: Job) -> Iterator[Finding]:
-    """Warn of settings of coefficients that are neither free nor looked for among the terms."""
+    """Warn of settings of coefficients that are neither free nor candidate terms."""
     asked = job.given.job
     unused = [
         name
@@ -338,11 +327,11 @@ def _starts_on_bounds(job: Job) -> Iterator[Finding]:
             yield Finding(Code.START_ON_BOUND, "info", parameter.name, numbers)
 
 
-def information(job: Job) -> Array:
+def information_at_start(job: Job) -> Array:
     """Return the Fisher information (K, K) at the start, in the scaled coordinates."""
     objective = job.objective
     rate = float(objective.schedule.log_rate)
-    horizon = min(round(HORIZON * rate), objective.samples)
+    horizon = min(round(HORIZON_S * rate), objective.samples)
     point = objective.start(job.space.initial)
     sums = objective.sums(point, plain_criterion(objective, horizon))
     count = len(job.space)
@@ -352,13 +341,13 @@ def information(job: Job) -> Array:
 
 
 def check_information(job: Job) -> Iterator[Finding]:
-    """Look at what the recordings tell of the coefficients where the search would begin."""
-    at_start = information(job)
+    """Yield findings on the recordings' information about coefficients at the search's start."""
+    at_start = information_at_start(job)
     if not np.isfinite(at_start).all():
         yield Finding(Code.NOT_FINITE, "failure", "simulation")
         return
     names = job.space.names
-    dead = np.diag(at_start) * job.space.prior_sd**2 < DEAD
+    dead = np.diag(at_start) * job.space.prior_sd**2 < MIN_INFORMATION_RATIO
     if dead.all():
         yield Finding(Code.NOTHING_HAS_EFFECT, "failure", "coefficients")
         return
@@ -367,12 +356,16 @@ def check_information(job: Job) -> Iterator[Finding]:
     alive = np.flatnonzero(~dead)
     for direction in singular_directions(at_start[np.ix_(alive, alive)]):
         share = np.abs(direction) / np.abs(direction).max()
-        members = tuple(names[alive[i]] for i in np.argsort(-share) if share[i] > SHARE)
+        members = tuple(names[alive[i]] for i in np.argsort(-share) if share[i] > MIN_COMPONENT)
         yield Finding(Code.SINGULAR_DIRECTION, "warning", "coefficients", names=members)
 
 
 def singular_directions(information: Array) -> list[Array]:
-    """Return the directions (K,) in scaled coordinates about which the data say nothing."""
+    """Return the directions (K,) in scaled coordinates without information."""
     unit = unit_diagonal(information)
     values, vectors = symmetric_eigen(information * np.outer(unit, unit))
-    return [vectors[:, i] * unit for i in range(len(values)) if values[i] < SINGULAR * values[-1]]
+    return [
+        vectors[:, i] * unit
+        for i in range(len(values))
+        if values[i] < MIN_EIGENVALUE_RATIO * values[-1]
+    ]

@@ -1,4 +1,4 @@
-"""What a run reports while it works."""
+"""Callbacks for the progress of a run."""
 
 from __future__ import annotations
 
@@ -15,21 +15,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Listener:
-    """Whom a run calls while it works.
+    """Callbacks of a run.
 
     Attributes
     ----------
     on_settings
         Gets the settings, before anything is read.
     on_iteration
-        Gets each iteration of the search, and the s that the search may still take (NaN where that
-        is unknown).
+        Gets each iteration of the search, and its remaining s (NaN where unknown).
     on_estimates
-        Gets where the search of the base model ended, long before intervals and validation.
+        Gets the estimates of the base model, long before intervals and validation.
     on_message
-        Gets a sentence on what is done next, or on what a user should know.
+        Gets a sentence on the next step, or a finding as a line.
     on_doubt
-        Gets a finding before the search: what was given is not what flew.
+        Gets a finding before the search that files contradict the flights.
     on_stop
         Gets a sentence on how to go on, where the run was interrupted.
     on_folds

@@ -1,4 +1,4 @@
-"""Whether recordings can be fitted, and how: what `tune` decides, before it simulates anything."""
+"""Whether and how recordings can be fitted: the decisions of `tune` before any simulation."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from tuner.vehicle import COEFFICIENTS
 
 @dataclass(frozen=True)
 class Verdict:
-    """What `tune` would do with a recording.
+    """The decision of `tune` on a recording.
 
     Attributes
     ----------
     fits
         Whether something can be fitted to it.
     inlets
-        Where each of its missions enters the simulated loop; ``none`` of a log without a pose.
+        Inlet of each of its missions; ``none`` for a log without a pose.
     why
-        In sentences: why it cannot be fitted, or why it enters there.
+        Reasons in sentences: why it cannot be fitted, or why it has these inlets.
     not_shown
-        Coefficients that act above those places, which this recording cannot show.
+        Coefficients upstream of the inlets, without effect on this recording.
     gains
-        What the log's own parameters have otherwise than the controller file.
+        Differences of the log's own parameters from the controller file.
     logging
-        What would have to be logged more of.
+        Messages to log more often.
     settings
-        The logger's settings that would do that; empty where nothing is missing.
+        The logger's settings that do that; empty where nothing is missing.
     """
 
     path: str
@@ -55,7 +55,7 @@ def verdict_of(
     namespace: str | None = None,
     vehicle: str | None = None,
 ) -> Verdict:
-    """Return what `tune` would do with a recording, by the job file beside it.
+    """Return the decision of `tune` on a recording, by the job file beside it.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def verdict_of(
     """
     path = Path(inspection.path)
     options = Options([str(path)], topics=topics, namespace=namespace, vehicle=vehicle)
-    decided = _decided(path, resolve_settings(options, fits=False))
+    decided = _cached_verdict(path, resolve_settings(options, fits=False))
     parameters = parameters_of(path)
     logging: tuple[LoggingAdvice, ...] = ()
     if inspection.format == "ulog" and inspection.duration > 0:
@@ -77,20 +77,20 @@ def verdict_of(
     return replace(decided, logging=logging, settings=words)
 
 
-def _decided(path: Path, settings: Settings) -> Verdict:
-    """Return what `tune` decides, from the cache where it was asked before."""
+def _cached_verdict(path: Path, settings: Settings) -> Verdict:
+    """Return the decision, from the cache if it is known."""
     job = settings.job
     inputs = settings.vehicle, settings.controller, job, read_sidecar(path)
     maps = [digest(file) for file in (job.topics,) if file is not None and file.exists()]
     key = (digest(path), path.name, source_version(), *map(repr, (*inputs, *maps)))
 
     found = load_or_compute(
-        Verdict, cache_file("verdict", *key), lambda: _simulatable(path, settings)
+        Verdict, cache_file("verdict", *key), lambda: _computed_verdict(path, settings)
     )
     return replace(found, path=str(path))
 
 
-def _simulatable(path: Path, settings: Settings) -> Verdict:
+def _computed_verdict(path: Path, settings: Settings) -> Verdict:
     """Return whether and how the only recording of some settings would be fitted, and why."""
     from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
 
@@ -124,7 +124,7 @@ def _simulatable(path: Path, settings: Settings) -> Verdict:
 
 
 def in_words(verdict: Verdict) -> list[str]:
-    """Return a verdict as lines: what `tune` does first, and then what would change it."""
+    """Return a verdict as lines: the decision, its reasons, and advice on logging."""
     if not verdict.fits:
         return [f"cannot be fitted: {verdict.why[0]}", *_logger_in_words(verdict)]
     if verdict.inlets == ("none",):
@@ -141,7 +141,7 @@ def in_words(verdict: Verdict) -> list[str]:
 
 
 def _logger_in_words(verdict: Verdict) -> list[str]:
-    """Return what would have to be logged more of, a line a message."""
+    """Return the advice on logging, a line for each message."""
     lines = []
     for advice in verdict.logging:
         logged = f"{advice.logged:.0f} Hz" if advice.logged else "not logged"

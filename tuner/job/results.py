@@ -109,7 +109,7 @@ def result_of(
                 flight.name: dict(zip(OFFSETS, offsets.tolist(), strict=True))
                 for flight, offsets in zip(job.fitted, table.T, strict=True)
             },
-            "window_starts": starts_moved(fitted),
+            "window_starts": shifts_of_starts(fitted),
             "starts": [
                 {"origin": outcome.origin, "cost": outcome.loss} for outcome in fitted.outcomes
             ],
@@ -143,11 +143,10 @@ def _loss_at_start(job: Job, fitted: Fitted) -> float:
     return float(loss)
 
 
-def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
-    """Return by how much free initial states were moved: of windows, and of spins.
+def shifts_of_starts(fitted: Fitted) -> dict[str, JsonValue]:
+    """Return the root mean square shifts of free initial states of windows and spins.
 
-    State -> root mean square in its unit: what was ascribed to initial states and
-    not to coefficients.
+    State -> shift in its unit: the part of the data explained by initial states, not coefficients.
     """
     freedom, states = fitted.objective.segments.freedom, fitted.criterion.states
     if freedom is None or states is None:

@@ -107,7 +107,7 @@ def run(
     settings, logged = with_logged_parameters(resolve_settings(options))
     listener.on_settings(settings)
     _check_place(options, settings, place_for(out, resume=resume))
-    job, findings = prepared(settings)
+    job, findings = prepare(settings)
     findings = (*logged, *findings)
     _check_refits(options, job)
     explanation = Explanation(listener.on_message)
@@ -144,22 +144,16 @@ def _fit(
 ) -> RunResult:
     """Search, validate, and write everything into a folder; findings are of the check before."""
     found, validation, (selected, fitted, examination) = _fitted(
-        job,
-        findings,
-        folder,
-        explanation,
-        listener,
-        command=command,
-        resume=resume,
+        job, findings, folder, explanation, listener, command=command, resume=resume
     )
     job = selected.job
     explanation.tell(fitted.findings)
     vehicle = vehicle_fitted(job, fitted)
     if job is not found.job or fitted is not found.fitted:
-        validation = _flown(job, fitted, vehicle, listener)
-    explanation.notice(_of_flights(job, validation))
+        validation = _validated(job, fitted, vehicle, listener)
+    explanation.notice(_flight_findings(job, validation))
     explanation.notice(reference_voltage_findings(settings.vehicle, vehicle))
-    sources = _known(fitted, examination, explanation)
+    sources = _examination_findings(fitted, examination, explanation)
 
     def written(
         effective: Effective | None = None, next_log: tuple[LogProposal, ...] = ()
@@ -182,7 +176,7 @@ def _fit(
         return result
 
     physical = Run(folder=folder, result=written(), vehicle=vehicle)
-    _write_flown(folder, validation, fitted)
+    _write_simulations(folder, validation, fitted)
     find = partial(_effective, physical, job, fitted, listener)
     stops = selected.refuted  # no other answer, and no flight to plan
     effective = None if stops else explanation.part("effective coefficients", find, None)
@@ -209,16 +203,22 @@ def _fit(
     return result
 
 
-def prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
-    """Return the job of some settings, and what there is to say of it before it is simulated."""
+def prepare(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
+    """Return the job of some settings, and the findings before any simulation."""
     with span("reading"):
         recordings, left_out = read_recordings(settings)
     with span("check"):
         recordings, changed = cut_at_rotor_changes(recordings, settings.vehicle)
         recordings = with_input_lags(recordings, settings.vehicle)
-        job, said = with_accelerations(job_of(settings, recordings))
+        job, regressed = with_accelerations(job_of(settings, recordings))
         job = with_first_terms(job)
-        return job, (*left_out, *changed, *late_input_findings(job), *said, *check_recordings(job))
+        return job, (
+            *left_out,
+            *changed,
+            *late_input_findings(job),
+            *regressed,
+            *check_recordings(job),
+        )
 
 
 def _fitted(
@@ -231,9 +231,9 @@ def _fitted(
     command: str,
     resume: bool,
 ) -> tuple[Selected, Validation, ExaminedFit]:
-    """Return where the search of a job ends, how it meets the flights, and how well that is known.
+    """Return a job's search with its terms, its validation, and its examination.
 
-    What was found is written before it is examined.
+    The search's result is written before the examination.
     """
     if not resume:
         forget(folder)
@@ -258,7 +258,7 @@ def _fitted(
     if found.refuted:
         listener.on_doubt(FLIGHTS_REFUTE)
     vehicle = vehicle_fitted(found.job, found.fitted)
-    validation = _flown(found.job, found.fitted, vehicle, listener)
+    validation = _validated(found.job, found.fitted, vehicle, listener)
     rows = found.rows_after_holding(found.fitted.held)
     result = result_of(found.job, found.fitted, None, validation, command=command, selection=rows)
     with span("results"):
@@ -270,14 +270,14 @@ def _fitted(
     )
 
 
-def _flown(job: Job, fitted: Fitted, vehicle: VehicleFile, listener: Listener) -> Validation:
+def _validated(job: Job, fitted: Fitted, vehicle: VehicleFile, listener: Listener) -> Validation:
     listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
     with span("validation"):
         return validate(job, fitted, vehicle)
 
 
-def _of_flights(job: Job, validation: Validation) -> tuple[Finding, ...]:
-    """Return what the simulated flights say of a fit."""
+def _flight_findings(job: Job, validation: Validation) -> tuple[Finding, ...]:
+    """Return the findings on a fit's simulated flights."""
     return (
         *flights_worse(validation.initial, validation.best),
         *flights_not_followed(job, validation.best),
@@ -286,10 +286,10 @@ def _of_flights(job: Job, validation: Validation) -> tuple[Finding, ...]:
     )
 
 
-def _known(
+def _examination_findings(
     fitted: Fitted, examination: Examination | None, explanation: Explanation
 ) -> dict[str, Sources]:
-    """Return what flights and ground measurements say each, and notice what is to be said."""
+    """Keep the findings of an examination; return coefficients by flights and by ground."""
     if examination is None:
         return {}
     uncertainty, known = examination.uncertainty, examination.known
@@ -317,8 +317,8 @@ def _effective(physical: Run, job: Job, fitted: Fitted, listener: Listener) -> E
     )
 
 
-def _write_flown(folder: Path, validation: Validation, fitted: Fitted) -> None:
-    """Write how each flight is simulated, and how the search went."""
+def _write_simulations(folder: Path, validation: Validation, fitted: Fitted) -> None:
+    """Write each flight's simulations, and the iterations of the search."""
     simulations = {"initial": validation.initial, "best": validation.best}
     write_traces(folder, simulations)
     table_of(simulations).write(folder)
@@ -333,11 +333,7 @@ def _export(folder: Path, settings: Settings, listener: Listener) -> None:
 
 
 def _with_refits(
-    fit: tuple[Job, Fitted],
-    result: RunResult,
-    folder: Path,
-    options: Options,
-    listener: Listener,
+    fit: tuple[Job, Fitted], result: RunResult, folder: Path, options: Options, listener: Listener
 ) -> RunResult:
     """Return the result with the standard errors of refits to other flights, and write it again."""
 
@@ -360,7 +356,7 @@ def _with_refits(
 
 
 def _check_place(options: Options, settings: Settings, folder: Path) -> None:
-    """Refuse a result folder of which the run reads what it would write there."""
+    """Refuse a result folder with inputs of the run that it would overwrite."""
     if options.bench and folder.resolve() == Path(options.bench).resolve():
         raise InputError("--out", "is the folder of --bench", "name another folder")
     read = (options.vehicle, options.controller, settings.job.vehicle, settings.job.controller)
@@ -381,9 +377,9 @@ def _check_refits(options: Options, job: Job) -> None:
 def _check(
     findings: Sequence[Finding], explanation: Explanation, listener: Listener, *, force: bool
 ) -> None:
-    """Tell findings; refuse to go on after a failure unless forced.
+    """Report findings; refuse to go on after a failure unless forced.
 
-    Where what was given is not what flew, the search may take long to fail.
+    Findings that files contradict the flights go to ``on_doubt``: such a search takes long to fail.
     """
     explanation.tell(findings)
     other = (one for one in findings if one.level == "warning" and one.code in WRONG_INPUT_CODES)

@@ -1,4 +1,4 @@
-"""The command `tune sensitivity` as a function: what coefficients do, how well they are known."""
+"""The command `tune sensitivity` as a function: effects and uncertainty of coefficients."""
 
 from __future__ import annotations
 
@@ -44,22 +44,22 @@ from tuner.vehicle import check_names, initial_values
 
 
 def unfitted(job: Job) -> Fitted:
-    """Return the vehicle that a job would start from, as a fit that moved nothing.
-
-    What is undecided of the loop is tried both ways.
-    """
+    """Return a job's start values as a fit, with the better of the loop's choices."""
     configured = loop_of(job.objective)
     loops = [configured, *map(configured.switched, job.undecided(job.objective))]
     tried = [_simulated(job, with_loop(job.objective, loop)) for loop in loops]
     best = min(tried, key=lambda fitted: fitted.loss_best)
     if tried[0].loss_best <= SWITCH_GAIN * best.loss_best:
         best = tried[0]
-    findings = (*loop_findings(job, loop_of(best.objective), "info"), *_poorly_met(best.scales))
+    findings = (
+        *loop_findings(job, loop_of(best.objective), "info"),
+        *_unmatched_findings(best.scales),
+    )
     return replace(best, evaluations=len(tried), findings=findings)
 
 
 def _simulated(job: Job, objective: Objective) -> Fitted:
-    """Return a problem at the job's vehicle, its noise scaled to residuals that are larger."""
+    """Return a problem at the job's vehicle as a fit, with noise scaled up to its residuals."""
     start = initial_values(job.settings.vehicle, job.settings.controller, job.space.free)
     vector = job.space.vector_of(start)
     points = initial_progress(objective, vector[None]).points
@@ -83,7 +83,7 @@ def _simulated(job: Job, objective: Objective) -> Fitted:
     )
 
 
-def _poorly_met(scales: Mapping[str, Mapping[str, float]]) -> Iterator[Finding]:
+def _unmatched_findings(scales: Mapping[str, Mapping[str, float]]) -> Iterator[Finding]:
     for name, of_channels in scales.items():
         worst, multiple = max(of_channels.items(), key=lambda item: item[1])
         if multiple > UNMATCHED_RATIO:
@@ -92,7 +92,7 @@ def _poorly_met(scales: Mapping[str, Mapping[str, float]]) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class SensitivityResult:
-    """A folder that `examine_vehicle` wrote, and what is in it."""
+    """A folder that `examine_vehicle` wrote, and its content."""
 
     folder: Path
     knowledge: Knowledge
@@ -112,10 +112,10 @@ def examine_vehicle(
     Parameters
     ----------
     asked
-        Flights, vehicle, everything else that decides the simulation, and what else is computed;
-        held-out flights are examined like the others.
+        Flights, vehicle, settings of the simulation, and further computations; held-out flights are
+        examined like the others.
     arena
-        m along x, y and up; None takes what the recorded flights took, and some more.
+        m along x, y and up; None takes that of the recorded flights, and some more.
 
     Raises
     ------
@@ -192,7 +192,7 @@ def _uncertainty_with(examination: Examination, name: str) -> Uncertainty:
 
 
 def _ranges(job: Job, examination: Examination, span: float) -> dict[str, tuple[float, float]]:
-    """Return where each fitted coefficient is varied: the job file's bounds, else some percent.
+    """Return the range of each fitted coefficient: the job file's bounds, else ± ``span``.
 
     The search's own bounds are guards: most vehicles between them cannot fly.
     """

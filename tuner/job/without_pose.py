@@ -18,17 +18,17 @@ from tuner.ground.measurement import Measurement, value_of
 from tuner.inertial.measurement import measure_inertial, widen_to_agree
 from tuner.inertial.prediction import RateErrors, rate_errors
 from tuner.inertial.signals import stretches_of
-from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, written
+from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, write_measurements
 from tuner.job.listener import SILENT, Listener
 from tuner.recordings.loader import InertialFlight
 from tuner.result import place_for
 from tuner.search.job_flights import left_out_finding
 from tuner.vehicle import VehicleFile, values_of, with_values
 
-BY_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
-"""What a flight without a pose gives over the mass."""
+OVER_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
+"""Coefficients that a flight without a pose determines over the mass."""
 CURVE = "input_scaling"
-"""The scale of the rotors' curve, which it leaves open."""
+"""The scale of the rotors' curve, which such a flight does not determine."""
 
 
 def fit_without_pose(
@@ -45,12 +45,12 @@ def fit_without_pose(
     Parameters
     ----------
     settings
-        Of the job; its vehicle is of the weighed mass.
+        Settings of the job; its vehicle has the weighed mass.
     flights
-        At least one; those that the job holds out are predicted, and not fitted, and those that
-        cannot be fitted are left out, if others are left.
+        At least one; held-out flights are predicted and not fitted, and those that cannot be fitted
+        are left out, if others remain.
     left_out
-        Findings of those that already were.
+        Findings on flights that already were left out.
     out
         Result folder; None makes one under ``runs/`` named by the time.
 
@@ -78,8 +78,8 @@ def fit_without_pose(
     except ConfigError:  # moment_constant over inertia_zz, shared out, gave what no body can have
         measurements = tuple(_without_yaw(m) for m in measurements)
         combination = _combined(measurements, known)
-        vehicle = vehicle_of(path, _as_flat(start, combination), combination)
-    return written(
+        vehicle = vehicle_of(path, _resized(start, combination), combination)
+    return write_measurements(
         out,
         start,
         vehicle.replace(name=f"{start.name}_inertial"),
@@ -87,9 +87,9 @@ def fit_without_pose(
         combination,
         findings=(
             *left_out,
-            *_left_open(settings, combination.names),
-            *_predicted(used, start, vehicle),
-            *_predicted(held_out, start, vehicle, held_out=True),
+            *_open_findings(settings, combination.names),
+            *_prediction_findings(used, start, vehicle),
+            *_prediction_findings(held_out, start, vehicle, held_out=True),
             *conflicts_of(combination),
         ),
         settings={"command": command, "origin": dict(settings.origin)},
@@ -102,7 +102,7 @@ def fit_without_pose(
 def _measured(
     flights: Sequence[InertialFlight], start: VehicleFile, listener: Listener
 ) -> tuple[list[Measurement], list[InertialFlight], list[Finding]]:
-    """Return what flights say, those that say it, and findings of those that cannot be fitted."""
+    """Return measurements of flights, these flights, and findings on unusable ones."""
     measured, used, errors = [], [], []
     for flight in flights:
         listener.on_message(f"{flight.name}: fitting body rate and specific force without a pose.")
@@ -119,7 +119,7 @@ def _measured(
 
 
 def _combined(measurements: Sequence[Measurement], known: Mapping[str, float]) -> Combination:
-    """Return what flights say together, of vehicles with the file's curve of rotor speeds."""
+    """Return the combination of measurements, with the file's curve of rotor speeds held."""
     combination = combine(measurements, known)
     if CURVE not in combination.names:
         return combination
@@ -128,33 +128,33 @@ def _combined(measurements: Sequence[Measurement], known: Mapping[str, float]) -
     return combination.model_copy(update={"scaled": scaled})
 
 
-def _predicted(
+def _prediction_findings(
     flights: Sequence[InertialFlight],
     start: VehicleFile,
     vehicle: VehicleFile,
     *,
     held_out: bool = False,
 ) -> tuple[Finding, ...]:
-    """Return from when on the body rate of a flight is better held, or until then predicted worse.
+    """Return findings on predictions of the body rate that are worse than holding, or than before.
 
-    Of flights that were held out it is said how well it is predicted until then in any case.
+    Of held-out flights the last prediction better than holding is reported in any case.
     """
     findings = []
     for flight in flights:
-        told: RateErrors | None = None
+        last: RateErrors | None = None
         for errors in rate_errors(stretches_of(flight.series, flight.flying), start, vehicle):
             if min(errors.fitted, errors.initial) > errors.hold:
-                findings.append(_foretold(Code.RATE_NOT_PREDICTED, flight, errors))
+                findings.append(_prediction_finding(Code.RATE_NOT_PREDICTED, flight, errors))
                 break
-            told = errors
-        if told is not None and told.fitted > (1.0 + MAX_RMSE_INCREASE) * told.initial:
-            findings.append(_foretold(Code.RATE_WORSE, flight, told))
-        elif told is not None and held_out:
-            findings.append(_foretold(Code.RATE_PREDICTED, flight, told))
+            last = errors
+        if last is not None and last.fitted > (1.0 + MAX_RMSE_INCREASE) * last.initial:
+            findings.append(_prediction_finding(Code.RATE_WORSE, flight, last))
+        elif last is not None and held_out:
+            findings.append(_prediction_finding(Code.RATE_PREDICTED, flight, last))
     return tuple(findings)
 
 
-def _foretold(code: Code, flight: InertialFlight, errors: RateErrors) -> Finding:
+def _prediction_finding(code: Code, flight: InertialFlight, errors: RateErrors) -> Finding:
     numbers = {
         "before": errors.initial,
         "after": errors.fitted,
@@ -165,11 +165,10 @@ def _foretold(code: Code, flight: InertialFlight, errors: RateErrors) -> Finding
     return Finding(code, level, flight.name, numbers)
 
 
-def _as_flat(vehicle: VehicleFile, combination: Combination) -> VehicleFile:
-    """Return a vehicle of the size that was found: its yaw inertia in the file's proportion.
+def _resized(vehicle: VehicleFile, combination: Combination) -> VehicleFile:
+    """Return a vehicle with inertias in the file's proportions, scaled to those of roll and pitch.
 
-    What the flights say of roll and pitch says how large the vehicle is, of which the file knows
-    nothing where another vehicle flew.
+    The file's size is wrong where another vehicle flew.
     """
     before = values_of(vehicle)
     changes = [
@@ -183,7 +182,7 @@ def _as_flat(vehicle: VehicleFile, combination: Combination) -> VehicleFile:
 
 
 def _without_yaw(measurement: Measurement) -> Measurement:
-    """Return a measurement without what it says of inertia_zz, which it does not say alone."""
+    """Return a measurement without inertia_zz, which it determines in combination only."""
     about_z = {"inertia_zz", "torque_trim_z"}
     kept = [i for i, row in enumerate(measurement.rows) if not about_z & set(row)]
     return replace(
@@ -194,9 +193,9 @@ def _without_yaw(measurement: Measurement) -> Measurement:
     )
 
 
-def _left_open(settings: Settings, names: Sequence[str]) -> tuple[Finding, ...]:
-    """Return what such flights leave open, and which number closes it."""
-    vehicle, scaled = settings.vehicle, tuple(name for name in BY_MASS if name in names)
+def _open_findings(settings: Settings, names: Sequence[str]) -> tuple[Finding, ...]:
+    """Return findings on coefficients that such flights do not determine."""
+    vehicle, scaled = settings.vehicle, tuple(name for name in OVER_MASS if name in names)
     mass = {"mass": values_of(vehicle)["mass"]}
     findings = [
         Finding(Code.SCALES_WITH_MASS, "info", "mass", mass, scaled),

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.disturbances.predictor import Predictor, hidden
+from tuner.disturbances.predictor import Predictor, hidden_by_setpoints
 from tuner.objective.information import with_start_values
 from tuner.objective.space import Space
 from tuner.search.problem import Job
@@ -94,7 +94,7 @@ class LinearisedInnovations:
         objective, beside = wide.objective, replace(predictor, schedule=wide.objective.schedule)
         if model_errors is not None:
             objective = model_errors.applied_to(objective)
-            beside = beside.stepped(objective)
+            beside = beside.for_problem(objective)
         information = beside.information(objective, wide.point, fitted.criterion)
         space, vector = objective.space, np.asarray(wide.point.coefficients)
         scaled = space.scaled(vector)
@@ -236,7 +236,7 @@ class LinearisedInnovations:
             row.group: row.names
             for row in self.selected.rows
             if row.reason in (ACCEPTED if row.kept else REJECTED_BY_LEAST_SQUARES)
-            and not hidden(row.names).any()
+            and not hidden_by_setpoints(row.names).any()
             and not set(row.names) & set(condition_rows())
             and all(COEFFICIENTS[name].begin is None for name in row.names)
         }
@@ -254,7 +254,7 @@ class LinearisedInnovations:
         return self._columns([name for name in names if name not in self.fitted.held])
 
     def _columns(self, names: Sequence[str]) -> Columns:
-        seen = ~hidden(self.space.names)
+        seen = ~hidden_by_setpoints(self.space.names)
         return np.flatnonzero(np.isin(self.space.names, list(names)) & seen)
 
 

@@ -10,8 +10,8 @@ from functools import partial
 import numpy as np
 
 from tuner.core.phrases import listed
-from tuner.disturbances.maximum_likelihood import STEPS, with_least_innovations
-from tuner.disturbances.predictor import Predictor, hidden
+from tuner.disturbances.maximum_likelihood import MAX_STEPS, maximise_likelihood
+from tuner.disturbances.predictor import Predictor, hidden_by_setpoints
 from tuner.disturbances.ticks import FLIGHT_CONTROLLER
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
@@ -212,7 +212,7 @@ def _with_lag_terms(
     fitted, beside = _fit_innovations(with_lag_terms, with_lag_terms.fitted, without)
     if not (beside.keeps_track and beside.is_likelier_than(without)):
         full = full_problem_of(there.objective, there.point)
-        point = Point(full.point.coefficients, without.feed.offsets)
+        point = Point(full.point.coefficients, without.inputs.offsets)
         return seen, there, without.at(full.objective, point)
     on_message(_changed_terms(seen.selected, with_lag_terms))
     chosen, selected = (
@@ -227,13 +227,13 @@ def _with_lag_terms(
 
 
 def _fit_innovations(
-    selected: Selected, fitted: Fitted, predictor: Predictor, *, steps: int = STEPS
+    selected: Selected, fitted: Fitted, predictor: Predictor, *, steps: int = MAX_STEPS
 ) -> tuple[Fitted, Predictor]:
     """Return the maximum-likelihood fit to innovations, started at a fit, and its predictor.
 
     The filter starts from its own strengths and clocks.
     """
-    job, own = selected.job, predictor.feed.offsets
+    job, own = selected.job, predictor.inputs.offsets
     full = full_problem_of(fitted.objective, fitted.point)
     point = Point(full.point.coefficients, own)
     predictor = predictor.laid(full.objective, point, job.fitted)
@@ -241,9 +241,9 @@ def _fit_innovations(
     moves = np.isin(names, full.fitted) & ~np.isin(names, list(fitted.held.values()))
     offsets = free_offsets(job)
     enter = offsets & (np.arange(len(offsets)) != FLIGHT_CONTROLLER)[:, None]
-    free = np.concatenate([moves & ~hidden(names), enter.ravel()])
+    free = np.concatenate([moves & ~hidden_by_setpoints(names), enter.ravel()])
     problem = full.objective, point, fitted.criterion
-    predictor, point = with_least_innovations(predictor, job.fitted, problem, free, steps)
+    predictor, point = maximise_likelihood(predictor, job.fitted, problem, free, steps)
     return replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)), predictor
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Z95, Array, scaled_solve
-from tuner.disturbances.predictor import Predictor, with_hidden, with_strengths
+from tuner.disturbances.predictor import Predictor, with_hidden_coefficients, with_strengths
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.normal_equations import Objective, flight_batch, flight_batches
@@ -98,7 +98,7 @@ def examine(
     informations, sensitivities, predicted = [], [], []
     slopes = None
     if predictor is not None:
-        slopes = predictor.slopes(objective, Point(point.coefficients, predictor.feed.offsets))
+        slopes = predictor.slopes(objective, Point(point.coefficients, predictor.inputs.offsets))
     residuals: list[Residual] = []
     for flights, batch in flight_batches(objective, point, criterion):
         flight_names = [names[number] for number in flights]
@@ -107,7 +107,7 @@ def examine(
             for name, other in alternatives.items()
         }
         if predictor is not None and slopes is not None:  # first: two Jacobians are too much
-            of_flights = predictor.among(flights)
+            of_flights = predictor.of_flights(flights)
             by_strengths = slopes.moved[..., flights]
             predicted.append(of_flights.information(*batch, others, by_strengths))
         jacobian = batch[0].jacobian(*batch[1:])
@@ -121,7 +121,7 @@ def examine(
     information = FisherInformation.joined(informations)
     astray = information.astray if at_minimum else None
     if predictor is not None and slopes is not None:
-        information = with_hidden(
+        information = with_hidden_coefficients(
             with_strengths(
                 FisherInformation.joined(predicted), slopes.information, predictor.strengths
             ),

@@ -26,9 +26,9 @@ def spread(rng: np.random.Generator, size: int) -> np.ndarray:
 @pytest.mark.parametrize("sampled", [[], [4], [0, 2, 3], list(range(WIDE))])
 def test_samples_tell_and_time_spreads_what_products_of_matrices_say(sampled: list[int]) -> None:
     rng = np.random.default_rng(len(sampled))
-    covariance, follow = spread(rng, SIZE), rng.standard_normal((SIZE, SIZE))
-    keeps = rng.random(3)
-    follow[-3:] = np.diag(np.append(np.zeros(SIZE - 3), keeps))[-3:]
+    covariance, transition = spread(rng, SIZE), rng.standard_normal((SIZE, SIZE))
+    retention = rng.random(3)
+    transition[-3:] = np.diag(np.append(np.zeros(SIZE - 3), retention))[-3:]
     derivatives = rng.standard_normal((WIDE, SHOWN)) * (rng.random((WIDE, SHOWN)) < 0.4)
     derivatives[:, 0] = 1.0
     columns = [jnp.asarray(row)[jnp.flatnonzero(row)] for row in derivatives]
@@ -40,41 +40,43 @@ def test_samples_tell_and_time_spreads_what_products_of_matrices_say(sampled: li
             for some, row in zip(columns, derivatives, strict=True)
         ]
 
-    seen = Sparse.of(push, SHOWN)
-    assert [list(row) for row in seen.rows] == [np.flatnonzero(r).tolist() for r in derivatives]
+    sparse = Sparse.of(push, SHOWN)
+    assert [list(row) for row in sparse.rows] == [np.flatnonzero(r).tolist() for r in derivatives]
     error, variance = rng.standard_normal(WIDE), rng.random(WIDE) + 0.1
     order = jnp.asarray([*sampled, *[0] * (WIDE - len(sampled))])
     samples = Samples(
         jnp.asarray(error),
         jnp.asarray(variance),
-        seen,
+        sparse,
         lambda number: order[number],
         jnp.asarray(len(sampled)),
     )
-    told = innovations_of(jnp.asarray(covariance), jnp.ones((WIDE, SIZE)), samples)
+    update = innovations_of(jnp.asarray(covariance), jnp.ones((WIDE, SIZE)), samples)
     along = np.zeros((len(sampled), SIZE))
     along[:, :SHOWN] = derivatives[sampled]
     total = along @ covariance @ along.T + np.diag(variance[sampled])
     root = np.linalg.cholesky(total) if sampled else np.zeros((0, 0))
     gain = np.linalg.solve(root, along @ covariance)
-    np.testing.assert_allclose(np.asarray(told.factors)[np.ix_(sampled, sampled)], root, atol=1e-9)
-    np.testing.assert_allclose(np.asarray(told.gain)[sampled], gain, atol=1e-9)
+    np.testing.assert_allclose(
+        np.asarray(update.factors)[np.ix_(sampled, sampled)], root, atol=1e-9
+    )
+    np.testing.assert_allclose(np.asarray(update.gain)[sampled], gain, atol=1e-9)
     white = np.linalg.solve(root, error[sampled])
-    np.testing.assert_allclose(np.asarray(told.white)[sampled], white, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(update.white)[sampled], white, atol=1e-9)
     weights = rng.standard_normal(WIDE)
-    corrects = told.corrections(samples, jnp.asarray(weights))
+    corrects = update.corrections(samples, jnp.asarray(weights))
     np.testing.assert_allclose(corrects, weights[sampled] @ gain, atol=1e-9)
-    unrest = rng.random(SIZE)
+    process_noise = rng.random(SIZE)
     after, _ = propagated(
         (jnp.asarray(covariance), jnp.zeros((SIZE, SIZE))),
-        told,
+        update,
         samples,
-        lambda column: jnp.asarray(follow) @ column,
-        jnp.asarray(unrest),
-        keeps=jnp.asarray(keeps),
+        lambda column: jnp.asarray(transition) @ column,
+        jnp.asarray(process_noise),
+        retention=jnp.asarray(retention),
         tick=jnp.asarray(1),
     )
-    expected = follow @ (covariance - gain.T @ gain) @ follow.T + np.diag(unrest)
+    expected = transition @ (covariance - gain.T @ gain) @ transition.T + np.diag(process_noise)
     np.testing.assert_allclose(after, expected, atol=1e-8)
 
 
@@ -83,32 +85,32 @@ def test_the_covariance_of_an_unstable_vehicle_settles_as_riccatis_equation_says
     rng, size, ticks, kept = np.random.default_rng(0), 7, 4000, 0.8
     shapes = rng.standard_normal((size, size))
     shapes[-1] = np.append(np.zeros(size - 1), 1.0)
-    follow = shapes @ np.diag([1.02, 1.01, 1.0, 0.99, 0.9, 0.5, kept]) @ np.linalg.inv(shapes)
-    seen = rng.standard_normal((2, size))
+    transition = shapes @ np.diag([1.02, 1.01, 1.0, 0.99, 0.9, 0.5, kept]) @ np.linalg.inv(shapes)
+    derivatives = rng.standard_normal((2, size))
     samples = Samples(
         jnp.zeros(2),
         jnp.ones(2),
-        Sparse.of(lambda c: [sum(map(jnp.multiply, row, c))[None] for row in seen], size),
+        Sparse.of(lambda c: [sum(map(jnp.multiply, row, c))[None] for row in derivatives], size),
         lambda number: number,
         jnp.asarray(2),
     )
-    unrest = np.full(size, 0.01)
+    process_noise = np.full(size, 0.01)
 
     def tick(matrices: tuple[Array, ...], number: Array) -> tuple[tuple[Array, ...], None]:
         covariance, gain, scratch = matrices
-        told = innovations_of(covariance, gain, samples)
+        update = innovations_of(covariance, gain, samples)
         covariance, scratch = propagated(
             (covariance, scratch),
-            told,
+            update,
             samples,
-            lambda c: follow @ c,
-            jnp.asarray(unrest),
-            keeps=jnp.asarray([kept]),
+            lambda c: transition @ c,
+            jnp.asarray(process_noise),
+            retention=jnp.asarray([kept]),
             tick=number,
         )
-        return (covariance, told.gain, scratch), None
+        return (covariance, update.gain, scratch), None
 
     begin = jnp.eye(size), jnp.zeros((2, size)), jnp.zeros((size, size))
     (covariance, *_), _ = lax.scan(tick, begin, jnp.arange(ticks))
-    settled = solve_discrete_are(follow.T, seen.T, np.diag(unrest), np.eye(2))
+    settled = solve_discrete_are(transition.T, derivatives.T, np.diag(process_noise), np.eye(2))
     np.testing.assert_allclose(covariance, settled, rtol=1e-9)

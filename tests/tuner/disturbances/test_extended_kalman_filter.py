@@ -21,9 +21,9 @@ from sim_jax.state import hover
 from tests.conftest import KERNELS
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
 from tuner.disturbances import extended_kalman_filter as ekf
-from tuner.disturbances.disturbances import COUNT, USUAL
-from tuner.disturbances.observer import Expected, Feed, first_errors
-from tuner.disturbances.ticks import Sampled
+from tuner.disturbances.disturbances import INITIAL_STRENGTHS, PROCESSES
+from tuner.disturbances.observer import AssumedModel, FilterInput, first_errors
+from tuner.disturbances.ticks import TickSamples
 from tuner.objective.segments import Segments
 from tuner.vehicle.model import coefficients_in, model_of, schedule_of
 
@@ -49,7 +49,7 @@ print(*(float(np.sum(each)).hex() for each in test.told(*test.hovering())))
 """
 
 
-def hovering() -> tuple[ekf.Schedule, Feed, Expected]:
+def hovering() -> tuple[ekf.Schedule, FilterInput, AssumedModel]:
     """Return a hover whose samples, at some of the ticks, scatter by their noise."""
     vehicle, controller = vehicle_file(), controller_file()
     model, schedule = model_of(vehicle, controller), schedule_of(controller)
@@ -72,23 +72,27 @@ def hovering() -> tuple[ekf.Schedule, Feed, Expected]:
         values += sd / 4.0 * rng.standard_normal(values.shape)
         weight = np.zeros((TICKS, 3 if name == "attitude" else read, 1))
         weight[number % 2 :: 2] = 1.0 / sd
-        samples[name] = Sampled(values, weight, np.ones((TICKS, 1)))
-    feed = Feed(Segments(inlet, start, {}, jnp.arange(1)), np.zeros((6, 1)), samples)
-    wide = sum(feed.widths.values())
+        samples[name] = TickSamples(values, weight, np.ones((TICKS, 1)))
+    inputs = FilterInput(Segments(inlet, start, {}, jnp.arange(1)), np.zeros((6, 1)), samples)
+    wide = sum(inputs.widths.values())
     return (
         schedule,
-        feed,
-        Expected(model, coefficients_in(model), USUAL[:, None] + 1.0, np.ones((wide, 1))),
+        inputs,
+        AssumedModel(
+            model, coefficients_in(model), INITIAL_STRENGTHS[:, None] + 1.0, np.ones((wide, 1))
+        ),
     )
 
 
-def told(schedule: ekf.Schedule, feed: Feed, expected: Expected) -> tuple[np.ndarray, ...]:
+def told(
+    schedule: ekf.Schedule, inputs: FilterInput, expected: AssumedModel
+) -> tuple[np.ndarray, ...]:
     """Return whitened innovations of the filter, its loss, and derivatives with its gains."""
-    found = ekf.filtered(schedule, feed, expected)
+    found = ekf.filtered(schedule, inputs, expected)
     assert found.gains is not None
     tangents = {"inertia_xx": np.array([1e-2, 0.0]), "motor_constant": np.array([0.0, 1e-6])}
-    tangents["offsets"] = np.zeros((2, len(feed.offsets)))
-    _, moved = ekf.innovations(schedule, feed, found.gains, expected, tangents)
+    tangents["offsets"] = np.zeros((2, len(inputs.offsets)))
+    _, moved = ekf.innovations(schedule, inputs, found.gains, expected, tangents)
     return found.white, found.loss, moved
 
 
@@ -106,49 +110,49 @@ def folder(tmp_path_factory):
 @pytest.mark.usefixtures("folder")
 def test_commands_that_once_took_longer_change_nothing() -> None:
     """Only how many are corrected on their way: one more is one that has reached the motors."""
-    schedule, feed, expected = hovering()
+    schedule, inputs, expected = hovering()
     latencies = 0.0, 2.5 * schedule.step
     counts = [ekf._shortly_delayed(schedule, expected, each)[1] for each in latencies]
     assert counts == [1, 3]
-    short, long = (ekf.filtered(schedule, feed, expected, latency=each) for each in latencies)
+    short, long = (ekf.filtered(schedule, inputs, expected, latency=each) for each in latencies)
     np.testing.assert_allclose(long.white, short.white, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(long.loss, short.loss, rtol=1e-9)
 
 
 @pytest.mark.usefixtures("folder")
 def test_innovations_are_those_of_a_filter_in_matrices() -> None:
-    schedule, feed, expected = hovering()
-    white = told(schedule, feed, expected)[0][..., 0]
+    schedule, inputs, expected = hovering()
+    white = told(schedule, inputs, expected)[0][..., 0]
     short, in_flight = ekf._shortly_delayed(ekf._undelayed(schedule), expected)
-    given = ekf._given(feed, expected)
-    of_lanes = given.feed, given.expected.strengths, given.expected.noise
+    given = ekf._given(inputs, expected)
+    of_lanes = given.inputs, given.assumed.strengths, given.assumed.noise
     one, strengths, noise = jax.tree.map(lambda leaf: jnp.asarray(leaf[..., 0]), of_lanes)
-    taken = replace(given.expected, strengths=strengths, noise=noise)
+    taken = replace(given.assumed, strengths=strengths, noise=noise)
     observer, state = ekf.Observer.of(short, one, taken)
-    size = len(first_errors(state, in_flight)) + COUNT
+    size = len(first_errors(state, in_flight)) + PROCESSES
 
     def errors(change, state, number):
         read = jax.tree.map(lambda leaf: leaf[number], one.samples)
-        now = observer.seen(observer.corrected(state, change, number, in_flight), number)
+        now = observer.outputs(observer.corrected(state, change, number, in_flight), number)
         return jnp.concatenate(observer.errors(now, now, read)), observer.sampled(read)
 
     def later(change, state, pushed, number):
-        moved = observer.corrected(state, change[:-COUNT], number, in_flight)
-        after = observer.next(moved, pushed + change[-COUNT:], number)
-        kept = observer.processes.keeps * (pushed + change[-COUNT:])
+        moved = observer.corrected(state, change[:-PROCESSES], number, in_flight)
+        after = observer.next(moved, pushed + change[-PROCESSES:], number)
+        kept = observer.processes.retention * (pushed + change[-PROCESSES:])
         numbers = observer.numbers(after, number + 1, in_flight)
         return jnp.concatenate([numbers, kept]), after
 
     told_by = jax.jit(lambda *args: (*errors(*args), jax.jacfwd(errors, has_aux=True)(*args)[0]))
     moved_by = jax.jit(jax.jacfwd(later, has_aux=True))
-    processes, pushed = observer.processes, jnp.zeros(COUNT)
+    processes, pushed = observer.processes, jnp.zeros(PROCESSES)
     sd = np.concatenate([first_errors(state, in_flight), processes.sd])
-    covariance, fresh = np.diag(sd**2), np.diag([*np.zeros(size - COUNT), *processes.added])
+    covariance, fresh = np.diag(sd**2), np.diag([*np.zeros(size - PROCESSES), *processes.added])
     for number in range(TICKS):
         error, sampled, slopes = map(
-            np.asarray, told_by(jnp.zeros(size - COUNT), state, jnp.asarray(number))
+            np.asarray, told_by(jnp.zeros(size - PROCESSES), state, jnp.asarray(number))
         )
-        along = np.hstack([slopes, np.zeros((len(slopes), COUNT))])[sampled]
+        along = np.hstack([slopes, np.zeros((len(slopes), PROCESSES))])[sampled]
         root = np.linalg.cholesky(along @ covariance @ along.T + np.eye(len(along)))
         gain = np.linalg.solve(root, along @ covariance)
         alone = np.linalg.solve(root, error[sampled])
@@ -156,10 +160,10 @@ def test_innovations_are_those_of_a_filter_in_matrices() -> None:
         np.testing.assert_allclose(white[number][sampled], alone, rtol=1e-6, atol=1e-9)
         assert (white[number][~sampled] == 0.0).all()
         change = jnp.asarray(-alone @ gain)
-        state = observer.corrected(state, change[:-COUNT], jnp.asarray(number), in_flight)
-        pushed = pushed + change[-COUNT:]
+        state = observer.corrected(state, change[:-PROCESSES], jnp.asarray(number), in_flight)
+        pushed = pushed + change[-PROCESSES:]
         follow, state = moved_by(jnp.zeros(size), state, pushed, jnp.asarray(number))
-        pushed = pushed * processes.keeps
+        pushed = pushed * processes.retention
         covariance = follow @ (covariance - gain.T @ gain) @ follow.T + fresh
 
 

@@ -6,8 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.disturbances.disturbances import LEAST, MOST, STRENGTHS
-from tuner.disturbances.predictor import hidden, with_hidden, with_strengths
+from tuner.disturbances.disturbances import MAX_STRENGTHS, MIN_STRENGTHS, STRENGTHS
+from tuner.disturbances.predictor import (
+    hidden_by_setpoints,
+    with_hidden_coefficients,
+    with_strengths,
+)
 from tuner.objective.information import Change, FisherInformation
 from tuner.uncertainty.estimates import _shares
 
@@ -43,7 +47,7 @@ def predicted() -> FisherInformation:
 
 
 def test_its_error_is_that_of_least_squares_with_all_others_free():
-    joined = with_hidden(predicted(), looped(), NAMES, FITTED)
+    joined = with_hidden_coefficients(predicted(), looped(), NAMES, FITTED)
     own = np.linalg.inv(joined.total[:FITTED, :FITTED])[HIDDEN, HIDDEN]
     beside = np.linalg.inv(looped().total[:FITTED, :FITTED])[HIDDEN, HIDDEN]
     # the prior of the others counts for a little of what they leave
@@ -51,7 +55,7 @@ def test_its_error_is_that_of_least_squares_with_all_others_free():
 
 
 def test_what_innovations_say_of_the_others_stays():
-    joined, others = with_hidden(predicted(), looped(), NAMES, FITTED), [0, 2, 3]
+    joined, others = with_hidden_coefficients(predicted(), looped(), NAMES, FITTED), [0, 2, 3]
     np.testing.assert_array_equal(
         joined.blocks[..., others, :][..., others], predicted().blocks[..., others, :][..., others]
     )
@@ -61,7 +65,7 @@ def test_what_innovations_say_of_the_others_stays():
 
 def test_how_high_markers_sit_is_told_by_the_loop_alone():
     names = ("inertia_xx", "estimate_latency", "marker_offset_x", "marker_offset_z")
-    assert hidden(names).tolist() == [False, True, False, True]
+    assert hidden_by_setpoints(names).tolist() == [False, True, False, True]
 
 
 def test_what_strengths_take_is_taken_from_the_flights_and_shares_still_add_up() -> None:
@@ -73,7 +77,9 @@ def test_what_strengths_take_is_taken_from_the_flights_and_shares_still_add_up()
         for name in STRENGTHS
     }
     learnt = with_strengths(
-        replace(said, changes=across), 100.0 * np.eye(len(STRENGTHS)), 0.5 * (LEAST + MOST)
+        replace(said, changes=across),
+        100.0 * np.eye(len(STRENGTHS)),
+        0.5 * (MIN_STRENGTHS + MAX_STRENGTHS),
     )
     assert not learnt.changes
     error, wider = (np.sqrt(np.diag(np.linalg.inv(i.total))) for i in (said, learnt))

@@ -12,9 +12,9 @@ import pytest
 from tests.tuner.disturbances.test_predictor import OFFSETS, gusty
 from tests.tuner.uncertainty import making
 from tuner.config import JobFile
-from tuner.disturbances.maximum_likelihood import with_least_innovations
+from tuner.disturbances.maximum_likelihood import maximise_likelihood
 from tuner.disturbances.predictor import Predictor
-from tuner.objective.information import begun
+from tuner.objective.information import with_start_values
 from tuner.objective.normal_equations import Objective
 from tuner.objective.space import extended
 from tuner.recordings.flight import Flight
@@ -35,9 +35,7 @@ def descended(
     assert predictor is not None
     criterion = making.fitted_of(problem, point).criterion
     moves = np.concatenate([np.ones(len(vector), bool), OFFSETS.ravel()])
-    predictor, point = with_least_innovations(
-        predictor, flights, (problem, point, criterion), moves
-    )
+    predictor, point = maximise_likelihood(predictor, flights, (problem, point, criterion), moves)
     return predictor, problem.space.numbers(point.coefficients)
 
 
@@ -49,7 +47,9 @@ def test_samples_call_for_a_second_lag_that_is_there(second: float) -> None:
     problem = replace(problem, model=with_coefficients(exact.model, {LAG: jnp.asarray(0.0)}))
     without, _ = descended(problem, flights, problem.space.initial)
     wide = replace(problem, space=extended(problem.space, (LAG,), JobFile(), {LAG: 0.0}))
-    beside, numbers = descended(wide, flights, begun(wide.space, wide.space.initial, (LAG,)))
+    beside, numbers = descended(
+        wide, flights, with_start_values(wide.space, wide.space.initial, (LAG,))
+    )
     assert beside.is_likelier_than(without) == (second > 0.0)
     if second:
         assert float(numbers[LAG]) == pytest.approx(second, abs=0.002)

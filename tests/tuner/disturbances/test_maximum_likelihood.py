@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
-from tuner.disturbances.disturbances import USUAL
+from tuner.disturbances.disturbances import INITIAL_STRENGTHS
 from tuner.disturbances.maximum_likelihood import _Equations
-from tuner.disturbances.observer import Feed
+from tuner.disturbances.observer import FilterInput
 from tuner.disturbances.predictor import Predictor
 
 
@@ -28,12 +28,12 @@ def test_no_step_is_taken_where_a_filter_has_lost_a_flight():
 def test_a_filter_flies_on_the_voltage_that_another_problem_reads():
     """What it does then is seen in `test_predictor`, at length."""
     fit = problem(("inertia_xx",))
-    feed = Feed(fit.segments, np.zeros((5, fit.segments.count)), {})
-    predictor = Predictor(fit.schedule, feed, {}, USUAL, {})
+    inputs = FilterInput(fit.segments, np.zeros((5, fit.segments.count)), {})
+    predictor = Predictor(fit.schedule, inputs, {}, INITIAL_STRENGTHS, {})
     volts = np.full((3, fit.segments.count), 0.1)
     other = replace(fit, segments=replace(fit.segments, log_voltage=volts))
-    assert predictor.stepped(fit).feed.segments.log_voltage is None
-    assert predictor.stepped(other).feed.segments.log_voltage is volts
+    assert predictor.for_problem(fit).inputs.segments.log_voltage is None
+    assert predictor.for_problem(other).inputs.segments.log_voltage is volts
 
 
 @pytest.mark.parametrize(

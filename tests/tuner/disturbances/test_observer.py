@@ -11,16 +11,16 @@ import pytest
 from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from tests.sim_jax.support import controller, moving_start, vehicle, wobble
-from tuner.disturbances.disturbances import COUNT, USUAL, processes_of
+from tuner.disturbances.disturbances import INITIAL_STRENGTHS, PROCESSES, processes_of
 from tuner.disturbances.extended_kalman_filter import GATE, deviance
 from tuner.disturbances.observer import (
     CHANNELS,
-    Feed,
+    FilterInput,
     Observer,
     commands_in_flight,
     first_errors,
 )
-from tuner.disturbances.ticks import Sampled, gathered
+from tuner.disturbances.ticks import TickSamples, samples_of_ticks
 
 SCHEDULE = Schedule(log_rate=400, position_control_rate=400, longest_actuator_latency=0.02)
 TICK = jnp.asarray(25)  # beyond the delay line's ten places
@@ -75,14 +75,18 @@ def test_a_command_on_its_way_moves_its_rotor_when_its_time_has_come(begin, age,
 def test_a_push_accelerates_a_heavy_vehicle_as_a_light_one(begin):
     """Gains that stay while mass and inertia move must tell nothing of them."""
     observer, state = begin
-    pushed = jnp.full((COUNT, 1), 0.5)
+    pushed = jnp.full((PROCESSES, 1), 0.5)
     gained = []
     for times in (jnp.asarray(1.0), jnp.asarray(2.0)):
         craft = observer.plant.vehicle
         craft = eqx.tree_at(lambda v: v.body, craft, jax.tree.map(times.__mul__, craft.body))
         plant = eqx.tree_at(lambda p: p.vehicle, observer.plant, craft)
-        heavier = Observer(plant, processes_of(craft, jnp.asarray(USUAL), 400.0), None, (), 400.0)
-        ends = [heavier.next(state, push, TICK).motion for push in (jnp.zeros((COUNT, 1)), pushed)]
+        heavier = Observer(
+            plant, processes_of(craft, jnp.asarray(INITIAL_STRENGTHS), 400.0), None, (), 400.0
+        )
+        ends = [
+            heavier.next(state, push, TICK).motion for push in (jnp.zeros((PROCESSES, 1)), pushed)
+        ]
         gained.append(
             [
                 getattr(ends[1], name).stacked() - getattr(ends[0], name).stacked()
@@ -97,21 +101,21 @@ def test_each_channels_errors_stand_where_its_columns_are_looked_for(begin):
     """A dictionary that jax has taken apart is sorted by its keys, and channels are not."""
     observer, state = begin
     observer = Observer(observer.plant, None, jnp.zeros((5, 1)), CHANNELS, 400.0)
-    seen = observer.seen(state, TICK)
+    outputs = observer.outputs(state, TICK)
     too_small = {name: 10.0 * number for number, name in enumerate(CHANNELS)}
     too_small["attitude"] = 0.0
     samples = {
-        name: Sampled(
-            seen[name] - too_small[name],
-            jnp.ones((3 if name == "attitude" else len(seen[name]), 1)),
+        name: TickSamples(
+            outputs[name] - too_small[name],
+            jnp.ones((3 if name == "attitude" else len(outputs[name]), 1)),
             jnp.ones(1),
         )
         for name in CHANNELS
     }
-    widths = Feed(None, None, jax.tree.map(lambda leaf: leaf[None], samples)).widths
-    errors = jax.jit(lambda taken: observer.errors(seen, seen, taken))(samples)
+    widths = FilterInput(None, None, jax.tree.map(lambda leaf: leaf[None], samples)).widths
+    errors = jax.jit(lambda taken: observer.errors(outputs, outputs, taken))(samples)
     table, rows = np.concatenate(errors)[None], {name: np.zeros((1, 1), int) for name in CHANNELS}
-    for name, part in gathered(table, widths, rows).items():
+    for name, part in samples_of_ticks(table, widths, rows).items():
         np.testing.assert_allclose(part, too_small[name], atol=1e-9)
 
 

@@ -16,23 +16,23 @@ from sim_jax.rollout import rollout
 from tests.tuner.uncertainty import making
 from tuner.disturbances.disturbances import (
     COMMAND_NOISE,
-    COUNT,
-    LEAST,
-    MOST,
-    USUAL,
+    INITIAL_STRENGTHS,
+    MAX_STRENGTHS,
+    MIN_STRENGTHS,
+    PROCESSES,
+    clipped,
     disturbance_of,
     processes_of,
-    within,
 )
 from tuner.disturbances.disturbances import STRENGTHS as NAMED
 from tuner.disturbances.extended_kalman_filter import GATE, Filtered
-from tuner.disturbances.maximum_likelihood import _equations, with_least_innovations
+from tuner.disturbances.maximum_likelihood import _equations, maximise_likelihood
 from tuner.disturbances.observer import Observer
 from tuner.disturbances.predictor import (
-    USUALLY,
+    STRENGTH_PRIOR_SD,
     Predictor,
+    difference_steps,
     slopes_of,
-    steps_from,
     unscaled,
     with_strengths,
 )
@@ -80,11 +80,11 @@ def gusty(exact: Objective, seed: int) -> tuple[Objective, list[Flight]]:
     rng, rate = np.random.default_rng(seed), 100.0
     processes = processes_of(exact.model.vehicle, jnp.asarray(STRENGTHS), rate)
     ticks = round(making.SECONDS * rate) + 2
-    pushes = np.zeros((COUNT, ticks, 2))
-    pushes[:, 0] = np.asarray(processes.sd)[:, None] * rng.standard_normal((COUNT, 2))
+    pushes = np.zeros((PROCESSES, ticks, 2))
+    pushes[:, 0] = np.asarray(processes.sd)[:, None] * rng.standard_normal((PROCESSES, 2))
     for tick in range(1, ticks):
-        fresh = np.sqrt(processes.added)[:, None] * rng.standard_normal((COUNT, 2))
-        pushes[:, tick] = np.asarray(processes.keeps)[:, None] * pushes[:, tick - 1] + fresh
+        fresh = np.sqrt(processes.added)[:, None] * rng.standard_normal((PROCESSES, 2))
+        pushes[:, tick] = np.asarray(processes.retention)[:, None] * pushes[:, tick - 1] + fresh
     pushes *= np.asarray(processes.acts)[:, None, None]
     channels, setpoints = flown(exact, jnp.asarray(pushes))
     every, measured = making.SAMPLE_EVERY, {}
@@ -125,7 +125,7 @@ def fitted(exact: Objective) -> tuple[Objective, Predictor, Point]:
     moves = np.concatenate([np.ones(len(FREE), bool), OFFSETS.ravel()])
     predictor = Predictor.of(problem, truth, flights)
     assert predictor is not None
-    return problem, *with_least_innovations(predictor, flights, (problem, truth, criterion), moves)
+    return problem, *maximise_likelihood(predictor, flights, (problem, truth, criterion), moves)
 
 
 def error_of(problem: Objective, predictor: Predictor, point: Point) -> np.ndarray:
@@ -164,9 +164,11 @@ def test_errors_are_those_of_coefficients_and_strengths_that_are_learnt_together
     learnt = with_strengths(moving, slopes.information, predictor.strengths)
     assert learnt.changes.keys() == fixed.changes.keys()
     alone, together = (np.linalg.inv(found.total) for found in (fixed, learnt))
-    free = np.flatnonzero((predictor.strengths > LEAST) & (predictor.strengths < MOST))
+    free = np.flatnonzero(
+        (predictor.strengths > MIN_STRENGTHS) & (predictor.strengths < MAX_STRENGTHS)
+    )
     across = np.array([moving.changes[name].gradient for name in NAMED])[free]
-    own = slopes.information[np.ix_(free, free)] + np.eye(len(free)) / USUALLY**2
+    own = slopes.information[np.ix_(free, free)] + np.eye(len(free)) / STRENGTH_PRIOR_SD**2
     both = np.linalg.inv(np.block([[fixed.total, across.T], [across, own]]))
     np.testing.assert_allclose(together, both[: len(FREE), : len(FREE)], rtol=1e-6)
     wider = np.sqrt(np.diag(together) / np.diag(alone))
@@ -214,9 +216,11 @@ def test_from_far_off_it_ends_in_the_same_place(fitted, exact) -> None:
     wrong = {"inertia_xx": 1.15, "inertia_yy": 1.2, "time_constant_up": 1.8}
     for name, factor in wrong.items():
         vector[exact.space.names.index(name)] *= factor
-    begin = replace(predictor, strengths=USUAL + np.log([2.0, 3.0, 0.3, 4.0, 1.0, 3.0, 1.0]))
+    begin = replace(
+        predictor, strengths=INITIAL_STRENGTHS + np.log([2.0, 3.0, 0.3, 4.0, 1.0, 3.0, 1.0])
+    )
     where = Point(jnp.asarray(vector), point.offsets)
-    again, there = with_least_innovations(begin, flights, (problem, where, criterion), free)
+    again, there = maximise_likelihood(begin, flights, (problem, where, criterion), free)
     told = predictor.jacobian(problem, point, range(len(FREE)))
     error = covariance_of(
         information_at(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
@@ -234,9 +238,9 @@ def test_disturbances_that_are_taken_for_five_times_too_strong_are_given_up_in_f
     problem, predictor, point = fitted
     criterion = making.fitted_of(problem, point).criterion
     stronger = np.log([5.0, 5.0, 5.0, 5.0, 1.0, 1.0, 1.0])
-    begin = replace(predictor, strengths=within(predictor.strengths + stronger))
+    begin = replace(predictor, strengths=clipped(predictor.strengths + stronger))
     free = np.concatenate([np.ones(5, bool), OFFSETS.ravel()])
-    again, _ = with_least_innovations(
+    again, _ = maximise_likelihood(
         begin, gusty(exact, 1)[1], (problem, point, criterion), free, steps=4
     )
     assert again.found.loss.sum() == pytest.approx(predictor.found.loss.sum(), abs=2.0)
@@ -253,9 +257,7 @@ def test_near_the_estimate_one_step_ends_at_it(monkeypatch, fitted, exact) -> No
     passes, at = [], Predictor.at
     monkeypatch.setattr(Predictor, "at", lambda *a: passes.append(1) or at(*a))
     free = np.concatenate([np.ones(5, bool), OFFSETS.ravel()])
-    _, there = with_least_innovations(
-        predictor, gusty(exact, 1)[1], (problem, where, criterion), free
-    )
+    _, there = maximise_likelihood(predictor, gusty(exact, 1)[1], (problem, where, criterion), free)
     moved = (np.asarray(there.coefficients) - np.asarray(point.coefficients)) * slope
     assert len(passes) == 2
     assert (np.abs(moved) < 0.3 * error).all(), moved / error
@@ -268,7 +270,7 @@ def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitt
     def alone(strengths: np.ndarray) -> Filtered:
         return replace(predictor, strengths=strengths).at(problem, point).found.first(ticks)
 
-    steps = steps_from(predictor.strengths)
+    steps = difference_steps(predictor.strengths)
     beside = [alone(predictor.strengths + step) for step in np.diag(steps)]
     slope, information, moved = slopes_of(alone(predictor.strengths), beside, steps)
     found = predictor.slopes(problem, point)
@@ -281,7 +283,7 @@ def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitt
 def test_noise_that_a_wrong_beginning_took_for_more_is_taken_back(fitted) -> None:
     problem, predictor, point = fitted
     noisy = replace(predictor, noise=dict.fromkeys(predictor.noise, 1.3)).at(problem, point)
-    assert all(noise == 1.0 for noise in noisy.noise_seen.values())
+    assert all(noise == 1.0 for noise in noisy.estimated_noise.values())
 
 
 @pytest.mark.parametrize("claimed", [2.0, 0.7])
@@ -296,9 +298,7 @@ def test_how_noisy_commands_are_is_learnt_whatever_is_claimed(exact, claimed) ->
     predictor = Predictor.of(problem, truth, flights)
     assert predictor is not None
     moves = np.concatenate([np.ones(len(FREE), bool), OFFSETS.ravel()])
-    predictor, point = with_least_innovations(
-        predictor, flights, (problem, truth, criterion), moves
-    )
+    predictor, point = maximise_likelihood(predictor, flights, (problem, truth, criterion), moves)
     noise = claimed * np.exp(predictor.strengths[COMMAND_NOISE])
     assert noise == pytest.approx(1.0, abs=0.1)
     told = predictor.jacobian(problem, point, range(len(FREE)))
@@ -311,12 +311,12 @@ def test_how_noisy_commands_are_is_learnt_whatever_is_claimed(exact, claimed) ->
 
 def test_what_was_not_sampled_is_as_likely_with_any_noise(fitted) -> None:
     problem, predictor, point = fitted
-    sample = predictor.feed.samples["rotor_speed"]
+    sample = predictor.inputs.samples["rotor_speed"]
     without = eqx.tree_at(
-        lambda f: f.samples["rotor_speed"].weight, predictor.feed, jnp.zeros_like(sample.weight)
+        lambda f: f.samples["rotor_speed"].weight, predictor.inputs, jnp.zeros_like(sample.weight)
     )
     losses = [
-        float(replace(predictor, feed=without, noise=noise).at(problem, point).found.loss.sum())
+        float(replace(predictor, inputs=without, noise=noise).at(problem, point).found.loss.sum())
         for noise in (predictor.noise, {**predictor.noise, "rotor_speed": 3.0})
     ]
     assert losses[0] == pytest.approx(losses[1])
@@ -325,11 +325,11 @@ def test_what_was_not_sampled_is_as_likely_with_any_noise(fitted) -> None:
 def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> None:
     """A simulation would end there: the state frozen, and all samples that follow lost."""
     problem, predictor, point = fitted
-    expected = predictor._expected(problem, point)
-    observer, state = Observer.of(predictor.schedule, predictor.feed, expected)
+    expected = predictor._assumed(problem, point)
+    observer, state = Observer.of(predictor.schedule, predictor.inputs, expected)
     height = state.motion.position.z
     state = eqx.tree_at(lambda s: s.motion.position.z, state, height - 2.0 * jnp.max(height) - 5.0)
-    after = observer.next(state, jnp.zeros((COUNT, 2)), jnp.asarray(0))
+    after = observer.next(state, jnp.zeros((PROCESSES, 2)), jnp.asarray(0))
     assert float(jnp.abs(after.motion.velocity.z - state.motion.velocity.z).max()) > 0.0
 
 
@@ -359,14 +359,16 @@ def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has
     own = Predictor.of(finer, point, gusty(problem, 1)[1])
     assert own is not None
     own = replace(own, strengths=predictor.strengths, noise=predictor.noise).at(finer, point)
-    stepped = predictor.stepped(finer)
+    for_problem = predictor.for_problem(finer)
     here, there = (np.asarray(of.found.gains.gain) for of in (predictor, own))
-    commands = here[..., -COUNT - 8 : -COUNT].reshape(*here.shape[:-1], 2, 4).repeat(2, axis=-2)
-    expected = there[..., -COUNT - 12 : -COUNT]
+    commands = (
+        here[..., -PROCESSES - 8 : -PROCESSES].reshape(*here.shape[:-1], 2, 4).repeat(2, axis=-2)
+    )
+    expected = there[..., -PROCESSES - 12 : -PROCESSES]
     on_their_way = commands.reshape(*here.shape[:-1], 16)[..., :12] - expected
     assert np.std(on_their_way) < 0.01 * np.std(expected)
     coarse = predictor.jacobian(late, point, []).residuals
-    found, expected = (of.jacobian(finer, point, []).residuals for of in (stepped, own))
+    found, expected = (of.jacobian(finer, point, []).residuals for of in (for_problem, own))
     for channel in ("position", "attitude"):  # the others hardly change: rates are fed in
         change = np.std(expected[channel] - coarse[channel])
         assert np.std(found[channel] - expected[channel]) < 0.5 * change
@@ -375,14 +377,14 @@ def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has
 def test_one_outlier_is_not_believed_and_many_in_a_row_are(fitted) -> None:
     """Markers that are moved by a metre, for a sample and for good."""
     problem, predictor, point = fitted
-    sampled = predictor.feed.samples["position"]
+    sampled = predictor.inputs.samples["position"]
     ticks = np.flatnonzero(np.asarray(sampled.weight)[:, 0, 0])
 
     def sizes(moved: np.ndarray) -> np.ndarray:
         values = np.array(sampled.values)
         values[moved, 1, 0] += 1.0
-        feed = eqx.tree_at(lambda f: f.samples["position"].values, predictor.feed, values)
-        found = replace(predictor, feed=feed).at(problem, point).found
+        inputs = eqx.tree_at(lambda f: f.samples["position"].values, predictor.inputs, values)
+        found = replace(predictor, inputs=inputs).at(problem, point).found
         return np.abs(np.asarray(found.white)[ticks, 1, 0])
 
     middle = len(ticks) // 2
@@ -404,7 +406,7 @@ def test_a_push_that_is_known_moves_innovations_in_proportion(fitted) -> None:
             rate=float(problem.schedule.log_rate),
         )
         other = replace(problem, segments=replace(problem.segments, disturbance=known))
-        residuals = predictor.stepped(other).jacobian(other, point, []).residuals
+        residuals = predictor.for_problem(other).jacobian(other, point, []).residuals
         return {name: np.asarray(rows) for name, rows in residuals.items()}
 
     here = predictor.jacobian(problem, point, []).residuals
@@ -424,7 +426,7 @@ def test_samples_that_are_stamped_otherwise_move_their_own_innovations_in_propor
         speeds = measured["rotor_speed"]
         measured["rotor_speed"] = eqx.tree_at(lambda m: m.time, speeds, speeds.time + seconds)
         other = replace(problem, segments=replace(problem.segments, measured=measured))
-        residuals = predictor.stepped(other).jacobian(other, point, []).residuals
+        residuals = predictor.for_problem(other).jacobian(other, point, []).residuals
         return {name: np.asarray(rows) for name, rows in residuals.items()}
 
     here = {n: np.asarray(r) for n, r in predictor.jacobian(problem, point, []).residuals.items()}
@@ -459,7 +461,7 @@ def test_a_voltage_that_is_read_higher_moves_innovations_as_faster_motors_do(fit
 
     faster = eqx.tree_at(speeds, problem, [s * np.exp(higher) for s in speeds(problem)])
     found, same, expected = (
-        predictor.stepped(other).jacobian(other, point, []).residuals["rotor_speed"]
+        predictor.for_problem(other).jacobian(other, point, []).residuals["rotor_speed"]
         for other in (read(higher), read(0.0), faster)
     )
     np.testing.assert_allclose(found, expected, atol=1e-9)

@@ -12,16 +12,16 @@ from sim_jax.constants import GRAVITY
 from tests.sim_jax.support import vehicle
 from tuner.disturbances.disturbances import (
     FAST,
-    LEAST,
-    MOST,
+    INITIAL_STRENGTHS,
+    MAX_STRENGTHS,
+    MIN_STRENGTHS,
     SLOW,
-    USUAL,
+    clipped,
     disturbance_of,
     processes_of,
-    within,
 )
 from tuner.disturbances.extended_kalman_filter import Filtered
-from tuner.disturbances.predictor import STEP, Slopes, slopes_of, steps_from
+from tuner.disturbances.predictor import STEP, Slopes, difference_steps, slopes_of
 
 ORDER = (*SLOW, *FAST)
 
@@ -36,7 +36,7 @@ def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Filtered]:
     shapes = shapes @ np.swapaxes(shapes, 1, 2)
 
     def root(strengths: np.ndarray) -> np.ndarray:
-        added = np.einsum("k,kij->ij", np.exp(2.0 * (strengths - USUAL)), shapes)
+        added = np.einsum("k,kij->ij", np.exp(2.0 * (strengths - INITIAL_STRENGTHS)), shapes)
         return np.linalg.cholesky(added + 1e-6 * np.eye(WIDE))
 
     samples = rng.standard_normal((SAMPLES, WIDE)) @ root(truth).T
@@ -52,13 +52,13 @@ def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Filtered]:
 
 
 def differenced(filtered: Callable[[np.ndarray], Filtered], strengths: np.ndarray) -> Slopes:
-    steps = steps_from(strengths)
+    steps = difference_steps(strengths)
     beside = (filtered(strengths + step) for step in np.diag(steps))
     return slopes_of(filtered(strengths), beside, steps)
 
 
 def test_the_likelihoods_slope_is_that_of_its_differences() -> None:
-    at = USUAL + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7])
+    at = INITIAL_STRENGTHS + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7])
     filtered = drawn(at, seed=2)
     differences = [
         (filtered(at + 1e-4 * axis).loss - filtered(at - 1e-4 * axis).loss) / 2e-4
@@ -70,7 +70,7 @@ def test_the_likelihoods_slope_is_that_of_its_differences() -> None:
 
 
 def test_slopes_scatter_about_none_as_fishers_information_says() -> None:
-    at = USUAL + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7])
+    at = INITIAL_STRENGTHS + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7])
     drawn_many = [differenced(drawn(at, seed=seed), at) for seed in range(100)]
     told = np.sqrt(np.diag(drawn_many[0].information))
     slopes = np.array([found.slope for found in drawn_many]) / told
@@ -79,24 +79,24 @@ def test_slopes_scatter_about_none_as_fishers_information_says() -> None:
 
 
 def test_no_strength_is_displaced_beyond_its_limits() -> None:
-    at = np.where(np.arange(7) % 2, MOST, LEAST)
-    steps = steps_from(at)
-    np.testing.assert_allclose(within(at + steps), at + steps)
+    at = np.where(np.arange(7) % 2, MAX_STRENGTHS, MIN_STRENGTHS)
+    steps = difference_steps(at)
+    np.testing.assert_allclose(clipped(at + steps), at + steps)
     np.testing.assert_allclose(np.abs(steps), STEP)
 
 
 def test_a_process_keeps_its_variance_and_forgets_within_its_time_constant() -> None:
-    processes = processes_of(vehicle(), jnp.asarray(USUAL), 400.0)
-    kept, added = np.asarray(processes.keeps), np.asarray(processes.added)
+    processes = processes_of(vehicle(), jnp.asarray(INITIAL_STRENGTHS), 400.0)
+    kept, added = np.asarray(processes.retention), np.asarray(processes.added)
     np.testing.assert_allclose(kept**2 * processes.sd**2 + added, processes.sd**2)
-    np.testing.assert_allclose(kept[0] ** 400, np.exp(-1.0 / np.exp(USUAL[4])))
+    np.testing.assert_allclose(kept[0] ** 400, np.exp(-1.0 / np.exp(INITIAL_STRENGTHS[4])))
 
 
 def test_thrusts_that_wander_alone_at_each_rotor_turn_a_vehicle_as_its_arms_say() -> None:
     craft = vehicle()
-    processes = processes_of(craft, jnp.asarray(USUAL), 400.0)
+    processes = processes_of(craft, jnp.asarray(INITIAL_STRENGTHS), 400.0)
     sd = dict(zip(FAST, np.asarray(processes.sd * processes.acts)[len(SLOW) :], strict=True))
-    each = np.exp(USUAL[3]) * float(craft.body.mass) * GRAVITY / 4.0
+    each = np.exp(INITIAL_STRENGTHS[3]) * float(craft.body.mass) * GRAVITY / 4.0
     rng = np.random.default_rng(0)
     thrust = each * rng.standard_normal((4, 20_000))
     arms = [(float(rotor.position.x), float(rotor.position.y)) for rotor in craft.rotors]
@@ -117,5 +117,5 @@ def test_slow_and_fast_moments_add_up() -> None:
 def test_a_draught_is_as_strong_as_what_it_takes_of_the_thrust() -> None:
     craft = vehicle()
     fastest = float(craft.aerodynamics.max_relative_airspeed)
-    draught = processes_of(craft, jnp.asarray(USUAL), 400.0).draught
-    assert float(draught) == pytest.approx(np.exp(USUAL[1]) * fastest)
+    draught = processes_of(craft, jnp.asarray(INITIAL_STRENGTHS), 400.0).draught
+    assert float(draught) == pytest.approx(np.exp(INITIAL_STRENGTHS[1]) * fastest)

@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 
 from sim_jax.schedule import Schedule
-from tuner.disturbances.ticks import each_reading, gathered, sampled, setpoints_on_ticks
-from tuner.objective.noise import repeats
+from tuner.disturbances.ticks import (
+    sampled,
+    samples_of_ticks,
+    setpoints_on_ticks,
+    with_equal_weights,
+)
+from tuner.objective.noise import repeat_counts
 from tuner.objective.segments import Measured
 from tuner.recordings.flight import Flight, InitialState, Series
 
@@ -52,14 +57,14 @@ def test_a_clock_that_is_late_moves_the_samples_and_a_command_holds() -> None:
 def test_a_command_that_rests_weighs_in_a_filter_as_one_that_moves() -> None:
     commands = measured(0.01 * np.arange(1, 50), 4)
     values = np.round(10.0 * np.asarray(commands.values)) / 10.0  # some rest for ten samples
-    is_at_rest = np.stack([repeats(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
+    is_at_rest = np.stack([repeat_counts(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
     assert is_at_rest.max() > 5
     as_one = replace(
         commands,
         values=jnp.asarray(values),
         weight=commands.weight / jnp.asarray(np.sqrt(is_at_rest)),
     )
-    np.testing.assert_allclose(each_reading(as_one).weight, commands.weight)
+    np.testing.assert_allclose(with_equal_weights(as_one).weight, commands.weight)
 
 
 def test_what_is_gathered_is_what_was_laid_out() -> None:
@@ -70,7 +75,7 @@ def test_what_is_gathered_is_what_was_laid_out() -> None:
     laid = {name: sampled(name, each, NOT_LATE, TICKS, RATE) for name, each in channels.items()}
     table = np.concatenate([np.asarray(each.values) for each, _ in laid.values()], axis=1)
     rows = {name: tick for name, (_, tick) in laid.items()}
-    back = gathered(np.stack([table, 2.0 * table]), {"position": 3, "body_rate": 3}, rows)
+    back = samples_of_ticks(np.stack([table, 2.0 * table]), {"position": 3, "body_rate": 3}, rows)
     for name, each in channels.items():
         expected = np.where(np.asarray(each.weight) > 0, np.asarray(each.values), 0.0)
         np.testing.assert_array_equal(back[name][0], expected)

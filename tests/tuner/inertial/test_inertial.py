@@ -16,7 +16,7 @@ from tuner.ground.bench_json import Combination, joint_prior
 from tuner.inertial.measurement import measure_inertial
 from tuner.inertial.prediction import rate_errors
 from tuner.inertial.signals import stretches_of
-from tuner.job.bench import least_noticed, vehicle_of
+from tuner.job.bench import resolution_of, vehicle_of
 from tuner.job.without_pose import fit_without_pose
 from tuner.options import SimulationOptions
 from tuner.recordings.inspection import inspect_recordings
@@ -196,8 +196,8 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
         assert best[name] == pytest.approx(truth, rel=0.1), name
         assert fitted.result.coefficients[name].fitted
         # known by its own size or the vehicle's, whichever is larger, small as the vehicle may be
-        assert least_noticed(name, flown) < 0.1 * moment
-        assert least_noticed(name, flown.replace(mass=1e-3)) < 1e-3 * moment
+        assert resolution_of(name, flown) < 0.1 * moment
+        assert resolution_of(name, flown.replace(mass=1e-3)) < 1e-3 * moment
     # the file that leaves the trims out foretells the body rate worse
     ((flight,), _) = read_inertial_flights(settings)
     stretches = stretches_of(flight.series, flight.flying)

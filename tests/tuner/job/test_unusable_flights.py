@@ -13,7 +13,7 @@ from tuner.config.job import Search
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.evaluate.validation import flights_worse
 from tuner.findings.findings import Code, Finding
-from tuner.job.check import said_once
+from tuner.job.check import merged_by_flight
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by
 from tuner.objective.segments import window_segments
 from tuner.objective.space import space_of
@@ -151,8 +151,8 @@ def test_what_holds_for_many_flights_is_said_once():
         Finding(Code.MISSING_SIGNALS, "warning", name, names=("rotor_speed",)) for name in "abcdefg"
     ]
     other = Finding(Code.POSE_GAP, "warning", "a", {"seconds": 0.4})
-    assert [finding.subject for finding in said_once([*same, other])] == ["7 flights", "a"]
-    assert [finding.subject for finding in said_once(same[:2])] == ["a, b"]
+    assert [finding.subject for finding in merged_by_flight([*same, other])] == ["7 flights", "a"]
+    assert [finding.subject for finding in merged_by_flight(same[:2])] == ["a, b"]
 
 
 def test_a_flight_that_a_fit_left_worse_is_named():

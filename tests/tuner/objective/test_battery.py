@@ -19,8 +19,8 @@ from tests.tuner.uncertainty.making import (
 )
 from tuner.core.errors import RecordingError
 from tuner.objective.battery import (
-    FEWEST,
-    IDLE,
+    IDLE_SPEED_RATIO,
+    MIN_SPLINE_READINGS,
     _resistance,
     log_voltage_of,
     require_voltage,
@@ -71,7 +71,9 @@ def loaded(seed=0, gap=0.1):
     time = np.arange(-2.0, 30.0, 0.02)
     random = np.random.default_rng(seed)
     command = 0.5 + 0.08 * np.sin(2.0 * np.pi * time / 2.5)[:, None] * np.ones(4)
-    load = ((command + IDLE) ** 3).mean(axis=1) / ((command + IDLE) ** 3).mean()
+    load = ((command + IDLE_SPEED_RATIO) ** 3).mean(axis=1) / (
+        (command + IDLE_SPEED_RATIO) ** 3
+    ).mean()
     truth = 16.3 - 0.01 * time - 0.2 * load
     slow = np.arange(-2.0, 30.0, gap)
     readings = np.interp(slow, time, truth) + NOISE * random.normal(size=len(slow))
@@ -101,9 +103,11 @@ def test_the_sag_comes_no_later_where_commands_were_recorded_less_often():
     curves = []
     for every in (1, 16):
         command = Series(fine[::every], swinging[::every])
-        mean = ((command.values + IDLE) ** 3).mean()
+        mean = ((command.values + IDLE_SPEED_RATIO) ** 3).mean()
         known, _ = loaded()
-        volts = 16.3 - 0.2 * np.interp(TIME, fine, ((swinging + IDLE) ** 3).mean(axis=1) / mean)
+        volts = 16.3 - 0.2 * np.interp(
+            TIME, fine, ((swinging + IDLE_SPEED_RATIO) ** 3).mean(axis=1) / mean
+        )
         known = replace(
             known,
             series=dict(known.series)
@@ -135,7 +139,7 @@ def test_a_load_that_the_voltage_does_not_follow_is_left_out():
     assert np.abs(curve.volts - 16.0).max() < NOISE
 
 
-@pytest.mark.parametrize("count", [FEWEST, 200])
+@pytest.mark.parametrize("count", [MIN_SPLINE_READINGS, 200])
 def test_a_curve_is_as_stiff_as_cross_validation_by_scipy_makes_it(count):
     random = np.random.default_rng(0)
     time = np.cumsum(random.uniform(0.05, 0.15, count))

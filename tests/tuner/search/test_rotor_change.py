@@ -8,7 +8,7 @@ import pytest
 
 from tuner.config import Options, resolve_settings
 from tuner.findings.findings import Code
-from tuner.job.run import prepared
+from tuner.job.run import prepare
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import read_recordings
 from tuner.search.rotor_change import WINDOW_S, cut_at_rotor_changes, rotor_change_of
@@ -84,7 +84,7 @@ def test_a_job_uses_a_flight_up_to_the_change(flown, monkeypatch):
     assert circle.flight.duration > BROKEN + 5.0
     broken = replace(circle, flight=weakened(circle.flight, settings.vehicle, 0.05))
     monkeypatch.setattr("tuner.job.run.read_recordings", lambda _: ((broken, *others), ()))
-    job, findings = prepared(settings)
+    job, findings = prepare(settings)
     (finding,) = [finding for finding in findings if finding.code is Code.ROTOR_CHANGED]
     assert (finding.subject, finding.names) == (circle.flight.name, ("front right",))
     cut = next(flight for flight in job.flights if flight.name == circle.flight.name)

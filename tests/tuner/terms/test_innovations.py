@@ -275,7 +275,7 @@ class Problem:
     pushed: bool = False
     loss: float = 0.5 * FLIGHTS * STRETCHES * STEPS
 
-    def stepped(self, other: Problem) -> Problem:
+    def for_problem(self, other: Problem) -> Problem:
         return other
 
     def information(self, objective: Problem, *_: object) -> FisherInformation:

@@ -12,8 +12,8 @@ import pytest
 
 from tests.tuner.uncertainty.making import ended
 from tuner.config import JobFile
-from tuner.disturbances.disturbances import USUAL
-from tuner.disturbances.maximum_likelihood import STEPS
+from tuner.disturbances.disturbances import INITIAL_STRENGTHS
+from tuner.disturbances.maximum_likelihood import MAX_STEPS
 from tuner.equation_error.omitted_laws import Law
 from tuner.search.problem import Job
 from tuner.search.progress import COLOURED_RATIO, Fitted
@@ -97,10 +97,10 @@ def test_two_fits_contradict_each_other_by_the_errors_of_both(moved, errors, agr
 @pytest.mark.parametrize(
     ("called_for", "descents"),
     [
-        ([None, None], [ROUGH_STEPS, STEPS]),
-        (["drag", None], [ROUGH_STEPS, STEPS]),
-        ([None, "drag", None], [ROUGH_STEPS, STEPS, STEPS]),
-        (["drag", "battery", "inflow", "more"], [ROUGH_STEPS, STEPS, STEPS, STEPS]),
+        ([None, None], [ROUGH_STEPS, MAX_STEPS]),
+        (["drag", None], [ROUGH_STEPS, MAX_STEPS]),
+        ([None, "drag", None], [ROUGH_STEPS, MAX_STEPS, MAX_STEPS]),
+        (["drag", "battery", "inflow", "more"], [ROUGH_STEPS, MAX_STEPS, MAX_STEPS, MAX_STEPS]),
     ],
     ids=["nothing", "at once", "later", "again and again"],
 )
@@ -116,7 +116,7 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
     begin = Selected(job, fitted(2.0 * COLOURED_RATIO))
     taken, within, asked = [], [], iter(called_for)
 
-    def descended(selected: Selected, there: Fitted, own: Any, steps: int = STEPS) -> Any:
+    def descended(selected: Selected, there: Fitted, own: Any, steps: int = MAX_STEPS) -> Any:
         taken.append(steps)
         within.append([row.group for row in selected.rows])
         return there, own
@@ -184,7 +184,9 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     out are judged.
     """
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
-    predictor = SimpleNamespace(memory=0, is_lost=False, keeps_track=True, strengths=USUAL)
+    predictor = SimpleNamespace(
+        memory=0, is_lost=False, keeps_track=True, strengths=INITIAL_STRENGTHS
+    )
     predictor.without_gains = predictor
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
@@ -271,7 +273,7 @@ def test_what_no_derivative_tells_is_judged_by_a_fit_with_it(
     full = SimpleNamespace(objective=NOBODY, point=SimpleNamespace(coefficients=np.zeros(0)))
     beside = SimpleNamespace(keeps_track=tracks, is_likelier_than=lambda _: likelier)
     beside.without_gains = beside
-    without = SimpleNamespace(feed=SimpleNamespace(offsets=np.zeros((5, 1))), keeps_track=True)
+    without = SimpleNamespace(inputs=SimpleNamespace(offsets=np.zeros((5, 1))), keeps_track=True)
     without.without_gains = without
     without.at = lambda *_: "as it was"
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)

@@ -113,8 +113,8 @@ def test_flights_do_not_disagree_because_the_search_stopped_short(one_tells):
     assert off["search"] == pytest.approx(0.02)
     assert total_error(off) == pytest.approx(np.hypot(total_error(at_minimum), 0.02))
     where = np.array([True, False, False])
-    assert made[1].resting(where).slope[0] == pytest.approx(0.0, abs=1e-9)
-    assert made[1].resting(where).slope[1:] == pytest.approx(made[1].slope[1:])
+    assert made[1].with_resting(where).slope[0] == pytest.approx(0.0, abs=1e-9)
+    assert made[1].with_resting(where).slope[1:] == pytest.approx(made[1].slope[1:])
 
 
 def test_one_flight_is_left_out_in_parts_if_it_is_long():
