@@ -80,9 +80,7 @@ def maximise_likelihood(
             break
         predictor = predictor.without_gains  # memory holds those of one point
         gain, before = equations.gain(change), gain
-        lower = _damped_step(
-            equations, predictor, objective, point, criterion, near=gain < NEAR_GAIN
-        )
+        lower = _descent(equations, predictor, objective, point, criterion, near=gain < NEAR_GAIN)
         if lower is None:
             return predictor.at(objective, point), point
         if gain < FINAL_GAIN or 0.5 * before < gain < NEAR_GAIN:  # they shrink no more
@@ -187,7 +185,7 @@ def _equations(
     )
 
 
-def _damped_step(
+def _descent(
     equations: _Equations,
     predictor: Predictor,
     objective: Objective,

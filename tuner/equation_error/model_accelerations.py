@@ -50,18 +50,18 @@ class LinearisedAccelerations:
         (N, 6) recorded accelerations minus the model's.
     columns
         (N, 6, K) derivatives of the model's, or by fewer coordinates where only these are asked.
-    noise_products
+    noise_square
         (2, 2, 6, K, K): products of the columns' derivatives by a rotor's speed and by its
         acceleration, mean over steps and sum over rotors. Zero without noise.
-    noise_cross
+    noise_across
         (2, 2, 6, K): likewise of columns and the model's accelerations.
     """
 
     steps: Steps
     errors: Array
     columns: Array
-    noise_products: Array
-    noise_cross: Array
+    noise_square: Array
+    noise_across: Array
 
 
 @dataclass(frozen=True)
@@ -117,9 +117,9 @@ class ModelAccelerations:
                 for flight, (part, (modelled, _)) in enumerate(zip(beside, ends, strict=True)):
                     change = errors[flight] - (part.accelerations - modelled)
                     columns[flight][:, :, number] = change / step
-        noise_products, noise_cross = self._noise_sums(point, flights, by)
+        noise_square, noise_across = self._noise_sums(point, flights, by)
         return tuple(
-            map(LinearisedAccelerations, flights, errors, columns, noise_products, noise_cross)
+            map(LinearisedAccelerations, flights, errors, columns, noise_square, noise_across)
         )
 
     def _noise_sums(
@@ -127,11 +127,11 @@ class ModelAccelerations:
     ) -> tuple[Array, Array]:
         """Return the noise products and cross products of all flights."""
         size = len(by)
-        noise_products, noise_cross = (
+        noise_square, noise_across = (
             np.zeros((len(flights), 2, 2, 6, *k)) for k in ((size, size), (size,))
         )
         if not self.noisy:
-            return noise_products, noise_cross
+            return noise_square, noise_across
         steps = _side_by_side(flights, every=NOISE_STRIDE)
         counts = [len(part.time[::NOISE_STRIDE]) for part in flights]
         flight = np.repeat(np.arange(len(flights)), counts)
@@ -143,9 +143,9 @@ class ModelAccelerations:
                 own = flight[some] == number
                 slopes = columns[:, :, :, own].reshape(2, 6, -1, size)
                 mean = slopes.mT[:, None] / counts[number]
-                noise_products[number] += mean @ slopes
-                noise_cross[number] += (mean @ values[:, :, :, own].reshape(2, 6, -1, 1))[..., 0]
-        return noise_products, noise_cross
+                noise_square[number] += mean @ slopes
+                noise_across[number] += (mean @ values[:, :, :, own].reshape(2, 6, -1, 1))[..., 0]
+        return noise_square, noise_across
 
     def _slopes(self, point: Array, steps: Any, by: NDArray[np.intp]) -> tuple[Array, Array]:
         """Return derivatives of n steps' accelerations (2, 6, 4, n) and columns (2, 6, 4, n, K).

@@ -264,10 +264,10 @@ def filtered_sums(
         if steps.noise > 0.0:
             gain = (steps.noise / sigma) ** 2 * _noise_gain(kernel, steps)
             noise = noise + np.multiply.outer(
-                counts, np.tensordot(gain, one.noise_products[:, :, axis])
+                counts, np.tensordot(gain, one.noise_square[:, :, axis])
             )
             crossed = crossed + np.multiply.outer(
-                counts, np.tensordot(gain, one.noise_cross[:, :, axis])
+                counts, np.tensordot(gain, one.noise_across[:, :, axis])
             )
     return information, slope, loss, noise, crossed
 

@@ -20,12 +20,12 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.space import extended
 from tuner.search.findings import MIN_TURNING_EXPLAINED
 from tuner.search.problem import Job, job_of
-from tuner.terms.candidates import candidate_groups, neutral_values_of
+from tuner.terms.candidates import candidate_groups, neutral_values
 from tuner.vehicle import COEFFICIENTS, initial_values, with_values
 
 ROTOR_INERTIA = "rotor_inertia"
 """A coefficient of every vehicle: the reaction to a rotor's acceleration."""
-REGRESSED_COEFFICIENTS = (
+BY_REGRESSION = (
     *(f"inertia_{axes}" for axes in ("xx", "yy", "zz")),
     ROTOR_INERTIA,
     "moment_constant",
@@ -55,7 +55,7 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     if INFLOW not in (*job.space.free, *own.fixed):
         candidates[INFLOW] = (INFLOW,)
     names = [name for group in candidates.values() for name in group]
-    effects = neutral_values_of([n for n in (*names, *TORQUE_GAINS) if COEFFICIENTS[n].is_effect])
+    effects = neutral_values([n for n in (*names, *TORQUE_GAINS) if COEFFICIENTS[n].is_effect])
     given = initial_values(settings.vehicle, settings.controller, names)
     space = extended(job.space, [*names, *TORQUE_GAINS], settings.job, {**given, **effects})
     candidates.pop(ROTOR_INERTIA, None)
@@ -69,9 +69,7 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
 def _regressed_job(job: Job, found: Estimate) -> Job | None:
     """Return the job with its search's coefficients, start and windows; None for no rigid body."""
     settings = job.settings
-    moving = tuple(
-        n for n in found.values if n not in REGRESSED_COEFFICIENTS and not moves_rotors(n)
-    )
+    moving = tuple(n for n in found.values if n not in BY_REGRESSION and not moves_rotors(n))
     try:
         vehicle = with_values(settings.vehicle, found.values)
     except ConfigError:

@@ -204,9 +204,7 @@ def cut_windows(
             flight, seconds, fed=fed, stride=stride, smoothed_widely=free_starts
         ):
             own = INLETS[name].fed(window.flight)
-            pieces.append(
-                FlightWindow(number, window, with_earlier_stamps(window.flight, own, late))
-            )
+            pieces.append(FlightWindow(number, window, stamped_earlier(window.flight, own, late)))
     return pieces
 
 
@@ -292,7 +290,7 @@ def window_segments(
     )
 
 
-def with_earlier_stamps(flight: Flight, signals: Sequence[str], late: float) -> Flight:
+def stamped_earlier(flight: Flight, signals: Sequence[str], late: float) -> Flight:
     """Return a flight with the stamps of some signals moved to earlier by ``late`` s."""
     if late == 0.0:
         return flight

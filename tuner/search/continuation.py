@@ -49,7 +49,7 @@ share a source or differ by much more, and 0.1 ms of freedom costs a percent of 
 CLOCK_LOSS_TOLERANCE = 0.01
 """Largest relative rise of the loss by setting clock offsets to zero: simulators differ by more."""
 RIDGE = 1e-12
-"""Added to a Hessian of unit diagonal."""
+"""Added to a Hessian of unit diagonal: undetermined directions stay where they are."""
 SWITCH_GAIN = 1.2
 """Least factor on the loss of informative flights that overrules the controller file."""
 RESTARTED_CHOICES = ("sees_markers",)

@@ -78,12 +78,7 @@ are fed in: real 100 Hz logs of good commands have 0.3 to 0.5, one at 41 Hz of a
 Measured speeds below it pass if they predict turning together with air velocity."""
 
 REFERENCE = ("reference_position", "reference_velocity", "reference_acceleration")
-DROPPED_SAMPLES = (
-    NoteCode.OUT_OF_RANGE,
-    NoteCode.UNIT_UNKNOWN,
-    NoteCode.NOT_A_NUMBER,
-    NoteCode.OUTLIERS,
-)
+DROPPED = (NoteCode.OUT_OF_RANGE, NoteCode.UNIT_UNKNOWN, NoteCode.NOT_A_NUMBER, NoteCode.OUTLIERS)
 """Notes of samples that the reader dropped for their values."""
 SIGNAL_OF_INLET: dict[InletName, Source] = {"actuator": "command", "rotor_speed": "rotor_speed"}
 """Inlet at which recorded rotor signals turn the simulated vehicle -> that signal."""
@@ -118,9 +113,9 @@ def choose_inlet(
                 return below, Finding(Code.PX4_LOOPS, "info", flight.name, names=(below,))
         match = match_setpoints(flight, controller)
         if match is not None and not match.is_ours:
-            (inlet_finding,) = setpoint_findings(flight, controller)
+            (finding,) = setpoint_findings(flight, controller)
             below, _ = choose_inlet(_without_reference(flight), "auto", vehicle, controller)
-            return below, inlet_finding
+            return below, finding
     if requested != "auto" or first not in SIGNAL_OF_INLET:
         return first, None
     doubt: TorqueCorrelation | None = None
@@ -198,10 +193,7 @@ def inlet_for(flight: Flight, requested: str) -> InletName:
 def _dropped(flight: Flight, signals: Sequence[str]) -> str:
     """Return how many samples of some signals were dropped as corrupt, as a clause."""
     counts = [
-        (
-            signal,
-            sum(n.count for n in flight.notes if n.code in DROPPED_SAMPLES and signal in n.names),
-        )
+        (signal, sum(n.count for n in flight.notes if n.code in DROPPED and signal in n.names))
         for signal in signals
     ]
     parts = [f"{count} {name.replace('_', ' ')} samples" for name, count in counts if count]

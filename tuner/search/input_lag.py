@@ -94,13 +94,11 @@ def _is_late(flight: Flight, vehicle: VehicleFile, lag: Lag) -> bool:
     """
     if abs(lag.seconds) <= SIGNIFICANT_SD * lag.sd:
         return False
-    late, *others = _turning_log_likelihoods(flight, vehicle, (lag.seconds, 0.5 * lag.seconds, 0.0))
+    late, *others = _turning_likelihoods(flight, vehicle, (lag.seconds, 0.5 * lag.seconds, 0.0))
     return late - max(others) > 0.5 * SIGNIFICANT_SD**2
 
 
-def _turning_log_likelihoods(
-    flight: Flight, vehicle: VehicleFile, at: Sequence[float]
-) -> list[float]:
+def _turning_likelihoods(flight: Flight, vehicle: VehicleFile, at: Sequence[float]) -> list[float]:
     """Return the log-likelihood of the innovations of angular accelerations at some lags in s.
 
     Forces are left out: the velocity that they come from is filtered.

@@ -49,7 +49,7 @@ class Recording:
         Whether it is evaluated and never fitted.
     conditions
         Known values of its `tuner.vehicle.conditions`.
-    inlet_finding
+    finding
         Why its inlet is not the most upstream one whose signals were recorded; None if it is.
     input_late
         s by which its inputs are stamped later than its recorded state.
@@ -60,7 +60,7 @@ class Recording:
     time_offset: float | None = 0.0
     holdout: bool = False
     conditions: Mapping[str, float] = field(default_factory=dict)
-    inlet_finding: Finding | None = None
+    finding: Finding | None = None
     input_late: float = 0.0
 
 
@@ -139,12 +139,8 @@ def read_recordings(
     none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
     if left_out and (not recordings or (fits and none_to_fit)):
         raise left_out[0][1]
-    recordings = [
-        _with_inlet_of_fitted(recording, recordings, settings) for recording in recordings
-    ]
-    chosen = (
-        recording.inlet_finding for recording in recordings if recording.inlet_finding is not None
-    )
+    recordings = [_with_fitted_inlet(recording, recordings, settings) for recording in recordings]
+    chosen = (recording.finding for recording in recordings if recording.finding is not None)
     return tuple(recordings), (
         *passed_over,
         *(left_out_finding(name, error) for name, error in left_out),
@@ -229,15 +225,15 @@ def _recording_of(settings: Settings, flight: Flight, holdout: bool) -> Recordin
         )
     flight = flight_in_rotor_order(flight, settings.vehicle)
     flight = with_speeds_in_si(with_commands(flight, settings.vehicle), settings.vehicle)
-    chosen, inlet_finding = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
+    chosen, finding = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
     if not INLETS[chosen].closed_loop:
         seconds = window_seconds([chosen], job.search.window)
         require_windows(flight, seconds, INLETS[chosen].fed(flight))
     late = None if offset == "free" else float(offset)
-    return Recording(flight, chosen, late, holdout, inlet_finding=inlet_finding)
+    return Recording(flight, chosen, late, holdout, finding=finding)
 
 
-def _with_inlet_of_fitted(
+def _with_fitted_inlet(
     recording: Recording, recordings: Sequence[Recording], settings: Settings
 ) -> Recording:
     """Return a held-out flight with the attitude inlet where all fitted ones have it.
@@ -255,8 +251,8 @@ def _with_inlet_of_fitted(
         require_windows(flight, window_seconds(["attitude"], job.search.window), ("attitude",))
     except RecordingError:
         return recording
-    inlet_finding = Finding(Code.ATTITUDE_FOLLOWED, "info", flight.name, names=(recording.inlet,))
-    return replace(recording, inlet="attitude", inlet_finding=inlet_finding)
+    finding = Finding(Code.ATTITUDE_FOLLOWED, "info", flight.name, names=(recording.inlet,))
+    return replace(recording, inlet="attitude", finding=finding)
 
 
 def _with_reference(flight: Flight, settings: Settings) -> Flight:

@@ -164,9 +164,7 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     ):
         plain = sums_at(objective, before.tried, criterion, derivatives=False)
         found = quadratics(plain)
-        if not any(
-            _acceptance(one, at.loss, moves)[0] for one, at in zip(each, found, strict=True)
-        ):
+        if not any(_accepts(one, at.loss, moves)[0] for one, at in zip(each, found, strict=True)):
             sums, here = plain, found
     if sums is None:
         sums = sums_at(objective, before.tried, criterion)
@@ -192,7 +190,7 @@ def _stepped(
     if last is not None:
         change = (_packed(tried) - _packed(before.point))[moves]
         rise = here.loss - last.loss
-        accepted, predicted = _acceptance(before, here.loss, moves)
+        accepted, predicted = _accepts(before, here.loss, moves)
         if not accepted:
             slope = -float(last.gradient[moves] @ change)
             too_long = 2.0 * (1.0 + rise / slope) if slope > 0.0 else DAMPING_FACTOR
@@ -227,7 +225,7 @@ def _stepped(
     )
 
 
-def _acceptance(before: Step, loss: float, moves: NDArray[np.intp]) -> tuple[bool, float]:
+def _accepts(before: Step, loss: float, moves: NDArray[np.intp]) -> tuple[bool, float]:
     """Return whether one start's point is accepted with a loss, and the predicted rise."""
     last = before.quadratic
     assert last is not None, "a point that was tried follows an accepted one"

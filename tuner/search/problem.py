@@ -18,7 +18,7 @@ from tuner.objective.initial_conditions import begins_gently
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal_equations import Objective
-from tuner.objective.segments import Segments, segments_of, window_segments, with_earlier_stamps
+from tuner.objective.segments import Segments, segments_of, stamped_earlier, window_segments
 from tuner.objective.space import Space, space_of
 from tuner.recordings.flight import Flight
 from tuner.search.job_flights import Recording
@@ -155,7 +155,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         require_voltage(fitted)
     schedule = schedule_of(settings.controller)
     compared = [
-        with_earlier_stamps(
+        stamped_earlier(
             r.flight, [n for n in CHANNELS if n in r.flight.series], r.time_offset or 0.0
         )
         for r in to_fit

@@ -114,7 +114,7 @@ def reads_recording(group: str) -> bool:
     return any(COEFFICIENTS[name].reads for name in term_groups().get(group, ()))
 
 
-def neutral_values_of(names: Sequence[str]) -> dict[str, float]:
+def neutral_values(names: Sequence[str]) -> dict[str, float]:
     """Return the neutral value of each coefficient of a term."""
     values = {}
     for name in names:
@@ -130,7 +130,7 @@ def with_terms(
     """Return a problem with more coefficients free, and its point with them at neutral values."""
     if not names:
         return objective, point
-    space = extended(objective.space, names, job, neutral_values_of(names))
+    space = extended(objective.space, names, job, neutral_values(names))
     return replace(objective, space=space), Point(
         np.concatenate([np.asarray(point.coefficients), np.asarray(space.initial[-len(names) :])]),
         point.offsets,
@@ -140,10 +140,7 @@ def with_terms(
 def with_free(
     job: Job, fitted: Fitted, names: Sequence[str], *, conditions_added: Sequence[str] = ()
 ) -> tuple[Job, Fitted]:
-    """Return job and fit with more coefficients free, at their neutral values.
-
-    ``conditions_added`` names per-flight conditions to estimate from here on, starting at zero.
-    """
+    """Return job and fit with more coefficients and conditions free, at neutral values."""
     objective, point = with_terms(fitted.objective, fitted.point, names, job.settings.job)
     objective, point = with_conditions(objective, point, conditions_added)
     return (
@@ -196,9 +193,8 @@ def offsets_of(fitted: Fitted, objective: Objective, *, reset: Collection[str] =
     rows = np.asarray(fitted.point.offsets)
     known = dict(zip(fitted.objective.of_flight, rows, strict=True))
     zeros = np.zeros(rows.shape[1])
-    return np.stack(
-        [zeros if name in reset else known.get(name, zeros) for name in objective.of_flight]
-    )
+    known |= dict.fromkeys(reset, zeros)
+    return np.stack([known.get(name, zeros) for name in objective.of_flight])
 
 
 @dataclass(frozen=True)
@@ -238,10 +234,7 @@ class Selected:
         )
 
     def rows_after_holding(self, held: Mapping[str, str]) -> tuple[SelectionRow, ...]:
-        """Return the table after holding: a chosen term whose coefficients are held is not kept.
-
-        ``held`` is that of `tuner.search.progress.Fitted`.
-        """
+        """Return the table with chosen terms not kept if all their coefficients are ``held``."""
         return tuple(
             row.model_copy(update={"kept": False, "reason": SelectionCode.NO_INFORMATION})
             if row.reason in ACCEPTED and all(held.get(name) == name for name in row.names)

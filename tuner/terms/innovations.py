@@ -11,8 +11,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.disturbances.predictor import Predictor, hidden_by_setpoints
 from tuner.objective.information import with_start_values
 from tuner.objective.space import Space
@@ -38,8 +38,6 @@ from tuner.terms.score import ACCEPTED, backward_elimination, score
 from tuner.uncertainty.model_error import ModelErrors
 from tuner.vehicle import COEFFICIENTS, condition_rows
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
-
-Array = NDArray[np.float64]
 
 REJECTED_BY_LEAST_SQUARES = (
     SelectionCode.NOT_SIGNIFICANT,
@@ -125,10 +123,8 @@ class LinearisedInnovations:
             return dict(self.selected.selection_shifts)
         model = self._model(self.fitted.objective.space.names)
         moves = selection_shifts(self.linear, model, groups)
-        return {
-            **self.selected.selection_shifts,
-            **{self.space.names[i]: float(moves[i]) for i in model},
-        }
+        own = {self.space.names[i]: float(moves[i]) for i in model}
+        return {**self.selected.selection_shifts, **own}
 
     def contradicts(self, name: str, value: float) -> bool:
         """Return whether the innovations contradict a value of an omitted coefficient."""
@@ -245,9 +241,8 @@ class LinearisedInnovations:
         """Return the step (P,) to the minimum with some groups, the others at neutral values."""
         free = np.concatenate([model, *(self._columns(tried[name]) for name in kept)])
         gone = [name for group in set(tried) - set(kept) for name in tried[group]]
-        return self.linear.step(
-            free.astype(np.intp), from_=self.linear.to_neutral(self._columns(gone))
-        )
+        removal = self.linear.to_neutral(self._columns(gone))
+        return self.linear.step(free.astype(np.intp), from_=removal)
 
     def _model(self, names: Sequence[str]) -> Columns:
         """Return the columns of coefficients that are not held and that innovations see."""

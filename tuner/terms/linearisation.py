@@ -20,26 +20,23 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_jax.numeric import Array as JaxArray
-from tuner.core.numerics import scaled_solve
+from tuner.core.numerics import Array, scaled_solve
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point, SegmentSums, units_of
 from tuner.objective.information import BLOCK_S, FisherInformation, information_at, with_secants
 from tuner.objective.normal_equations import Objective, flight_batches
 from tuner.objective.residuals import huber_loss
 from tuner.objective.space import Space
+from tuner.search.continuation import RIDGE
 from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import Stretches
 from tuner.vehicle import COEFFICIENTS, REGISTRY
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.selection_table import Groups
 
-Array = NDArray[np.float64]
 Columns = NDArray[np.intp]
 
-SECTIONS_PER_FLIGHT = 3
+FLIGHT_SECTIONS = 3
 """Sections in time of a flight, each held out in turn where flights cannot be."""
-RIDGE = 1e-12
-"""Added to a Hessian of unit diagonal: undetermined directions stay where they are."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +82,7 @@ class LinearisedLoss:
     neutral: Array | None = None
 
     @cached_property
-    def _columns_by_name(self) -> dict[str, list[int]]:
+    def _by_name(self) -> dict[str, list[int]]:
         places: dict[str, list[int]] = {}
         for column, name in enumerate(self.names):
             places.setdefault(name, []).append(column)
@@ -93,9 +90,7 @@ class LinearisedLoss:
 
     def columns_of(self, names: Iterable[str]) -> Columns:
         """Return the columns of some names, in their order."""
-        return np.array(
-            [column for name in names for column in self._columns_by_name[name]], np.intp
-        )
+        return np.array([column for name in names for column in self._by_name[name]], np.intp)
 
     def to_neutral(self, gone: Columns) -> Array:
         """Return the change (P,) that leads some columns to their neutral values."""
@@ -387,9 +382,7 @@ def linearised_from(
     blocks = information.begins[:, None] / BLOCK_S + np.arange(information.blocks.shape[2])
     numbers = np.floor(blocks + 1e-9).astype(np.intp)
     hessian, score, flight, number = information.in_stretches(numbers)
-    section = np.minimum(
-        number * SECTIONS_PER_FLIGHT // (number.max() + 1), SECTIONS_PER_FLIGHT - 1
-    )
+    section = np.minimum(number * FLIGHT_SECTIONS // (number.max() + 1), FLIGHT_SECTIONS - 1)
     flown = np.einsum("spp->s", hessian) > 0
     flight = flight[flown]
     of_prior = np.diag(information.prior)
@@ -431,12 +424,8 @@ MAX_STEP_PRIOR_SD = 1.0
 
 
 def predicted_losses(
-    fitted: Fitted,
-    linear: LinearisedLoss,
-    model: Columns,
-    own: Columns,
-    scale: Mapping[str, JaxArray],
-) -> NDArray[np.float64]:
+    fitted: Fitted, linear: LinearisedLoss, model: Columns, own: Columns, scale: Mapping[str, Array]
+) -> Array:
     """Return the loss (N,) of each flight with the coefficients of a fit to the others.
 
     One linear step leads from the joint fit to the fit without the flight; there the flight is
@@ -481,7 +470,7 @@ def section_loss_ratio(linear: LinearisedLoss, model: Columns) -> float:
     return 1.0 + lost / linear.loss
 
 
-def vector_after(space: Space, vector: JaxArray, change: Array) -> Array:
+def vector_after(space: Space, vector: Array, change: Array) -> Array:
     """Return the search vector (K,) after a change of the scaled coordinates, inside the bounds."""
     far = MAX_STEP_PRIOR_SD * space.prior_sd
     scaled = space.scaled(vector) + np.clip(change, -far, far)

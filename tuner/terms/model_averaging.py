@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.core.numerics import scaled_solve, symmetric_eigen
-from tuner.terms.linearisation import RIDGE, Array, Columns, LinearisedLoss
+from tuner.core.numerics import Array, scaled_solve, symmetric_eigen
+from tuner.search.continuation import RIDGE
+from tuner.terms.linearisation import Columns, LinearisedLoss
 from tuner.uncertainty.covariance import STRETCH_S, overdispersion_factors, scatter
 
 NEGLIGIBLE_SE, NEGLIGIBLE_SIZE = 0.4, 0.1

@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import scaled_solve, symmetric_eigen, unit_diagonal
+from tuner.core.numerics import Array, scaled_solve, symmetric_eigen, unit_diagonal
 from tuner.objective.information import BLOCK_S
-from tuner.terms.linearisation import RIDGE, SECTIONS_PER_FLIGHT, Columns, LinearisedLoss
+from tuner.search.continuation import RIDGE
+from tuner.terms.linearisation import FLIGHT_SECTIONS, Columns, LinearisedLoss
 from tuner.uncertainty.covariance import STRETCH_S
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 
-def chance_of_gusts(
-    linear: LinearisedLoss, model: Columns, group: Columns, begin: NDArray[np.float64]
-) -> float:
+def chance_of_gusts(linear: LinearisedLoss, model: Columns, group: Columns, begin: Array) -> float:
     """Return the probability of such per-flight values if they are means of gusts.
 
     Gusts have a mean over a flight. A flight's own columns take that mean out of the residuals,
@@ -66,7 +65,7 @@ def _sections(flight: NDArray[np.intp]) -> NDArray[np.intp]:
     numbers, count = np.empty(len(flight), np.intp), 0
     for own in np.unique(flight):
         stretches = np.flatnonzero(flight == own)
-        many = max(SECTIONS_PER_FLIGHT, round(len(stretches) * BLOCK_S / STRETCH_S))
+        many = max(FLIGHT_SECTIONS, round(len(stretches) * BLOCK_S / STRETCH_S))
         for part in np.array_split(stretches, min(many, len(stretches))):
             numbers[part] = count
             count += 1
@@ -161,10 +160,7 @@ def row_of(
     *,
     kept: bool,
 ) -> SelectionRow:
-    """Return the table row of a group; ``reason`` overrides the score's.
-
-    A group with an accepted score that is not kept was eliminated beside the others.
-    """
+    """Return the table row of a group; ``reason`` overrides the score's."""
     if not kept and found.is_accepted:
         reason = reason or SelectionCode.WORSE_AFTER_REFIT
     return SelectionRow(
@@ -347,15 +343,15 @@ class _Gain:
     ``of_flight`` is the gain of each flight (N,), where the stretches of a flight share an error.
     """
 
-    of_stretch: NDArray[np.float64]
-    without: NDArray[np.float64]
-    of_flight: NDArray[np.float64] | None = None
+    of_stretch: Array
+    without: Array
+    of_flight: Array | None = None
 
     @staticmethod
     def of(
         linear: LinearisedLoss,
-        alone: NDArray[np.float64],
-        with_group: NDArray[np.float64],
+        alone: Array,
+        with_group: Array,
         inside: NDArray[np.bool_] | bool = True,
     ) -> _Gain:
         """Return the gain of one change (K,) over another in some stretches, none elsewhere."""
@@ -403,9 +399,9 @@ class _Gain:
 def _steps(
     linear: LinearisedLoss,
     columns: tuple[Columns, Columns],
-    begin: tuple[NDArray[np.float64], NDArray[np.float64]],
+    begin: tuple[Array, Array],
     inside: NDArray[np.bool_] | None = None,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Array, Array]:
     """Return the changes (K,) that fit some stretches, without and with a group."""
     without, with_group = (
         linear.step(free, inside=inside, from_=change)
@@ -417,7 +413,7 @@ def _steps(
 def _held_out(
     linear: LinearisedLoss,
     columns: tuple[Columns, Columns],
-    begin: tuple[NDArray[np.float64], NDArray[np.float64]],
+    begin: tuple[Array, Array],
     by: NDArray[np.intp],
 ) -> _Gain:
     """Return the gain in each fold's stretches of linear fits to the other folds' stretches."""
@@ -448,7 +444,7 @@ def _hotelling_chance(
     linear: LinearisedLoss,
     model: Columns,
     group: Columns,
-    minima: tuple[NDArray[np.float64], NDArray[np.float64]],
+    minima: tuple[Array, Array],
     *,
     one_section_may_err: bool = False,
 ) -> float:
@@ -482,10 +478,7 @@ def _hotelling_chance(
 
 
 def _hotelling_chance_in(
-    part: NDArray[np.bool_],
-    called: NDArray[np.float64],
-    scores: NDArray[np.float64],
-    flight: NDArray[np.intp],
+    part: NDArray[np.bool_], called: Array, scores: Array, flight: NDArray[np.intp]
 ) -> float:
     """Return the p-value of ``called`` (S, L) summed over a part (S,), by scatter of ``scores``.
 
@@ -502,9 +495,7 @@ def _hotelling_chance_in(
     return float(fdtrc(size, count - size, hotelling * (count - size) / (size * (count - 1.0))))
 
 
-def long_run_covariance(
-    scores: NDArray[np.float64], flight: NDArray[np.intp]
-) -> NDArray[np.float64]:
+def long_run_covariance(scores: Array, flight: NDArray[np.intp]) -> Array:
     """Return the covariance (L, L) of the sum of scores (S, L) that are correlated in a flight."""
     spread = scores.T @ scores
     for apart in range(1, CORRELATED_STRETCHES + 1):

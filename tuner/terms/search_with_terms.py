@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.core.spans import span
 from tuner.evaluate.validation import point_estimates
@@ -28,7 +29,7 @@ from tuner.terms.candidates import (
     candidate_groups,
     condition_groups,
     groups_named,
-    neutral_values_of,
+    neutral_values,
 )
 from tuner.terms.selection import Selection
 from tuner.uncertainty.model_error import (
@@ -75,9 +76,7 @@ def with_first_terms(job: Job) -> Job:
         require_voltage(job.fitted)
     begin = dict(zip(("marker_tilt_x", "marker_tilt_y"), tilt.mean(axis=0), strict=True))
     begin |= {name: row.begin for name in names if (row := COEFFICIENTS[name]).begin is not None}
-    values = {
-        name: float(begin.get(name, value)) for name, value in neutral_values_of(names).items()
-    }
+    values = {name: float(begin.get(name, value)) for name, value in neutral_values(names).items()}
     space = extended(job.space, names, settings, values)
     windows = None if job.windows is None else replace(job.windows, space=space)
     return replace(
@@ -89,7 +88,7 @@ def with_first_terms(job: Job) -> Job:
     )
 
 
-def hover_tilt(flights: Sequence[Flight]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def hover_tilt(flights: Sequence[Flight]) -> Array:
     """Return the recorded tilt about x and y, (n, 2) rad, of the flights that begin in hover.
 
     One row of zeros where none does.
@@ -100,7 +99,7 @@ def hover_tilt(flights: Sequence[Flight]) -> np.ndarray[tuple[int, int], np.dtyp
     return np.array(tilts or [(0.0, 0.0)])
 
 
-def _hovers_tilted(job: Job, tilt: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> bool:
+def _hovers_tilted(job: Job, tilt: Array) -> bool:
     """Return whether the flights of a closed loop agree that their hover is not level."""
     closed = all(INLETS[inlet].closed_loop for inlet in job.inlets)
     if not closed or len(tilt) < 2:
@@ -200,7 +199,7 @@ def refuted_by_commands(selected: Selected, fitted: Fitted) -> tuple[str, ...]:
     numbers = fitted.objective.space.numbers(fitted.point.coefficients)
 
     def matches_file(name: str) -> bool:
-        told = gain_by_commands(name, model_errors.controller_estimates)
+        told = gain_by_commands(name, model_errors.controller)
         return told is not None and abs(numbers[name] * told[0] - 1.0) < GAIN_TOLERANCE
 
     return tuple(group for group, names in kept.items() if any(map(matches_file, names)))

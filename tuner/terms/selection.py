@@ -15,9 +15,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jax import Array
-from numpy.typing import NDArray
 
+from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.information import with_start_values
@@ -40,7 +39,7 @@ from tuner.terms.candidates import (
     free_groups,
     is_lumped,
     names_of,
-    neutral_values_of,
+    neutral_values,
     offsets_of,
     prior_presence_of,
     reads_recording,
@@ -52,6 +51,8 @@ from tuner.terms.model_averaging import selection_shifts
 from tuner.terms.score import Score, backward_elimination, row_of, score
 from tuner.vehicle.model import with_coefficients
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
+
+Reasons = Mapping[str, SelectionCode]
 
 MAX_ROUNDS = 4
 """Rounds of additions; each adds all groups with a significant gain, and prunes."""
@@ -115,9 +116,7 @@ class Selection:
         own = linear.columns_of(coefficients)
         return dict(zip(coefficients, moves[own].tolist(), strict=True))
 
-    def _wanted(
-        self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
-    ) -> dict[str, Score]:
+    def _wanted(self, state: LinearisedFit, dropped: Reasons) -> dict[str, Score]:
         """Return the groups to fit next: all with significant gains, if one predicts.
 
         While terms are missing, those in the model make up for them, and even a true one may not
@@ -126,9 +125,7 @@ class Selection:
         scores = self._worth_fitting(state, dropped)
         return scores if any(found.is_accepted for found in scores.values()) else {}
 
-    def _worth_fitting(
-        self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
-    ) -> dict[str, Score]:
+    def _worth_fitting(self, state: LinearisedFit, dropped: Reasons) -> dict[str, Score]:
         """Return the groups with a significant gain in the fit, whether they predict or not."""
         return {
             group: found
@@ -280,15 +277,13 @@ class Selection:
         )
         return LinearisedFit(fitted, added, linear)
 
-    def _problem(
-        self, fitted: Fitted, names: Sequence[str]
-    ) -> tuple[Objective, NDArray[np.float64]]:
+    def _problem(self, fitted: Fitted, names: Sequence[str]) -> tuple[Objective, Array]:
         """Return a fit's base problem with some coefficients free, and its start vector (K,).
 
         The model has all candidate terms and conditions, at their neutral values.
         """
         objective = with_loop(self.fitted.objective, loop_of(fitted.objective))
-        neutral = neutral_values_of(coefficients_of(self.candidates))
+        neutral = neutral_values(coefficients_of(self.candidates))
         values = {name: np.asarray(value) for name, value in neutral.items()}
         objective = replace(objective, model=with_coefficients(objective.model, values))
         objective, point = with_terms(objective, self.fitted.point, names, self.job.settings.job)
@@ -302,9 +297,7 @@ class Selection:
             state, names, inside=inside, excludes_gusts=_excludes_gusts(state, group)
         )
 
-    def _rows(
-        self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
-    ) -> tuple[SelectionRow, ...]:
+    def _rows(self, state: LinearisedFit, dropped: Reasons) -> tuple[SelectionRow, ...]:
         """Return the table: groups in the model first, then by held-out gain."""
         groups = dict.fromkeys([*state.added, *self.candidates])
         scores = {group: self._score(state, group) for group in groups}
@@ -368,13 +361,13 @@ class Selection:
         scatter = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
         return bool(gains.sum() > (scatter if by_flight else -scatter))
 
-    def _predicted(self, state: LinearisedFit, scale: Mapping[str, Array]) -> NDArray[np.float64]:
+    def _predicted(self, state: LinearisedFit, scale: Mapping[str, Array]) -> Array:
         model = state.linear.columns_of([*self.job.space.names, *names_of(state.added)])
         own = state.linear.columns_of(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)
 
 
-def _start_vector(fitted: Fitted, objective: Objective, start: NDArray[np.float64]) -> list[float]:
+def _start_vector(fitted: Fitted, objective: Objective, start: Array) -> list[float]:
     """Return a start vector (K,) of a problem, with a fit's values where it has them."""
     own, names = fitted.vector, objective.space.names
     return [own.get(name, start[i]) for i, name in enumerate(names)]

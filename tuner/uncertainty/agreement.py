@@ -1,8 +1,8 @@
-"""Whether flights agree on each coefficient, or some of them call for another value.
+"""Test for flights that need different values of a coefficient.
 
-A coefficient is given a second value in some of the flights, as the last of K + 1 coefficients: how
-large the difference is, and its error, follow from what residuals say at the fit. What flights call
-for one by one splits them in two, so that two vehicles, payloads or sets of gains show.
+A coefficient gets a second value in some of the flights, as the last of K + 1 coefficients: size
+and error of the difference follow from the residuals at the fit. Flights are split in two by the
+values that each needs, so that two vehicles, payloads or sets of gains show.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.examination import Examination
 
-LEVEL = 0.001
+FALSE_ALARM_LEVEL = 0.001
 """Probability of a false alarm among all coefficients and splits."""
-MATTERS = 0.01
-"""Difference, as a share of the coefficient, below which one vehicle is as good as two."""
-TOLD = 0.01
-"""Share of what flights say of a coefficient, all others beside it, from which they tell of it."""
+MIN_DIFFERENCE = 0.01
+"""Least relative difference that is reported."""
+MIN_OWN_INFORMATION = 0.01
+"""Least share of the information on a coefficient that the others do not explain."""
 
 
 class Split(NamedTuple):
-    """Flights that call for another value of a coefficient than the others do.
+    """Flights that need another value of a coefficient than the others.
 
     ``number`` is the coefficient's, ``error`` the difference's were residuals independent.
     """
@@ -46,13 +46,13 @@ class Split(NamedTuple):
 
 
 def flights_disagree(fitted: Fitted, examination: Examination) -> tuple[Finding, ...]:
-    """Return which flights are surest to call for another value of a coefficient, if some do.
+    """Return the finding on the most significant split of flights, if one is significant.
 
-    Nothing where a flight is told already to be another's, or to have gains of its own.
+    There is none where a flight already is reported as unmatched, or with gains of its own.
     """
     uncertainty, errors = examination.uncertainty, examination.model_errors
-    told = any(finding.code is Code.FLIGHT_UNMATCHED for finding in fitted.findings)
-    if told or (errors is not None and any(one.flight for one in errors.controller_estimates)):
+    reported = any(finding.code is Code.FLIGHT_UNMATCHED for finding in fitted.findings)
+    if reported or (errors is not None and any(one.flight for one in errors.controller)):
         return ()
     names = uncertainty.names
     information = examination.information.about(np.arange(len(names)))
@@ -62,9 +62,9 @@ def flights_disagree(fitted: Fitted, examination: Examination) -> tuple[Finding,
         return ()
     split = max(splits, key=lambda one: abs(one.ratio))
     error = float(covariance_of(_with_two_values(information, split)).error[-1])
-    sure = abs(split.difference) > float(ndtri(1.0 - 0.5 * LEVEL / len(splits))) * error
+    sure = abs(split.difference) > float(ndtri(1.0 - 0.5 * FALSE_ALARM_LEVEL / len(splits))) * error
     reference = float(uncertainty.reference[split.number])
-    if not sure or abs(split.difference) < MATTERS * reference:
+    if not sure or abs(split.difference) < MIN_DIFFERENCE * reference:
         return ()
     numbers = {"difference": split.difference / reference, "error": error / reference}
     flights = ", ".join(uncertainty.flights[flight] for flight in split.flights)
@@ -72,7 +72,7 @@ def flights_disagree(fitted: Fitted, examination: Examination) -> tuple[Finding,
 
 
 def _splits(information: FisherInformation, searched: Sequence[int], flights: int) -> list[Split]:
-    """Return all splits in two by what each flight calls for, the smaller part of each."""
+    """Return all splits in two by the value that each flight needs, the smaller part of each."""
     size = information.score.shape[-1]
     known, score = np.zeros((flights, size, size)), np.zeros((flights, size))
     np.add.at(known, information.flight, information.blocks.sum(axis=(0, 2)))
@@ -83,7 +83,7 @@ def _splits(information: FisherInformation, searched: Sequence[int], flights: in
     def split(index: int, some: NDArray[np.intp]) -> Split:
         across = known[some, :, index].sum(axis=0)
         own = across[index] - across @ inverse @ across
-        if own <= TOLD * across[index]:
+        if own <= MIN_OWN_INFORMATION * across[index]:
             return Split(index, np.sort(some), 0.0, np.inf)
         left = score[some, index].sum() + across @ to_minimum
         return Split(index, np.sort(some), float(-left / own), float(own**-0.5))

@@ -139,9 +139,11 @@ def examine(
     information = replace(information, astray=astray)
 
     def known(*others: str) -> Uncertainty:
-        return _uncertainty_of(
-            full_problem, information, (*full_problem.fitted, *others), names, at_minimum=at_minimum
-        )
+        space, indices = full_problem.subspace((*full_problem.fitted, *others))
+        about = information.about(indices)
+        if not at_minimum:  # flights may agree with each other and not with the vehicle
+            about = about.at_minimum
+        return uncertainty_at(space, np.asarray(point.coefficients)[indices], about, names)
 
     return Examination(
         uncertainty=known(),
@@ -153,22 +155,6 @@ def examine(
         information=information,
         model_errors=model_errors,
     )
-
-
-def _uncertainty_of(
-    full_problem: FullProblem,
-    information: FisherInformation,
-    names: tuple[str, ...],
-    flights: Sequence[str],
-    *,
-    at_minimum: bool,
-) -> Uncertainty:
-    space, indices = full_problem.subspace(names)
-    vector = np.asarray(full_problem.point.coefficients)[indices]
-    information = information.about(indices)
-    if not at_minimum:  # flights may agree with each other and not with the vehicle
-        information = information.at_minimum
-    return uncertainty_at(space, vector, information, flights)
 
 
 def _bias(full_problem: FullProblem, information: FisherInformation, reference: Array) -> Array:

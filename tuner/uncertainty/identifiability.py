@@ -23,6 +23,7 @@ from tuner.core.numerics import scaled_solve
 from tuner.core.phrases import listed
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import normal_equations
+from tuner.search.continuation import RIDGE
 from tuner.search.estimation import BOTH_POLISHES, LAST_POLISH, free_offsets, polished
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
@@ -37,8 +38,6 @@ MAX_ROUNDS = 3
 SEARCH_TOLERANCE = 0.002
 """Largest relative rise of the loss by holding one of an exact trade-off: an optimiser's remainder.
 A larger one shows that the others could not follow, by their bounds for example."""
-RIDGE = 1e-12
-"""Added to a Hessian of unit diagonal."""
 CLOSED_LOOP_TOLERANCE = 2.0
 """Largest relative rise of the loss in closed loop: gusts raise it by less."""
 

@@ -96,7 +96,7 @@ class ModelErrors:
         Omitted laws, the likeliest first.
     disturbance
         Their forces and moments in every segment; None for no laws.
-    controller_estimates
+    controller
         Gains and latencies of the rate controller that differ from the file's, of all flights or
         of one.
     speed_lag
@@ -108,22 +108,20 @@ class ModelErrors:
 
     laws: tuple[Law, ...]
     disturbance: Disturbance | None
-    controller_estimates: tuple[ControllerEstimate, ...] = ()
+    controller: tuple[ControllerEstimate, ...] = ()
     speed_lag: float = 0.0
     gains: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def or_none(self) -> ModelErrors | None:
         """None if there are no errors."""
-        return (
-            self if self.laws or self.controller_estimates or self.speed_lag or self.gains else None
-        )
+        return self if self.laws or self.controller or self.speed_lag or self.gains else None
 
     def applied_to(self, objective: Objective) -> Objective:
         """Return a problem with these disturbances, gains, and stamps of rotor speeds."""
         segments, model = objective.segments, objective.model
         rate = model.controller.rate
-        for estimate in self.controller_estimates:
+        for estimate in self.controller:
             if not estimate.flight:
                 rate = _with_gain(rate, estimate)
         pushed = replace(
@@ -222,7 +220,7 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
 
 
 def gain_by_commands(
-    name: str, controller_estimates: Sequence[ControllerEstimate]
+    name: str, controller: Sequence[ControllerEstimate]
 ) -> tuple[float, float] | None:
     """Return a coefficient of `GAIN_AXES` by recorded commands over the fit's, and its error.
 
@@ -230,7 +228,7 @@ def gain_by_commands(
     """
     those = [
         one
-        for one in controller_estimates
+        for one in controller
         if one.part == "P" and one.axis in GAIN_AXES[name] and not one.flight
     ]
     if len(those) < len(GAIN_AXES[name]):
@@ -319,10 +317,8 @@ def _with_other_readings(
     for number in range(VOLTMETER_DRAWS):
         again = log_voltage_of(with_readings_redrawn(flights, random), windows, objective.schedule)
         assert again is not None, "there is a voltmeter"
-        volts = segments.log_voltage + (again - as_read)
-        others[f"{READINGS} {number}"] = replace(
-            objective, segments=replace(segments, log_voltage=volts)
-        )
+        other = replace(segments, log_voltage=segments.log_voltage + (again - as_read))
+        others[f"{READINGS} {number}"] = replace(objective, segments=other)
     return others
 
 
@@ -351,7 +347,7 @@ def model_error_findings(
     ]
     differing = [
         one
-        for one in model_errors.controller_estimates
+        for one in model_errors.controller
         if one.part != "late" or abs(one.value) > MIN_REPORTED_LATENCY_S
     ]
     if abs(model_errors.speed_lag) > MIN_REPORTED_SPEED_LAG_S:
@@ -361,27 +357,21 @@ def model_error_findings(
 
 
 def gains_far_off(fitted: Fitted, flights: Sequence[Flight]) -> tuple[Finding, ...]:
-    """Return the gains that cannot be those of the controller file, by recorded commands.
-
-    The fit need not be good for that; arguments are those of `model_errors_of`.
-    """
+    """Return findings on gains far from the file's; arguments are those of `model_errors_of`."""
     model_errors = model_errors_of(fitted, flights)
-    controller_estimates = () if model_errors is None else model_errors.controller_estimates
+    controller = () if model_errors is None else model_errors.controller
     return _controller_findings(
         [
             one
-            for one in controller_estimates
+            for one in controller
             if one.part != "late" and not 1.0 / FAR_OFF_GAIN < one.value < FAR_OFF_GAIN
         ]
     )
 
 
-def _controller_findings(controller_estimates: Sequence[ControllerEstimate]) -> tuple[Finding, ...]:
-    kinds = dict.fromkeys((one.flight, part) for part in PARTS for one in controller_estimates)
-    alike = {
-        kind: [one for one in controller_estimates if (one.flight, one.part) == kind]
-        for kind in kinds
-    }
+def _controller_findings(controller: Sequence[ControllerEstimate]) -> tuple[Finding, ...]:
+    kinds = dict.fromkeys((one.flight, part) for part in PARTS for one in controller)
+    alike = {kind: [one for one in controller if (one.flight, one.part) == kind] for kind in kinds}
     return tuple(
         Finding(
             Code.CONTROLLER_ANSWERS,
@@ -400,10 +390,7 @@ def _controller_findings(controller_estimates: Sequence[ControllerEstimate]) -> 
 
 
 def _with_gain(gains: RateGains, estimate: ControllerEstimate) -> RateGains:
-    """Return the gains with one estimate applied, P before the latency of its axis.
-
-    A latency of the gyro acts like less D.
-    """
+    """Return the gains with one estimate applied; a latency, after P, acts like less D."""
     axis = "xyz"[AXES.index(estimate.axis)]
 
     def scaled(gain: Vec3) -> Vec3:

@@ -21,7 +21,7 @@ from tuner.uncertainty.examination import FullProblem
 from tuner.uncertainty.records import CHI_SQUARE_95, Profile
 from tuner.vehicle import COEFFICIENTS
 
-GRID_POINTS = 13
+POINTS = 13
 """Number of the coefficient's values, the middle one that of the fit."""
 GRID_REACH_SE = 3.5
 """Distance of the outermost values in standard errors."""
@@ -56,9 +56,7 @@ def profile_likelihood(
     reach = min(GRID_REACH_SE * error, MAX_GRID_REACH * uncertainty.reference[index])
     parameter = space.parameters[index]
     low, high = parameter.scaled(parameter.lower), parameter.scaled(parameter.upper)
-    grid = np.linspace(
-        max(centre[index] - reach, low), min(centre[index] + reach, high), GRID_POINTS
-    )
+    grid = np.linspace(max(centre[index] - reach, low), min(centre[index] + reach, high), POINTS)
     along = (
         uncertainty.covariance.data_only[:, index] / uncertainty.covariance.data_only[index, index]
     )

@@ -74,12 +74,12 @@ def settings_of(vehicle, bag, **job):
 
 
 def test_auto_follows_the_attitude_where_commands_explain_no_turn(sparse, updated):
-    inlet, inlet_finding = choose_inlet(sparse, "auto", updated, ControllerFile())
+    inlet, finding = choose_inlet(sparse, "auto", updated, ControllerFile())
     assert inlet == "attitude"
-    assert inlet_finding.code is Code.INLET_CHOSEN
-    line = one_line(inlet_finding)
+    assert finding.code is Code.INLET_CHOSEN
+    line = one_line(finding)
     assert "Nothing of its turning is fitted: the command" in line
-    assert inlet_finding.level == "warning"
+    assert finding.level == "warning"
     assert "command, logged at 45 Hz, does not explain how the vehicle turned" in line
     assert "its recorded attitude is followed" in line
     assert line.endswith("Log the command as often as its loop runs.")
@@ -105,14 +105,14 @@ def test_commands_of_motors_in_another_order_need_not_be_logged_faster(dense, up
     monkeypatch.setattr("tuner.search.inlet_choice.motor_order", lambda *_: seen)
     command = dense.series["command"]
     turned = Series(command.time, command.values[:, [1, 0, 3, 2]])
-    inlet, inlet_finding = choose_inlet(
+    inlet, finding = choose_inlet(
         replace(dense, series={**dense.series, "command": turned}),
         "auto",
         updated,
         ControllerFile(),
     )
     assert inlet == "attitude"
-    line = one_line(inlet_finding)
+    line = one_line(finding)
     assert "turned in the order in which it is read (correlation" in line
     assert "Log the" not in line
 

@@ -79,7 +79,7 @@ def test_flights_that_hardly_tell_anything_end_in_a_result(
     for broken in (False, True):
         if broken:
             monkeypatch.setattr(disturbances, "hold_undetermined", fails)
-            monkeypatch.setattr("tuner.job.run.what_to_log", fails)
+            monkeypatch.setattr("tuner.job.run.propose_logs", fails)
         told.clear()
         listener = Listener(on_message=told.append)
         folder, result = run(options, out=folder, resume=broken, listener=listener)

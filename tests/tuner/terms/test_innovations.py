@@ -17,7 +17,7 @@ from tuner.objective.space import Space, extended, space_of
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms import innovations
-from tuner.terms.candidates import Selected, neutral_values_of
+from tuner.terms.candidates import Selected, neutral_values
 from tuner.terms.innovations import LinearisedInnovations
 from tuner.terms.linearisation import linearised_from
 from tuner.vehicle import COEFFICIENTS, term_groups
@@ -37,7 +37,7 @@ TOLD = 10.0
 def wide_space(names: Sequence[str]) -> Space:
     """Return the space of a model's coefficients, and of those of terms at neutral values."""
     space = space_of(making.vehicle_file(), making.controller_file(), JobFile(free=MODEL))
-    return extended(space, tuple(names), JobFile(), neutral_values_of(names))
+    return extended(space, tuple(names), JobFile(), neutral_values(names))
 
 
 def information(

@@ -347,7 +347,7 @@ def test_odd_flights_say_nothing_of_the_controller_or_the_model(monkeypatch):
 def test_one_flight_of_another_p_is_named_and_moves_no_gain_of_the_others():
     (fitted, flights), (_, others) = flown_with_p(1.0), flown_with_p(0.6)
     found = model_errors_of(fitted, [*flights[:2], others[2]])
-    assert {(one.flight, one.part) for one in found.controller_estimates} == {(others[2].name, "P")}
+    assert {(one.flight, one.part) for one in found.controller} == {(others[2].name, "P")}
     said = model_error_findings(found, examine(fitted).uncertainty)
     assert [one.subject for one in said] == [others[2].name]
     assert said[0].numbers["roll"] == pytest.approx(0.6, abs=0.05)
@@ -368,12 +368,10 @@ def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
         ]
         assert 0.0 < known.parts.lack < 0.01 * known.value
         return
-    known = {(one.axis, one.part): one for one in model_errors.controller_estimates}
+    known = {(one.axis, one.part): one for one in model_errors.controller}
     assert {("roll", "P"), ("pitch", "P")} <= set(known)
     assert known["roll", "P"].value == pytest.approx(factor, abs=0.01)
-    examination = examine(
-        fitted, model_errors=ModelErrors((), None, model_errors.controller_estimates)
-    )
+    examination = examine(fitted, model_errors=ModelErrors((), None, model_errors.controller))
     for name in ("inertia_xx", "inertia_yy"):
         parts = examination.uncertainty.estimates[name].parts
         assert parts.lack == pytest.approx(parts.search, rel=0.25)
