@@ -351,14 +351,14 @@ def metrics(result: RunResult) -> str:
 
 
 MARGIN = 1.0
-"""Length added to what the recorded flights took, to make an arena of it; m."""
+"""Length added to the extent of the recorded flights for an arena; m."""
 SHORTEST = 20.0
 """Length of a proposed flight, or twice, four times as long, whichever is nearest to the recorded
 ones; s. The publisher takes ten to wind up."""
 
 
 def write_knowledge(folder: Path, job: Job, examination: Examination, fitted: Fitted) -> Knowledge:
-    """Write what is known of each coefficient into a result folder, and return it."""
+    """Write the knowledge of each coefficient into a result folder, and return it."""
     knowledge = knowledge_of(examination, job.space, fitted.point)
     write_files(knowledge, folder)
     return knowledge
@@ -367,16 +367,16 @@ def write_knowledge(folder: Path, job: Job, examination: Examination, fitted: Fi
 def write_next_flight(
     folder: Path, job: Job, examination: Examination, fitted: Fitted, arena: Arena | None = None
 ) -> Proposals | None:
-    """Write what to fly next into a result folder, and return it.
+    """Write the proposals of next flights into a result folder, and return them.
 
     Returns None, and writes nothing, where the controllers that flew are not simulated.
 
     Parameters
     ----------
     job, examination, fitted
-        The recorded flights, what they identify, and the fit.
+        The recorded flights, their examination, and the fit.
     arena
-        Where the next flight must fit; None takes what the recorded flights took, and some more.
+        Space of the next flight; None takes that of the recorded flights, and some more.
     """
     if not isinstance(examination.full_problem.objective.segments.inlet, ReferenceInlet):
         return None

@@ -405,7 +405,7 @@ def _keeping_best(folder: Path, listener: Listener) -> OnProgress:
     report = _reporting(listener)
 
     def on_progress(job: Job, progress: Progress) -> None:
-        with suppress(ConfigError):  # on its way a search may cross what no rigid body can have
+        with suppress(ConfigError):  # a search may pass through impossible inertias
             best = with_values(
                 job.settings.vehicle, job.space.numbers(progress.best_point.coefficients)
             )

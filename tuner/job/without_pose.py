@@ -75,7 +75,7 @@ def fit_without_pose(
     path = Path(used[0].path)
     try:
         vehicle = vehicle_of(path, start, combination)
-    except ConfigError:  # moment_constant over inertia_zz, shared out, gave what no body can have
+    except ConfigError:  # an impossible inertia_zz, by moment_constant over inertia_zz
         measurements = tuple(_without_yaw(m) for m in measurements)
         combination = _combined(measurements, known)
         vehicle = vehicle_of(path, _resized(start, combination), combination)

@@ -37,7 +37,7 @@ flights leave 2."""
 
 
 class Change(NamedTuple):
-    """How the residuals of C channels and F segments change in B stretches, simulated otherwise.
+    """The change of residuals of C channels and F segments in B stretches by another simulation.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Change(NamedTuple):
 
     @property
     def gradient(self) -> Array:
-        """By how much the slope of the loss (K,) changes."""
+        """Change of the slope of the loss (K,)."""
         return np.asarray(self.across.sum(axis=(0, 1, 2)))
 
 
@@ -89,7 +89,7 @@ class FisherInformation:
     lost
         (K, K): information lost to nuisances that all flights share; None without.
     changes
-        What might be simulated differently -> how residuals change.
+        Source of error -> change of the residuals.
     selection_shifts
         (K,) shifts of the estimates by omitted terms; None if none was tried.
     astray
@@ -208,10 +208,10 @@ class FisherInformation:
             nuisance_pull=some(self.nuisance_pull),
         )
 
-    def beside(self, change: Change) -> FisherInformation:
+    def with_change(self, change: Change) -> FisherInformation:
         """Return the same with the size of a change as the last of K + 1 coefficients.
 
-        Now it is zero, and it would be one were the change what flew; it has no prior.
+        It is 0 in this simulation and 1 with the change; it has no prior.
         """
         beside = np.append(change.across, change.own[..., None], axis=-1)
         blocks = np.concatenate([self.blocks, change.across[..., None, :]], axis=-2)

@@ -188,7 +188,7 @@ def _ramp(share: Array) -> Array:
 class _Series:
     """A log (F, samples, *rest), or (F, Q, samples, *rest), read at fractional sample numbers.
 
-    These are (G, m), and what is read is (G, m, *rest), or (G, Q, m, *rest).
+    These are (G, m), and the values (G, m, *rest), or (G, Q, m, *rest).
     """
 
     def __init__(self, rows: Array, *, moved: bool = False) -> None:

@@ -252,7 +252,7 @@ def _tables(inlet: Inlet) -> Inlet:
 
 
 def _directions(given: _Given, tangents: Mapping[str, Array]) -> list[Array]:
-    """Return the tangents of what moves, in the order of the leaves."""
+    """Return the tangents of all differentiated leaves, in their order."""
     count = len(next(iter(tangents.values())))
     still = np.zeros(count)
     moved = [tangents.get(name, still) for name in sorted(given.coefficients)]

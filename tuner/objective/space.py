@@ -286,7 +286,7 @@ def parameter_of(
             name, f"its lower bound {lower:g} is not below its upper bound {upper:g}", "widen them"
         )
     for bound in (given.lower, given.upper):
-        if bound:  # none is reached, so that zero holds for what is above zero
+        if bound:  # bounds are never reached, so that zero is allowed for positive coefficients
             check_value(name, bound, f"bound of {name}")
 
     def scaled(value: float) -> float:

@@ -110,7 +110,7 @@ def require_windows(flight: Flight, seconds: float, fed: Collection[str]) -> Non
     Raises
     ------
     RecordingError
-        Names what is missing, and in how much of the flight.
+        Most of the flight makes no windows: names the signal and the share.
     """
     stretches = _stretches(flight, seconds, None)
     for names in ((), *((name,) for name in fed), fed):

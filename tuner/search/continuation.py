@@ -83,7 +83,7 @@ def run_stages(
     progress
         Where to begin: `initial_progress`, or a checkpoint.
     free
-        What may move.
+        The parameters that may move.
     undecided
         The choices of a `Loop` that are tried both ways -> the informative flights (N,).
     on_progress

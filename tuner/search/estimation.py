@@ -379,7 +379,7 @@ def polished(
     fitted
         Its objective, which need not be the job's, and the point to begin at.
     free
-        What may move.
+        The parameters that may move.
     title
         Prefix of the stages' names in messages.
     on_progress

@@ -162,7 +162,7 @@ def inlet_for(flight: Flight, requested: str) -> InletName:
     Raises
     ------
     RecordingError
-        The recording does not hold what the inlet needs.
+        The recording lacks signals that the inlet needs.
     """
     preferred = next((inlet for inlet in INLETS.values() if inlet.is_preferred(flight)), None)
     if requested == "auto":

@@ -146,7 +146,7 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     criterion
         Horizon, scales, robust limit: change only at `initial_step`.
     free
-        (K + offsets·N,) one for what may move, zero for what stays; changes only at `initial_step`.
+        (K + offsets·N,) one for free parameters, zero for others; changes only at `initial_step`.
     """
     moves = np.flatnonzero(free)
     each = [_of(before, start) for start in range(len(before.damping))]
@@ -275,8 +275,8 @@ def descend(problem: StageProblem) -> Iterator[Iterate]:
     step, losses = initial_step(problem.points, problem.damping, problem.sums), list[Array]()
     while True:
         step = advance(problem.objective, step, replace(problem.criterion, states=states), free)
-        assert step.sums is not None, "what has stepped has sums"
-        assert step.best is not None, "and so has what it found"
+        assert step.sums is not None, "a step has sums"
+        assert step.best is not None, "and a best point"
         best, worst = int(np.argmin(step.loss)), _median_worst_channel(problem.objective, step.sums)
         estimated, here = estimated_states(step.best, best, states), _of(step.sums, best)
         found = Iterate(
@@ -308,7 +308,7 @@ def _has_converged(
     when the normal equations predict less. Rejected steps may have been too long: the last stage
     shortens them until their predicted gain is below the tolerance. `Step.stalled` ends the rest.
     """
-    assert step.sums is not None, "what has stepped has sums"
+    assert step.sums is not None, "a step has sums"
     stage, predicted = problem.stage, step.predicted_reduction
     # windows with residuals far above the noise have no sharp minimum
     vague = problem.objective.segments.windowed & (worst > MATCHED_RATIO)

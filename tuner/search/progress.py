@@ -104,7 +104,7 @@ class StageProblem:
     losses
         (S,) of the last stage; infinite before the first.
     free
-        What may move in this stage.
+        The parameters that may move in this stage.
     seed
         For an optimiser that draws at random; differs from stage to stage.
     damping

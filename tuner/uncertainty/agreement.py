@@ -102,4 +102,4 @@ def _with_two_values(information: FisherInformation, split: Split) -> FisherInfo
     inside = np.isin(information.flight, split.flights)[:, None]
     across = np.where(inside[..., None], information.blocks[..., split.number], 0.0)
     score = np.where(inside, information.score[..., split.number], 0.0)
-    return information.beside(Change(across, across[..., split.number], score))
+    return information.with_change(Change(across, across[..., split.number], score))

@@ -401,7 +401,7 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
     if LOGGED in moved:
         moved[STEP] = np.hypot(moved[STEP], moved[LOGGED])
     if MODEL_ERRORS in moved:
-        flew = share_that_flew(information, information.changes[MODEL_ERRORS])
+        flew = plausible_share(information, information.changes[MODEL_ERRORS])
         moved[MODEL_ERRORS] = moved[MODEL_ERRORS] * flew
     drawn = [moves for name, moves in moved.items() if name.startswith(READINGS)]
     parts = {
@@ -418,14 +418,14 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
     return {name: part for name, part in parts.items() if part is not None}
 
 
-def share_that_flew(information: FisherInformation, change: Change) -> float:
-    """Return how much of a change of the simulation the residuals leave room for, at most all.
+def plausible_share(information: FisherInformation, change: Change) -> float:
+    """Return the share of a change of the simulation that the residuals allow, at most 1.
 
-    That is the root mean square of what its size may be, judged by the residuals, which hold all of
-    what flew that no coefficient takes up. Accelerations and commands show a law each by itself;
-    where a law of theirs is chance, flights that are met as well as noise allows show none.
+    It is the root mean square of its size, estimated from the residuals, which hold all effects
+    that no coefficient absorbs. A law found by chance in accelerations or commands is not in the
+    residuals of flights that are matched to the noise.
     """
-    beside = information.beside(change)
+    beside = information.with_change(change)
     if not beside.inverse.known[-1]:
         return 1.0
     size = (beside.inverse.matrix @ beside.slope)[-1]

@@ -312,7 +312,7 @@ def _with_other_readings(
         return {}
     windows = [Window(flight, 0.0) for flight in flights]
     as_read = log_voltage_of(flights, windows, objective.schedule)
-    assert as_read is not None, "the segments hold what was read"
+    assert as_read is not None, "the segments have a voltage"
     random, others = np.random.default_rng(0), {}
     for number in range(VOLTMETER_DRAWS):
         again = log_voltage_of(with_readings_redrawn(flights, random), windows, objective.schedule)
@@ -430,10 +430,10 @@ def _controller_estimates(
         recorded.append(_signals([series[name] for name in LOOP_SIGNALS], mixer, even))
         made = []
         for name, channel in zip(LOOP_SIGNALS, (SETPOINTS, "body_rate", "command"), strict=True):
-            stamps = series[name].time  # what is lost between a recording's samples is lost here
+            stamps = series[name].time  # sampled as the recording
             stamps = stamps[(stamps >= 0.0) & (stamps <= clock[-1])]
             there = Series(clock, flown.channels[channel][number])
-            # what a loop computes holds until it runs again; a body turns on
+            # outputs of a loop hold until it runs again; a body rate is continuous
             read = _interpolated if name == "body_rate" else zero_order_hold
             made.append(Series(stamps, read(there, stamps)))
         simulated.append(_signals(made, mixer, even))

@@ -342,7 +342,7 @@ class Knowledge(ResultFile):
     Attributes
     ----------
     coefficients
-        Name -> what is known of it; the fitted ones first.
+        Name -> its record; the fitted ones first.
     flights, channels
         Names.
     outputs, effects_over_time, residuals

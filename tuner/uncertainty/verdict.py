@@ -170,7 +170,7 @@ def judge(
     Parameters
     ----------
     known
-        All that a reason may hold; the one returned keeps what bears on the verdict.
+        All fields of a reason; the returned one keeps those relevant to the verdict.
     directions
         Worst-determined combinations.
     relative_half_width, data_error
@@ -249,7 +249,7 @@ def judge_by_error(
     relative
         The error as a share of the value.
     known, roughly
-        What is said of one that is determined, and of one that is not.
+        Reasons for a coefficient that is determined, and for one that is not.
     channel
         Where most of the information comes from.
     """
