@@ -1,8 +1,6 @@
-"""Content by its SHA-256, in a folder or at any fsspec URL.
+"""A store of content by its SHA-256, in a folder or at any fsspec URL.
 
-What is written appears whole: it is moved into place in a folder, and an object store shows no
-object before it is complete. Who has a digest from a source that he trusts may read the content
-from a store that he does not.
+Writes are atomic. The digest verifies content from an untrusted store.
 """
 
 from __future__ import annotations

@@ -244,25 +244,16 @@ def flights_table(flights: Sequence[FlightOutcome]) -> Table:
     ahead = sorted({flight.horizon for flight in flights if flight.horizon is not None})
     ends = dict.fromkeys(f"{seconds:.2g}" for seconds in ahead[:: len(ahead) - 1 or 1])
     within = f" in {' to '.join(ends)} s" if ahead else ""
-    columns = (
-        *("flight", f"position RMSE{within}", "noise"),
-        *("attitude RMSE", "noise ", "verdict"),
-    )
+    columns = ("flight", f"position RMSE{within}", "noise", "attitude RMSE", "noise ", "verdict")
     return Table(columns, rows, words=("flight", "verdict"))
 
 
 def verdict_counts(verdicts: Sequence[Verdict]) -> str:
     """Return a clause with the number of coefficients of each verdict."""
     counts = Counter(verdict_in_words(verdict) for verdict in verdicts)
-    if len(counts) == 1 and len(verdicts) > 1:
-        return f"all {len(verdicts)} are {_plural(next(iter(counts)))}"
-    return listed(
-        [f"1 is {one}" if n == 1 else f"{n} are {_plural(one)}" for one, n in counts.items()]
-    )
-
-
-def _plural(words: str) -> str:
-    return words.replace("at its initial value", "at their initial values")
+    many = {one: one.replace("at its initial value", "at their initial values") for one in counts}
+    clauses = [f"1 is {o}" if n == 1 else f"{n} are {many[o]}" for o, n in counts.items()]
+    return f"all {clauses[0]}" if len(counts) == 1 and len(verdicts) > 1 else listed(clauses)
 
 
 def _cells(errors: Errors, write: Callable[[float], str]) -> list[str]:
