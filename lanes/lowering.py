@@ -239,10 +239,10 @@ class Lowering:
                 return of(*(read(array, index) for array in arrays))
 
             return Deferred(tuple(shape), at, tuple(operands))
+        shape = tuple(shape)
         given = [self.elements(o) for o in operands]
-        spread = np.broadcast_arrays(*given, np.empty(tuple(shape), object))[:-1]
-        flat = [o.ravel() for o in spread]
-        return array_of([of(*(o[i] for o in flat)) for i in range(prod(shape))], shape)
+        spread = [o if o.shape == shape else np.broadcast_to(o, shape) for o in given]
+        return array_of(list(map(of, *(o.ravel().tolist() for o in spread))), shape)
 
     def apply(self, name: str, params: Mapping[str, Any], *elements: Element) -> Element:
         """Apply a rule to elements, column by column where one is a tangent."""

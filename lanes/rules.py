@@ -62,17 +62,15 @@ def is_bool(value: ir.Value) -> bool:
 
 def constant(kind: ir.Type, number: float | int | bool) -> ir.Constant:
     """Return a number as a constant of a scalar or vector type."""
-    scalar = base(kind)
-    plain = float(number) if isinstance(scalar, ir.FloatType | ir.DoubleType) else int(number)
-    if isinstance(kind, ir.VectorType):
-        return _of_every_lane(scalar, kind.count, plain, repr(plain))
-    return ir.Constant(scalar, plain)
+    real = isinstance(base(kind), ir.FloatType | ir.DoubleType)
+    plain = float(number) if real else int(number)
+    return _constant(kind, plain, repr(plain))
 
 
 @cache
-def _of_every_lane(scalar: ir.Type, count: int, number: float, _: str) -> ir.Constant:
-    """Return a constant vector, written lane by lane once; the text tells -0 from 0."""
-    return ir.Constant(ir.VectorType(scalar, count), [number] * count)
+def _constant(kind: ir.Type, number: float, _: str) -> ir.Constant:
+    """Return a constant, made and written once; the text tells -0 from 0."""
+    return ir.Constant(kind, [number] * kind.count if isinstance(kind, ir.VectorType) else number)
 
 
 class Emitter:
