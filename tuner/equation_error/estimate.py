@@ -12,7 +12,6 @@ from tuner.core.numerics import Array
 from tuner.equation_error.model_accelerations import ModelAccelerations, values_at
 from tuner.equation_error.recorded_accelerations import Commands, Mask, Steps
 from tuner.equation_error.regression import (
-    MEMORY_S,
     Regression,
     convolved,
     feedback_bias,
@@ -27,9 +26,6 @@ from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 TORQUE_GAINS = ("torque_gain_x", "torque_gain_y", "torque_gain_z")
 """Factors on the moments that predict turning best: not part of the vehicle."""
-NOISE_UNCERTAINTY = 0.25
-"""Relative standard error of the correction for noise of rotor speeds: a guess, for noise that is
-not white or not of the estimated size."""
 THRUST_EXPONENT = "thrust_exponent"
 """Estimated from forces, where effects of airspeed on all rotors imitate it. Whether moments, which
 are differences among rotors, follow the same exponent is not known."""
@@ -96,9 +92,9 @@ def estimate(
     made = ModelAccelerations(
         with_terms_computed(model, absent), space.parameters, tuple(flights), *commands[:1]
     )
-    names, quiet = np.array(space.names), made.noiseless
+    names = np.array(space.names)
     begin = np.array([p.scaled(p.initial) for p in space.parameters])
-    acts = np.any([np.any(one.columns != 0.0, axis=(0, 1)) for one in quiet.at(begin)], axis=0)
+    acts = np.any([np.any(one.columns != 0.0, axis=(0, 1)) for one in made.at(begin)], axis=0)
     is_gain = np.isin(names, TORQUE_GAINS)
     free = acts & ~is_gain
     groups = {
@@ -111,24 +107,22 @@ def estimate(
     free = free & ~out
     found = regress(made, np.where(out, begin, full.point), free=free, near=True)
     again = partial(regress, begin=found.point, free=free, near=True)
-    others = [(1.0, again(made, memory=times * MEMORY_S)) for times in (0.5, 2.0)]
-    as_read = again(quiet) if made.noisy else found
-    others.append((NOISE_UNCERTAINTY, as_read))
+    others = [again(made, times=2)]
     if commands:
-        others.append((1.0, again(replace(made, commands=commands[1]))))
-    of_power, by_squares = free & (names == THRUST_EXPONENT), as_read
+        others.append(again(replace(made, commands=commands[1])))
+    of_power, by_squares = free & (names == THRUST_EXPONENT), found
     if of_power.any():
-        of_squares = np.where(of_power, begin, as_read.point)
-        by_squares = regress(quiet, of_squares, free=free & ~of_power, near=True)
+        of_squares = np.where(of_power, begin, found.point)
+        by_squares = regress(made, of_squares, free=free & ~of_power, near=True)
     errors = np.sqrt(
         np.diag(found.covariance)
-        + feedback_bias(quiet, found, free=free, memory=MEMORY_S) ** 2
-        + np.where(of_power, 0.0, by_squares.point - as_read.point) ** 2
+        + feedback_bias(made, found, free=free) ** 2
+        + np.where(of_power, 0.0, by_squares.point - found.point) ** 2
         + np.where(free, full.point - found.point, 0.0) ** 2
-        + sum((share * (other.point - found.point)) ** 2 for share, other in others)
+        + sum((other.point - found.point) ** 2 for other in others)
     )
     predicted = minimised(
-        quiet,
+        made,
         found.point,
         lambda one: [summing(one.steps.step, PREDICTION_S)] * 6,
         mean=found.point,
@@ -144,8 +138,8 @@ def estimate(
         values={name: values[name] for name in kept},
         errors=named(errors, free),
         rows=rows,
-        explained=_explained_shares(quiet, found.point),
-        horizon=_horizon(quiet, predicted),
+        explained=_explained_shares(made, found.point),
+        horizon=_horizon(made, predicted),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -25,17 +25,8 @@ from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model, with_coefficients
 
-SPEED_STEP = 1e-3
-"""Relative step of a rotor's speed in finite differences."""
-CHANGE_STEP = 100.0
-"""Step of a rotor's acceleration in finite differences, rad/s²."""
 MOTOR_STEP = 1e-2
 """Step of a motor's logarithm, or of a number over its usual size, in finite differences."""
-ROTORS = 4
-NOISE_STRIDE = 5
-"""Stride of the steps at which the effect of noise of rotor speeds is computed."""
-NOISE_BATCH = 2048
-"""Number of these computed at once: a call costs as much as a thousand of them."""
 
 
 @dataclass(frozen=True)
@@ -50,18 +41,11 @@ class LinearisedAccelerations:
         (N, 6) recorded accelerations minus the model's.
     columns
         (N, 6, K) derivatives of the model's, or by fewer coordinates where only these are asked.
-    noise_square
-        (2, 2, 6, K, K): products of the columns' derivatives by a rotor's speed and by its
-        acceleration, mean over steps and sum over rotors. Zero without noise.
-    noise_across
-        (2, 2, 6, K): likewise of columns and the model's accelerations.
     """
 
     steps: Steps
     errors: Array
     columns: Array
-    noise_square: Array
-    noise_across: Array
 
 
 @dataclass(frozen=True)
@@ -84,22 +68,12 @@ class ModelAccelerations:
     flights: tuple[Steps, ...]
     commands: tuple[Series, ...] = ()
 
-    @property
-    def noisy(self) -> bool:
-        """Whether rotor speeds hold noise."""
-        return any(part.noise > 0.0 for part in self.flights)
-
-    @property
-    def noiseless(self) -> ModelAccelerations:
-        """The same without noise of rotor speeds."""
-        return replace(self, flights=tuple(replace(part, noise=0.0) for part in self.flights))
-
     def at(
         self, point: Array, by: NDArray[np.intp] | None = None
     ) -> tuple[LinearisedAccelerations, ...]:
         """Return each flight's accelerations about a point (K,) of scaled coordinates.
 
-        With derivatives by some of these; by default by all. Noise takes most of the time.
+        With derivatives by some of these; by default by all.
         """
         flights, by = self._with_rotors(point), np.arange(len(point)) if by is None else by
         made = _modelled(self.model, self.parameters, point, flights, by)
@@ -117,58 +91,7 @@ class ModelAccelerations:
                 for flight, (part, (modelled, _)) in enumerate(zip(beside, ends, strict=True)):
                     change = errors[flight] - (part.accelerations - modelled)
                     columns[flight][:, :, number] = change / step
-        noise_square, noise_across = self._noise_sums(point, flights, by)
-        return tuple(
-            map(LinearisedAccelerations, flights, errors, columns, noise_square, noise_across)
-        )
-
-    def _noise_sums(
-        self, point: Array, flights: Sequence[Steps], by: NDArray[np.intp]
-    ) -> tuple[Array, Array]:
-        """Return the noise products and cross products of all flights."""
-        size = len(by)
-        noise_square, noise_across = (
-            np.zeros((len(flights), 2, 2, 6, *k)) for k in ((size, size), (size,))
-        )
-        if not self.noisy:
-            return noise_square, noise_across
-        steps = _side_by_side(flights, every=NOISE_STRIDE)
-        counts = [len(part.time[::NOISE_STRIDE]) for part in flights]
-        flight = np.repeat(np.arange(len(flights)), counts)
-        for first in range(0, len(flight), NOISE_BATCH):
-            some = slice(first, first + NOISE_BATCH)
-            here = jax.tree.map(lambda a, s=some: a[..., s], steps)
-            values, columns = self._slopes(point, here, by)
-            for number in np.unique(flight[some]):
-                own = flight[some] == number
-                slopes = columns[:, :, :, own].reshape(2, 6, -1, size)
-                mean = slopes.mT[:, None] / counts[number]
-                noise_square[number] += mean @ slopes
-                noise_across[number] += (mean @ values[:, :, :, own].reshape(2, 6, -1, 1))[..., 0]
-        return noise_square, noise_across
-
-    def _slopes(self, point: Array, steps: Any, by: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Return derivatives of n steps' accelerations (2, 6, 4, n) and columns (2, 6, 4, n, K).
-
-        By each rotor's speed, and by its acceleration.
-        """
-        motion, speeds, changes = steps
-        unit, count = np.eye(2 * ROTORS), speeds.shape[1]
-        both = np.stack([unit, -unit])[..., None]
-        beside = (
-            jax.tree.map(lambda leaf: np.tile(leaf, 4 * ROTORS), motion),
-            _in_lanes(speeds * (1.0 + SPEED_STEP * both[:, :, :ROTORS])),
-            _in_lanes(changes + CHANGE_STEP * both[:, :, ROTORS:]),
-        )
-        span = 2.0 * np.concatenate([SPEED_STEP * speeds, np.full(speeds.shape, CHANGE_STEP)])
-
-        def slope(made: Array) -> Array:
-            above, below = made.reshape(2, 2, ROTORS, count, *made.shape[1:])
-            slopes = (above - below) / span.reshape(2, ROTORS, count, *[1] * (made.ndim - 1))
-            return np.moveaxis(slopes, 3, 1)
-
-        values, columns = _computed(self.model, self.parameters, point, beside, by)
-        return slope(values), slope(columns)
+        return tuple(map(LinearisedAccelerations, flights, errors, columns))
 
     def _model(self, point: Array) -> Model:
         values = values_at(self.parameters, point)
@@ -197,17 +120,12 @@ def values_at(parameters: Sequence[Parameter], point: Array) -> dict[str, float]
     }
 
 
-def _side_by_side(flights: Sequence[Steps], every: int = 1) -> Any:
-    """Return motion, rotor speeds and accelerations of all flights, with a stride of steps (N,)."""
+def _side_by_side(flights: Sequence[Steps]) -> Any:
+    """Return motion, rotor speeds and accelerations of all flights' steps (N,)."""
     return jax.tree.map(
-        lambda *leaves: np.concatenate([leaf[..., ::every] for leaf in leaves], axis=-1),
+        lambda *leaves: np.concatenate(leaves, axis=-1),
         *((part.motion, part.rotor_speed.T, part.rotor_acceleration.T) for part in flights),
     )
-
-
-def _in_lanes(rotors: Array) -> Array:
-    """Return rotors (..., 4, n) as (4, lanes)."""
-    return np.moveaxis(rotors, -2, 0).reshape(ROTORS, -1)
 
 
 def _modelled(

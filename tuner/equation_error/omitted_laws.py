@@ -174,9 +174,9 @@ def find_omitted_laws(
     their scaled coordinates.
     """
     recorded, simulated, by_command = zip(*flights, strict=True)
-    along = ModelAccelerations(model, tuple(parameters), simulated).noiseless.at(point)
+    along = ModelAccelerations(model, tuple(parameters), simulated).at(point)
     moved = [other for part in simulated for other in _motor_shifts(part)]
-    made = ModelAccelerations(model, (), (*recorded, *moved)).noiseless.at(np.zeros(0))
+    made = ModelAccelerations(model, (), (*recorded, *moved)).at(np.zeros(0))
     mean = float(np.mean([part.rotor_speed.mean() for part in simulated]))
     names = [*((axis, name) for axis, features in FEATURES.items() for name in features), SPEED_LAG]
     motions, tables, sums = list[_Motion](), list[Array](), list[tuple[Array, Array]]()
@@ -188,7 +188,7 @@ def find_omitted_laws(
         table = np.concatenate([_features(motion), _lag_column(shift) * (not of_commands)], axis=2)
         columns = np.concatenate([one.columns, nuisances, shift * of_commands, table], axis=2)
         units = len(columns) // max(1, round(STRETCH_S / real.steps.step))
-        filters = whitening(real, MEMORY_S)
+        filters = whitening(real, [MEMORY_S] * len(AXES))
         sums.append(filtered_sums(replace(real, columns=columns), filters, units)[:2])
         motions.append(motion)
         tables.append(table)

@@ -14,7 +14,6 @@ from sim_jax.rigid_body import Motion
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
 from tuner.objective.inlets import MAX_PERIODS, linear_interpolation, zero_order_hold
-from tuner.objective.noise import white_noise
 from tuner.objective.rotor_response import MotorLags, rotor_speeds
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import local_parabolas, states_at
@@ -56,8 +55,6 @@ class Steps:
         (2, m) of a rotor's samples about mid-step, in its mean and, in 1/s, in its acceleration.
     samples_per_step
         Rotor samples per step.
-    noise
-        rad/s, standard deviation of the white noise of a rotor's samples.
     """
 
     step: float
@@ -68,7 +65,6 @@ class Steps:
     accelerations: Array
     weights: Array
     samples_per_step: int
-    noise: float
 
     @property
     def known(self) -> Mask:
@@ -95,13 +91,11 @@ def steps_of(flight: Flight, *, input_late: float = 0.0, averaged: bool = False)
     if known.sum() < MIN_SAMPLES:
         return None
     rotors = Series(rotors.time[known] - input_late, rotors.values[known])
-    return steps_with(flight, rotors, noise=_noise(rotors), averaged=averaged)
+    return steps_with(flight, rotors, averaged=averaged)
 
 
-def steps_with(
-    flight: Flight, rotors: Series, *, noise: float, averaged: bool = False
-) -> Steps | None:
-    """Return the same for rotor speeds on the clock of the state, with their white noise."""
+def steps_with(flight: Flight, rotors: Series, *, averaged: bool = False) -> Steps | None:
+    """Return the same with rotor speeds on the clock of the state."""
     series = flight.series
     if not {"position", "attitude", "body_rate"} <= set(series):
         return None
@@ -146,7 +140,6 @@ def steps_with(
         accelerations=accelerations,
         weights=weights,
         samples_per_step=samples_per_step,
-        noise=noise,
     )
     part = with_rotors(part, rotors)
     return part if np.count_nonzero(part.known) >= MIN_SAMPLES else None
@@ -193,7 +186,7 @@ def read_commands(
         command = flight.series["command"]
         recorded = Series(command.time - late, command.values)
         every, second = (_held(flight, recorded, rate, count) for count in (1, 2))
-        part = steps_with(flight, rotor_response(model, every), noise=0.0)
+        part = steps_with(flight, rotor_response(model, every))
         part = None if part is None else without_gaps_of(recorded, part)
         if part is None or np.count_nonzero(part.known) < MIN_SAMPLES:
             return None
@@ -277,20 +270,3 @@ def _velocity(series: Mapping[str, Series], edges: Array) -> Array:
     if "velocity" in series and np.isfinite(series["velocity"].values).all():
         return local_parabolas(series["velocity"], edges)
     return local_parabolas(series["position"], edges, derivative=1)
-
-
-def _noise(rotors: Series) -> float:
-    """Return the standard deviation, rad/s, of the white noise of tachometers.
-
-    Third differences hold noise, equal for strides of 1, 2 and 4 samples, and the rotor's own
-    motion, whose variance grows with the stride by a constant factor: two for a first-order
-    process, or more. Noise is at most that of every second sample.
-    """
-    one, two, four = (
-        float(np.nanmedian(white_noise(Series(rotors.time[::n], rotors.values[::n])))) ** 2
-        for n in (1, 2, 4)
-    )
-    if two <= one:
-        return float(np.sqrt(two))
-    growth = max(2.0, (four - two) / (two - one))
-    return float(np.sqrt(max(0.0, one - (two - one) / (growth - 1.0))))

@@ -4,16 +4,18 @@ Four things bias or spoil ordinary least squares:
 
 - Disturbances are not white, and the loop's rotors respond to them: their torque then seems to have
   little effect. A response comes after its disturbance. So errors are predicted from earlier ones,
-  and only the innovations are weighted, which hold no response (Ljung, System Identification, 13.4:
-  prediction errors with a noise model are consistent in closed loop). The noise model is
-  autoregressive for each flight and axis, estimated from the residuals (iterated generalised least
-  squares).
-- Noise of rotor speeds attenuates their coefficients. Its effect on products of regressors is
-  subtracted (Fuller, Measurement Error Models, 1987, 2.2).
+  and only the innovations are weighted (Ljung, System Identification, 13.4: prediction errors with
+  a noise model are consistent in closed loop). The noise model is autoregressive for each flight
+  and axis, estimated from the residuals (iterated generalised least squares).
+- A fast loop responds within a step, most of all by its rotors' acceleration; noise of rotor speeds
+  attenuates their coefficients; and a smoothed log mixes later samples into earlier ones. So
+  columns of moments are replaced by their prediction from columns two steps earlier, beside earlier
+  errors. These hold neither the present innovation nor the present noise (instrumental variables,
+  Ljung 7.6; Söderström and Stoica, Instrumental Variable Methods for System Identification, 1983).
 - A loop sees more of a disturbance than a noisy log shows, and a response to it may be a part of
-  the innovations. These then correlate with earlier rotor signals, too, as they do where the model
-  omits a lag (residual test; Ljung, 16.6). The size of that correlation estimates the possible bias
-  (`feedback_bias`).
+  the innovations. These then correlate with still earlier rotor signals, too, as they do where the
+  model omits a lag (residual test; Ljung, 16.6). The size of that correlation estimates the
+  possible bias (`feedback_bias`).
 - Some directions are not determined by the flights: each coordinate has its prior.
 """
 
@@ -29,10 +31,18 @@ from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to 
 
 from tuner.core.numerics import Z95, Array, huber_weights, robust_sd
 from tuner.equation_error.model_accelerations import LinearisedAccelerations, ModelAccelerations
-from tuner.equation_error.recorded_accelerations import Mask, Steps
+from tuner.equation_error.recorded_accelerations import Mask
 
-MEMORY_S = 0.1
-"""Length of the autoregressive model of errors."""
+MEMORY_S = (0.1, 0.1, 0.1, 0.05, 0.05, 0.05)
+"""Length of the autoregressive model of errors, axis by axis. A longer one of moments takes up what
+instruments predict, and simulated inertia strays."""
+Delays = tuple[int, ...]
+"""For each axis, steps by which instruments are earlier than errors; 0 for ordinary regression."""
+NO_DELAYS: Delays = (0,) * 6
+DELAYS: Delays = (0, 0, 0, 2, 2, 2)
+"""Means of neighbouring steps share samples, those of two steps apart do not."""
+BIAS_LAGS = 8
+"""Number of steps before the instruments in which `feedback_bias` looks for correlation."""
 MAX_ROUNDS = 8
 """Largest number of Gauss-Newton steps."""
 MAX_STEP = 0.7
@@ -40,9 +50,8 @@ MAX_STEP = 0.7
 STEP_TOLERANCE = 1e-3
 """Step, likewise, below which the iteration has converged."""
 MIN_UNITS = 3
-"""Least number of flights to leave out in turn; fewer are cut into so many parts each."""
-MAX_NOISE_SHARE = 0.5
-"""Largest share of a direction's information that is subtracted as noise."""
+"""Least number of flights that are units of the normal equations; fewer are cut into so many parts
+each."""
 HUBER_LIMIT = 3.0
 """Standard deviations beyond which an error counts linearly."""
 
@@ -60,6 +69,8 @@ class NormalEquations:
         (U, K, K), (U, K) and (U,): half the weighed squares are c - s·x + x·A·x / 2 at a change x.
     prior, pull
         (K,) information and slope of the priors.
+    predicted
+        (K, K) coefficients of the instruments in the prediction of each column, row by row.
     """
 
     information: Array
@@ -67,6 +78,7 @@ class NormalEquations:
     loss: Array
     prior: Array
     pull: Array
+    predicted: Array
 
     def solved(self, free: Mask, units: Mask | slice, moved: Array | None = None) -> Array:
         """Return the change (K,) of least loss of some units (U,) along free coordinates (K,).
@@ -80,6 +92,11 @@ class NormalEquations:
         scaled = information[np.ix_(free, free)] * np.outer(unit, unit)
         change[free] = unit * np.linalg.lstsq(scaled, unit * slope[free], rcond=1e-12)[0]
         return change
+
+    def change_by(self, slope: Array, free: Mask) -> Array:
+        """Return the change (K,) of all units' estimate by an additional slope (K,)."""
+        alone = replace(self, slope=slope[None], pull=np.zeros_like(self.pull))
+        return alone.solved(free, slice(None))
 
     def losses(self, change: Array, units: Mask) -> Array:
         """Return each unit's (units,) loss at a change."""
@@ -112,7 +129,7 @@ def regress(
     begin: Array,
     *,
     free: Mask,
-    memory: float = MEMORY_S,
+    times: int = 1,
     near: bool = False,
 ) -> Regression:
     """Return the regression of recorded accelerations.
@@ -123,25 +140,29 @@ def regress(
         (K,) scaled coordinates of the start.
     free
         (K,) which of them are free.
-    memory
-        s, as `MEMORY_S`.
+    times
+        Factor on `MEMORY_S` of forces and `DELAYS` of moments.
     near
         Whether the start is near the end, so that errors are filtered from the first step on.
     """
-    mean = np.array([p.prior_mean for p in made.parameters])
-    whitened, quiet = partial(whitening, memory=memory), made.noiseless
-    stages: list[tuple[ModelAccelerations, Filter]] = [(quiet, _plain), (quiet, whitened)]
-    if made.noisy:
-        stages.append((made, whitened))
-    point = np.array(begin, float)
-    for source, filters in stages[-1:] if near else stages:
-        point = minimised(source, point, filters, mean=mean, free=free)
-    sums = _sums_at(made, point, whitened, mean, free)
+    point, mean = np.array(begin, float), np.array([p.prior_mean for p in made.parameters])
+    memory = tuple(s if delay else times * s for s, delay in zip(MEMORY_S, DELAYS, strict=True))
+    filters, delays = partial(whitening, memory=memory), tuple(times * delay for delay in DELAYS)
+    if not near:
+        point = minimised(made, point, _plain, mean=mean, free=free)
+    point = minimised(made, point, filters, mean=mean, free=free, delays=delays)
+    sums = _sums_at(made, point, filters, mean=mean, free=free, delays=delays)
     return Regression(point, sums, _covariance(sums, free))
 
 
 def minimised(
-    made: ModelAccelerations, begin: Array, filters: Filter, *, mean: Array, free: Mask
+    made: ModelAccelerations,
+    begin: Array,
+    filters: Filter,
+    *,
+    mean: Array,
+    free: Mask,
+    delays: Delays = NO_DELAYS,
 ) -> Array:
     """Return the coordinates (K,) of least filtered errors, by Gauss-Newton steps.
 
@@ -152,7 +173,8 @@ def minimised(
     high = np.array([p.scaled(p.upper) for p in made.parameters])
     point = np.array(begin, float)
     for _ in range(MAX_ROUNDS):
-        change = _sums_at(made, point, filters, mean, free).solved(free, slice(None))
+        sums = _sums_at(made, point, filters, mean=mean, free=free, delays=delays)
+        change = sums.solved(free, slice(None))
         step = np.clip(change, -MAX_STEP * unit, MAX_STEP * unit)
         point = np.clip(point + step, low, high)
         if np.abs(step / unit).max() < STEP_TOLERANCE:
@@ -161,24 +183,33 @@ def minimised(
 
 
 def _sums_at(
-    made: ModelAccelerations, point: Array, filters: Filter, mean: Array, free: Mask
+    made: ModelAccelerations,
+    point: Array,
+    filters: Filter,
+    *,
+    mean: Array,
+    free: Mask,
+    delays: Delays,
 ) -> NormalEquations:
     """Return the normal equations about a point (K,), with priors about a mean (K,).
 
-    The effect of noise of rotor speeds is subtracted.
+    Columns are replaced by their predictions from instruments (two-stage least squares).
     """
     prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
     parts = 1 if len(made.flights) >= MIN_UNITS else MIN_UNITS
     by = np.flatnonzero(free) if free.any() else np.arange(len(free))
-    sums = [filtered_sums(one, filters(one), parts) for one in made.at(point, by)]
-    information, slope, loss, noise, crossed = (
-        _embedded(len(free), by, np.concatenate(some)) for some in zip(*sums, strict=True)
+    sums = [filtered_sums(one, filters(one), parts, delays) for one in made.at(point, by)]
+    information, slope, loss, own = (np.concatenate(some) for some in zip(*sums, strict=True))
+    unit = prior[by] ** -0.5
+    scaled = np.outer(unit, unit) * own.sum(axis=0) + np.eye(len(by))
+    shares = np.linalg.solve(scaled, unit[:, None] * information.sum(axis=0)).T * unit
+    if not any(delays):
+        shares = np.eye(len(by))
+    information, slope, (shares,) = (
+        _embedded(len(free), by, sums)
+        for sums in (shares @ information, slope @ shares.T, shares[None])
     )
-    if made.noisy:
-        taken = _noise_limiter(information.sum(axis=0) + np.diag(prior), noise.sum(axis=0), free)
-        information -= taken @ noise @ taken.T
-        slope += crossed @ (taken @ taken).T
-    return NormalEquations(information, slope, loss, prior, prior * (mean - point))
+    return NormalEquations(information, slope, loss, prior, prior * (mean - point), shares)
 
 
 def _embedded(count: int, by: NDArray[np.intp], sums: Array) -> Array:
@@ -188,88 +219,57 @@ def _embedded(count: int, by: NDArray[np.intp], sums: Array) -> Array:
     return whole
 
 
-def _noise_limiter(information: Array, noise: Array, free: Mask) -> Array:
-    """Return the matrix (K, K) that limits noise (K, K), multiplied from both sides.
-
-    In each free direction at most `MAX_NOISE_SHARE` of the information is noise: a larger estimate
-    is of noise that is not white, as in smoothed signals, and the corrected loss would have no
-    minimum (Fuller, 2.5.1, limits the correction for that reason).
-    """
-    inside = np.ix_(free, free)
-    unit = np.sqrt(np.diag(information)[free])
-    root = np.linalg.cholesky(information[inside] / np.outer(unit, unit)) * unit[:, None]
-    inverse = np.linalg.inv(root)
-    shares, along = np.linalg.eigh(inverse @ noise[inside] @ inverse.T)
-    limit = np.sqrt(np.minimum(1.0, MAX_NOISE_SHARE / np.maximum(shares, MAX_NOISE_SHARE)))
-    taken = np.eye(len(free))
-    taken[inside] = root @ (along * limit) @ along.T @ inverse
-    return taken
-
-
-def feedback_bias(
-    made: ModelAccelerations, found: Regression, *, free: Mask, memory: float
-) -> Array:
+def feedback_bias(made: ModelAccelerations, found: Regression, *, free: Mask) -> Array:
     """Return the possible bias (K,) of a regression by responses of the loop.
 
-    The root mean square, over the lags of the noise model, of the changes that the estimates would
-    make if innovations had the correlation with present regressors that they have with earlier
-    ones. That is zero for a correct model and a log of all that the loop sees.
+    The root mean square, over `BIAS_LAGS`, of the changes that the estimates would make if
+    innovations had the correlation with instruments that they have with still earlier columns.
+    That is zero for a correct model and a log of all that the loop sees.
     """
-    slopes: dict[int, Array] = {}
-    for one in made.at(found.point):
-        for axis, kernel in enumerate(whitening(one, memory)):
-            table = np.column_stack([one.errors[:, axis], one.columns[:, axis]])
-            rows = convolved(table, one.steps.known, kernel)
-            if not len(rows):
-                continue
-            rows /= spread(rows[:, 0])
-            errors, columns = rows[:, 0] * huber_weights(rows[:, 0], HUBER_LIMIT), rows[:, 1:]
-            for lag in range(1, len(kernel)):
-                slope = errors[lag:] @ columns[: len(columns) - lag]
-                slopes[lag] = slopes.get(lag, 0.0) + slope
-    prior = np.zeros_like(found.sums.pull)
-    changes = [
-        replace(found.sums, slope=slope[None], pull=prior).solved(free, slice(None))
-        for slope in slopes.values()
-    ]
-    return np.sqrt(np.mean(np.square(changes), axis=0)) if changes else prior
+    here, changes = made.at(found.point), list[Array]()
+    for lag in range(1, BIAS_LAGS + 1):
+        slopes = [
+            filtered_sums(one, whitening(one), 1, tuple(lag + delay for delay in DELAYS))[1]
+            for one in here
+        ]
+        slope = np.sum(slopes, axis=0) @ found.sums.predicted.T
+        changes.append(found.sums.change_by(slope[0], free))
+    return np.asarray(np.sqrt(np.mean(np.square(changes), axis=0)))
 
 
 def filtered_sums(
-    one: LinearisedAccelerations, kernels: Sequence[Array], parts: int
-) -> tuple[Array, Array, Array, Array, Array]:
+    one: LinearisedAccelerations, kernels: Sequence[Array], parts: int, delays: Delays = NO_DELAYS
+) -> tuple[Array, Array, Array, Array]:
     """Return information (U, K, K), slope (U, K) and loss (U,) of a flight in so many parts.
 
-    Errors of each axis are filtered by its kernel. And the part of information and slope (U, K, K)
-    and (U, K) that noise of rotor speeds makes.
+    Errors of each axis are filtered by its kernel. Instruments are the columns of ``delays`` steps
+    before; both are taken orthogonal to the errors before. And the instruments' own information
+    (U, K, K).
     """
-    size, steps = one.columns.shape[-1], one.steps
-    information, slope, loss = (np.zeros((parts, *k)) for k in ((size, size), (size,), ()))
-    noise, crossed = (np.broadcast_to(0.0, made.shape) for made in (information, slope))
-    for axis, kernel in enumerate(kernels):
+    size, known = one.columns.shape[-1], one.steps.known
+    shapes = (size, size), (size,), (), (size, size)
+    information, slope, loss, own = (np.zeros((parts, *shape)) for shape in shapes)
+    for axis, (kernel, delay) in enumerate(zip(kernels, delays, strict=True)):
         table = np.column_stack([one.errors[:, axis], one.columns[:, axis]])
-        rows = convolved(table, steps.known, kernel)
-        if not len(rows):
+        rows = convolved(table, known, kernel)
+        if len(rows) <= delay:
             continue
-        sigma = spread(rows[:, 0])
-        counts = np.zeros(parts)
-        for unit, stretch in enumerate(np.array_split(rows / sigma, parts)):
-            errors, columns = stretch[:, 0], stretch[:, 1:]
-            robust = huber_weights(errors, HUBER_LIMIT)
-            weighed = columns * robust[:, None]
-            loss[unit] += 0.5 * float(np.sum(robust * errors**2))
-            information[unit] += weighed.T @ columns
-            slope[unit] += weighed.T @ errors
-            counts[unit] = robust.sum()
-        if steps.noise > 0.0:
-            gain = (steps.noise / sigma) ** 2 * _noise_gain(kernel, steps)
-            noise = noise + np.multiply.outer(
-                counts, np.tensordot(gain, one.noise_square[:, :, axis])
-            )
-            crossed = crossed + np.multiply.outer(
-                counts, np.tensordot(gain, one.noise_across[:, :, axis])
-            )
-    return information, slope, loss, noise, crossed
+        rows /= spread(rows[:, 0])
+        errors, columns = rows[delay:, 0], rows[delay:, 1:]
+        instruments = columns
+        if delay:
+            past = _windows(one.errors[:, axis], known, len(kernel))[delay:, :-1]
+            both = np.hstack([columns, rows[:-delay, 1:]])
+            both -= past @ np.linalg.lstsq(past, both, rcond=1e-9)[0]
+            columns, instruments = np.hsplit(both, 2)
+        robust = huber_weights(errors, HUBER_LIMIT)
+        for unit, part in enumerate(np.array_split(np.arange(len(errors)), parts)):
+            weighed = robust[part, None] * instruments[part]
+            loss[unit] += 0.5 * float(np.sum(robust[part] * errors[part] ** 2))
+            information[unit] += weighed.T @ columns[part]
+            slope[unit] += weighed.T @ errors[part]
+            own[unit] += weighed.T @ instruments[part]
+    return information, slope, loss, own
 
 
 def convolved(table: Array, known: Mask, kernel: Array) -> Array:
@@ -296,35 +296,30 @@ def _plain(one: LinearisedAccelerations) -> Sequence[Array]:
     return [np.ones(1)] * one.errors.shape[1]
 
 
-def whitening(one: LinearisedAccelerations, memory: float) -> Sequence[Array]:
+def whitening(one: LinearisedAccelerations, memory: Sequence[float] = MEMORY_S) -> Sequence[Array]:
     """Return the whitening filter of errors for each axis."""
-    order = max(1, round(memory / one.steps.step))
-    return [whitening_filter(errors, one.steps.known, order) for errors in one.errors.T]
+    orders = [max(1, round(seconds / one.steps.step)) for seconds in memory]
+    rows = zip(one.errors.T, orders, strict=True)
+    return [whitening_filter(errors, one.steps.known, order) for errors, order in rows]
 
 
 def whitening_filter(errors: Array, known: Mask, order: int) -> Array:
     """Return the filter from errors (N,) to innovations, by autoregression of an order."""
-    whole = np.lib.stride_tricks.sliding_window_view(known, order + 1).all(axis=1)
-    limit = 2.0 * HUBER_LIMIT * spread(errors[known])
-    errors = np.clip(np.where(known, errors, 0.0), -limit, limit)
-    rows = np.lib.stride_tricks.sliding_window_view(errors, order + 1)[whole]
+    rows = _windows(errors, known, order + 1)
     predicted = np.linalg.lstsq(rows[:, :-1], rows[:, -1], rcond=1e-9)[0]
     return np.concatenate([[1.0], -predicted[::-1]])
 
 
-def _noise_gain(kernel: Array, steps: Steps) -> Array:
-    """Return the covariance (2, 2) of filtered noise over the variance of a rotor's sample.
-
-    Noise of the mean of the rotor's samples in a step, and of their acceleration.
-    """
-    each = np.zeros(steps.samples_per_step * (len(kernel) - 1) + 1)
-    each[:: steps.samples_per_step] = kernel
-    made = np.stack([np.convolve(each, samples[::-1]) for samples in steps.weights])
-    return np.asarray(made @ made.T)
+def _windows(errors: Array, known: Mask, count: int) -> Array:
+    """Return windows (n, count) of successive errors (N,), where all of them are known."""
+    view = np.lib.stride_tricks.sliding_window_view
+    limit = 2.0 * HUBER_LIMIT * spread(errors[known])
+    errors = np.clip(np.where(known, errors, 0.0), -limit, limit)
+    return view(errors, count)[view(known, count).all(axis=1)]
 
 
 def _covariance(sums: NormalEquations, free: Mask) -> Array:
-    """Return the coordinates' covariance: by innovations, or by leaving units out if larger.
+    """Return the coordinates' covariance: by innovations, or by the scatter of units if larger.
 
     Errors that violate the noise model scatter from flight to flight; a few flights show that
     roughly (Student). Fixed coordinates have no variance.
@@ -334,9 +329,9 @@ def _covariance(sums: NormalEquations, free: Mask) -> Array:
     inside, covariance = np.ix_(free, free), np.zeros_like(information)
     scaled = information[inside] * np.outer(unit, unit)
     covariance[inside] = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) * np.outer(unit, unit)
-    left_out = np.stack([sums.solved(free, units) for units in ~np.eye(count, dtype=bool)])
+    pulls = [sums.change_by(slope, free) for slope in sums.slope]
     student = stdtrit(count - 1, 0.975) / Z95
-    scatter = student**2 * (count - 1) * left_out.var(axis=0)
+    scatter = student**2 * count / (count - 1) * np.sum(np.square(pulls), axis=0)
     least = np.maximum(np.diag(covariance), 0.0)
     wider = np.sqrt(np.maximum(scatter, least) / np.maximum(least, 1e-300))
     wider[~free] = 1.0

@@ -114,5 +114,5 @@ def _residual_acceleration(
     if found is None:
         return None
     (part,) = found[0]
-    (one,) = ModelAccelerations(model, (), (part,)).noiseless.at(np.zeros(0))
+    (one,) = ModelAccelerations(model, (), (part,)).at(np.zeros(0))
     return part, np.where(part.known[:, None], np.nan_to_num(one.errors[:, 3:]), 0.0)

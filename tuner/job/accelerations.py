@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.errors import ConfigError
+from tuner.core.numerics import Z95
 from tuner.equation_error.estimate import TORQUE_GAINS, Estimate, estimate
 from tuner.equation_error.model_accelerations import moves_rotors
 from tuner.equation_error.recorded_accelerations import steps_by_inlet
@@ -68,7 +69,7 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
 
 def _regressed_job(job: Job, found: Estimate) -> Job | None:
     """Return the job with its search's coefficients, start and windows; None for no rigid body."""
-    settings = job.settings
+    settings, found = job.settings, of_rigid_body(found)
     moving = tuple(n for n in found.values if n not in BY_REGRESSION and not moves_rotors(n))
     try:
         vehicle = with_values(settings.vehicle, found.values)
@@ -80,6 +81,21 @@ def _regressed_job(job: Job, found: Estimate) -> Job | None:
     changed = settings.job.model_copy(update={"free": moving, "fixed": (), "search": search})
     regressed = job_of(replace(settings, vehicle=vehicle, job=changed), job.recordings)
     return replace(regressed, user_settings=job.settings, accelerations=found)
+
+
+def of_rigid_body(found: Estimate) -> Estimate:
+    """Return an estimate whose inertia about z is at most a rigid body's, if its error allows that.
+
+    Turning about z determines the ratios of the other yaw moments to it; they stay.
+    """
+    values = found.values
+    if not {*BY_REGRESSION[:3]} <= {*values}:
+        return found
+    xx, yy, zz = (values[name] for name in BY_REGRESSION[:3])
+    if not 0.0 < np.log(zz / (xx + yy)) < Z95 * found.errors["inertia_zz"]:
+        return found
+    within = {name: values[name] * (xx + yy) / zz for name in BY_REGRESSION[2:] if name in values}
+    return replace(found, values={**values, **within})
 
 
 def _finding(found: Estimate) -> Finding:

@@ -227,7 +227,7 @@ def _hover_lift(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
         if series is None or known is None or known.sum() < MIN_SAMPLES:
             continue
         speeds = np.sqrt(squared_speed(vehicle, source, series.values[known]))
-        steps = steps_with(flight, Series(series.time[known], speeds), noise=0.0)
+        steps = steps_with(flight, Series(series.time[known], speeds))
         if steps is None:
             continue
         pull = np.nan_to_num(steps.accelerations[:, 2])

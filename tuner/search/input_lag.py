@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sim_jax.constants import GRAVITY
 from tuner.core.numerics import Array
 from tuner.equation_error.recorded_accelerations import Mask, steps_with, with_rotors
-from tuner.equation_error.regression import MEMORY_S, convolved, whitening_filter
+from tuner.equation_error.regression import convolved, whitening_filter
 from tuner.objective.inlets import INLETS, linear_interpolation
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import states_at
@@ -28,6 +28,8 @@ from tuner.vehicle import VehicleFile
 
 BAND_HZ = (0.7, 8.0)
 """Frequencies at which accelerations are compared."""
+MEMORY_S = 0.1
+"""Errors from which the next one is predicted."""
 LAGS_S = np.arange(-24, 25) * 0.0025
 """Lags that are tried: five samples at 100 Hz, and as much again for a rotor's lag."""
 MAX_LAG_SD_S = 0.003
@@ -106,7 +108,7 @@ def _turning_likelihoods(flight: Flight, vehicle: VehicleFile, at: Sequence[floa
     rotors = flight.series["rotor_speed"]
     there = np.isfinite(rotors.values).all(axis=1)
     rotors = Series(rotors.time[there], rotors.values[there])
-    steps = steps_with(flight, rotors, noise=0.0)
+    steps = steps_with(flight, rotors)
     if steps is None:
         return [0.0] * len(at)
     parts = [with_rotors(steps, Series(rotors.time - late, rotors.values)) for late in at]
