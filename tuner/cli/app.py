@@ -108,7 +108,10 @@ COMMANDS = {
         "Fetch the result of a job of a tuning service.",
         "tune fetch 3f2a91c05d7e4b68 --out runs/first",
     ),
-    "cancel": ("Cancel a job of a tuning service.", "tune cancel 3f2a91c05d7e4b68"),
+    "cancel": (
+        "Cancel a job of a tuning service.",
+        "tune cancel 3f2a91c05d7e4b68",
+    ),
     "watch-folder": (
         "Submit a job to a tuning service whenever new recordings in a folder have settled.",
         "tune watch-folder lab/ --server http://lab:8000",

@@ -10,6 +10,7 @@ from tests.tuner.uncertainty.making import FLIGHTS, NOISE, fitted_of, problem, t
 from tuner.config import JobFile
 from tuner.search import estimation
 from tuner.search.progress import Free, Loop, initial_progress, loop_of, with_loop
+from tuner.vehicle import ControllerFile
 
 PLAIN = ("motor_constant", "inertia_xx", "inertia_yy")
 
@@ -23,7 +24,7 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
     fitted = fitted_of(with_loop(objective, own.switched(choice)), truth(objective))
     job = SimpleNamespace(
         objective=objective,
-        settings=SimpleNamespace(job=JobFile()),
+        settings=SimpleNamespace(job=JobFile(), controller=ControllerFile()),
         fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
         undecided=lambda _: {choice: tell},
     )
@@ -53,7 +54,7 @@ def test_a_rough_fit_ends_where_a_linear_step_is_left(left, steps):
     fitted = fitted_of(objective, objective.start(true + 0.02 * true))
     job = SimpleNamespace(
         objective=objective,
-        settings=SimpleNamespace(job=JobFile()),
+        settings=SimpleNamespace(job=JobFile(), controller=ControllerFile()),
         fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
     )
     free = Free(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
