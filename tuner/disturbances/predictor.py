@@ -63,6 +63,9 @@ lag of motors and the lag of tachometers: for an estimate of memory."""
 STRETCH_S, MIN_GAIN_SE = 2.0, 1.5
 """Stretches by which likelihoods are compared, and the least gain in standard errors: half the
 standard errors by which the coefficient that gains it differs from neutral."""
+MAX_INNOVATION_RATIO = 1.1
+"""RMS of a flight's whitened innovations of a channel up to which it is matched. Simulated gusty
+flights of 18 s have up to 1.04."""
 MIN_NOISE_RATIO = 1.05
 """Ratio of a channel's innovations to their assumed size from which its noise is increased."""
 STRENGTH_PRIOR_SD = 1.5
@@ -222,6 +225,18 @@ class Predictor:
             for _, white in self._sizes()
             if len(white) > 0
         )
+
+    @property
+    def matched(self) -> NDArray[np.bool_]:
+        """Whether each flight's (F,) innovations are as small as assumed, in every channel."""
+        assert self.found is not None
+        sizes = np.minimum(np.abs(np.asarray(self.found.white, float)), GATE)
+        ends = np.cumsum(list(self.inputs.widths.values()))[:-1]
+        squares, counts = (
+            np.array([part.sum(axis=(0, 1)) for part in np.split(table, ends, axis=1)])
+            for table in (sizes**2, sizes > 0.0)
+        )
+        return np.asarray(np.all(squares <= MAX_INNOVATION_RATIO**2 * counts, axis=0))
 
     @property
     def is_lost(self) -> bool:

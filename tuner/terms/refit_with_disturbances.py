@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuner.core.phrases import listed
 from tuner.disturbances.maximum_likelihood import MAX_STEPS, maximise_likelihood
@@ -15,6 +16,7 @@ from tuner.disturbances.predictor import Predictor, hidden_by_setpoints
 from tuner.disturbances.ticks import FLIGHT_CONTROLLER
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
+from tuner.recordings.flight import Flight
 from tuner.search.estimation import LAST_POLISH, free_offsets, polished
 from tuner.search.explanation import Explanation
 from tuner.search.findings import outlying_flights
@@ -142,7 +144,10 @@ def with_disturbances(
     again = replace(
         again,
         wall_time=fitted.wall_time + time.perf_counter() - clock,
-        findings=(*again.findings, _disturbance_finding(predictor)),
+        findings=(
+            *without_matched_flights(again.findings, job.fitted, predictor.matched),
+            _disturbance_finding(predictor),
+        ),
     )
     alternatives = alternatives_of(again.objective, again.point, job.fitted)
     model_errors = _without_contradicted_lag(model_errors_of(again, job.fitted), seen)
@@ -177,6 +182,21 @@ def with_disturbances(
             on_message("It contradicts the fit of the simulated flights, which is kept.")
         better = agree and _is_sharper(examination.uncertainty, before.uncertainty)
     return (seen.selected, again, examination) if better else None
+
+
+def without_matched_flights(
+    findings: Sequence[Finding], flights: Sequence[Flight], matched: NDArray[np.bool_]
+) -> tuple[Finding, ...]:
+    """Return the findings without those on flights that are matched with their disturbances.
+
+    Without them a simulated flight, as of a spin whose position nothing holds, may be far off.
+    """
+    names = {flight.name for flight, one in zip(flights, matched, strict=True) if one}
+    return tuple(
+        finding
+        for finding in findings
+        if finding.code is not Code.FLIGHT_UNMATCHED or finding.subject not in names
+    )
 
 
 def _without_contradicted_lag(

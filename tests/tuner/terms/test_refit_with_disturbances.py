@@ -15,6 +15,7 @@ from tuner.config import JobFile
 from tuner.disturbances.disturbances import INITIAL_STRENGTHS
 from tuner.disturbances.maximum_likelihood import MAX_STEPS
 from tuner.equation_error.omitted_laws import Law
+from tuner.findings.findings import Code, Finding
 from tuner.search.problem import Job
 from tuner.search.progress import COLOURED_RATIO, Fitted
 from tuner.terms import refit_with_disturbances as disturbances
@@ -185,7 +186,11 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     """
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
     predictor = SimpleNamespace(
-        memory=0, is_lost=False, keeps_track=True, strengths=INITIAL_STRENGTHS
+        memory=0,
+        is_lost=False,
+        keeps_track=True,
+        strengths=INITIAL_STRENGTHS,
+        matched=np.zeros(0, bool),
     )
     predictor.without_gains = predictor
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
@@ -237,6 +242,26 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     assert len(examined) == 2 - lag
     assert (examined[-1] is begin.fitted) == (titles == 1 and not lag)
     assert read[0] == (job.fitted,)  # whose voltmeters are read again
+
+
+def test_a_flight_that_disturbances_explain_is_not_reported_as_unmatched():
+    """White innovations match a flight; one channel that is too large does not."""
+    random = np.random.default_rng(0)
+    white = random.normal(size=(500, 6, 3))
+    white[:, 4, 1] *= 1.5
+    white[::2, :, 2] = 0.0  # ticks without samples
+    inputs = SimpleNamespace(widths={"position": 3, "attitude": 3})
+    names = ("spin", "odd", "sparse")
+    found = [Finding(Code.FLIGHT_UNMATCHED, "warning", name, {"position": 20.0}) for name in names]
+    other = Finding(Code.MODEL_UNMATCHED, "warning", "spin", {})
+    matched = disturbances.Predictor.matched.fget(
+        SimpleNamespace(found=SimpleNamespace(white=white), inputs=inputs)
+    )
+    flights = [SimpleNamespace(name=name) for name in names]
+    assert disturbances.without_matched_flights([*found, other], flights, matched) == (
+        found[1],
+        other,
+    )
 
 
 def test_a_lateness_that_samples_contradict_is_not_believed():
