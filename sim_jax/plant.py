@@ -180,12 +180,9 @@ class Plant(eqx.Module):
         asked = [self._on_battery(references, step) for references in self._asked(state, step)]
         if state.lagged_speed is not None:
             asked.append(self._on_battery(state.lagged_speed, step))
-
-        @jax.jit  # traced and differentiated once, for all rotors
-        def advanced(*speeds: Array) -> tuple[Array, Array]:
-            return self.lag.advance(*speeds)
-
-        moves = [advanced(*speeds) for speeds in zip(state.rotor_speed, *asked, strict=True)]
+        moves = [
+            self.lag.advance(*speeds) for speeds in zip(state.rotor_speed, *asked, strict=True)
+        ]
         speeds = tuple(end for end, _ in moves)
         mean = tuple(mean for _, mean in moves)
         return speeds, mean if self.schedule.integrator == "midpoint" else state.rotor_speed
@@ -216,7 +213,6 @@ class Plant(eqx.Module):
 
         around = self.environment.during(step, self.schedule)
 
-        @jax.jit  # traced and differentiated once, wherever the integrator asks for it
         def wrench_at(predicted: Motion) -> Wrench:
             motion = self.inlet.felt(predicted, step)
             air = Air.around(self.vehicle, motion, around, accelerations)
