@@ -200,11 +200,11 @@ def _sums_at(
     by = np.flatnonzero(free) if free.any() else np.arange(len(free))
     sums = [filtered_sums(one, filters(one), parts, delays) for one in made.at(point, by)]
     information, slope, loss, own = (np.concatenate(some) for some in zip(*sums, strict=True))
-    unit = prior[by] ** -0.5
-    scaled = np.outer(unit, unit) * own.sum(axis=0) + np.eye(len(by))
-    shares = np.linalg.solve(scaled, unit[:, None] * information.sum(axis=0)).T * unit
-    if not any(delays):
-        shares = np.eye(len(by))
+    shares = np.eye(len(by))
+    if any(delays):
+        unit = prior[by] ** -0.5
+        scaled = np.outer(unit, unit) * own.sum(axis=0) + shares
+        shares = np.linalg.solve(scaled, unit[:, None] * information.sum(axis=0)).T * unit
     information, slope, (shares,) = (
         _embedded(len(free), by, sums)
         for sums in (shares @ information, slope @ shares.T, shares[None])
@@ -226,12 +226,10 @@ def feedback_bias(made: ModelAccelerations, found: Regression, *, free: Mask) ->
     innovations had the correlation with instruments that they have with still earlier columns.
     That is zero for a correct model and a log of all that the loop sees.
     """
-    here, changes = made.at(found.point), list[Array]()
+    here, changes = [(one, whitening(one)) for one in made.at(found.point)], list[Array]()
     for lag in range(1, BIAS_LAGS + 1):
-        slopes = [
-            filtered_sums(one, whitening(one), 1, tuple(lag + delay for delay in DELAYS))[1]
-            for one in here
-        ]
+        delays = tuple(lag + delay for delay in DELAYS)
+        slopes = [filtered_sums(one, kernels, 1, delays)[1] for one, kernels in here]
         slope = np.sum(slopes, axis=0) @ found.sums.predicted.T
         changes.append(found.sums.change_by(slope[0], free))
     return np.asarray(np.sqrt(np.mean(np.square(changes), axis=0)))

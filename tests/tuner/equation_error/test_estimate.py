@@ -90,7 +90,7 @@ def test_errors_hold_what_instruments_of_longer_ago_move(flown, begun, monkeypat
 
 
 @pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
-def test_errors_hold_how_far_a_regression_was_misled(flown, begun, monkeypatch):
+def test_errors_hold_the_bias_by_feedback(flown, begun, monkeypatch):
     _, settings, recordings = flown
 
     def half(made, found, **given):

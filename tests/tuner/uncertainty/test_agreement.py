@@ -18,14 +18,16 @@ NAMES = ("inertia_xx", "motor_constant", "moment_constant")
 
 
 def fit_of(
-    seed: int, difference: float, *, memory: int = 1, shift: float = 0.0
+    seed: int, difference: float, *, memory: int = 1, shift: float = 0.0, seen: int = FLIGHTS
 ) -> tuple[SimpleNamespace, ...]:
     """Return a fit and its examination; b and d have another motor constant by a difference.
 
-    Each error lasts for ``memory`` samples. The fit is a ``shift`` away from the minimum.
+    Each error lasts for ``memory`` samples. The fit is a ``shift`` away from the minimum. The
+    moment constant acts in the first ``seen`` flights alone.
     """
     random = np.random.default_rng(seed)
     design = random.normal(size=(FLIGHTS, BLOCKS * LENGTH, COUNT))
+    design[seen:, :, 2] = 0.0
     own = np.zeros((FLIGHTS, COUNT))
     own[1::2, 1] = difference
     noise = random.normal(size=(FLIGHTS, BLOCKS * LENGTH // memory)).repeat(memory, axis=1)
@@ -69,6 +71,10 @@ def test_flights_of_another_vehicle_are_named_with_what_differs():
 def test_flights_of_one_vehicle_agree(memory, shift):
     fits = (fit_of(seed, 0.0, memory=memory, shift=shift) for seed in range(100))
     assert not any(flights_disagree(*fit) for fit in fits)
+
+
+def test_a_coefficient_that_one_flight_determines_has_no_second_value():
+    assert not any(flights_disagree(*fit_of(seed, 0.0, seen=1)) for seed in range(100))
 
 
 def test_a_difference_that_does_not_matter_is_not_said():
