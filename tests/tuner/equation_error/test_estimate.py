@@ -22,6 +22,7 @@ from tuner.equation_error.recorded_accelerations import (
 )
 from tuner.equation_error.regression import (
     BIAS_LAGS,
+    DELAYS,
     NO_DELAYS,
     NormalEquations,
     Regression,
@@ -183,6 +184,26 @@ def test_what_comes_a_step_late_is_in_the_errors(lags):
     (error,) = feedback_bias(made, found, free=np.ones(1, bool))
     chance = 0.5 / np.sqrt(size)
     assert error == pytest.approx(np.hypot(lags / np.sqrt(BIAS_LAGS), chance), abs=chance)
+
+
+def test_moments_count_only_beside_earlier_errors():
+    """Responses of columns to earlier errors change nothing; instruments have their own Gram."""
+    random, size = np.random.default_rng(0), 400
+    errors, columns = random.uniform(-1.0, 1.0, (size, 6)), random.normal(size=(size, 6, 2))
+    responses = columns.copy()
+    responses[1:, 3:] += errors[:-1, 3:, None]
+    steps, kernels = (
+        SimpleNamespace(known=np.ones(size, bool)),
+        [np.array([1.0, 0.0, 0.0, 0.0])] * 6,
+    )
+    plain, responding = (
+        filtered_sums(LinearisedAccelerations(steps, errors, table), kernels, 3, DELAYS)
+        for table in (columns, responses)
+    )
+    for one, other in zip(plain, responding, strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9)
+    own = plain[3].sum(axis=0)
+    np.testing.assert_allclose(own, own.T, rtol=1e-12)
 
 
 @pytest.fixture
