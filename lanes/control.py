@@ -15,7 +15,7 @@ from jax.extend.core import JaxprEqn
 from llvmlite import ir
 
 from lanes.dependence import dependent, dependent_in_scan, dependent_in_while
-from lanes.lowering import CONTROL, I64, SPILLED, Lowering, dtype_of, shape_of
+from lanes.lowering import CONTROL, I64, MAX_CARRIED_IN_REGISTERS, Lowering, dtype_of, shape_of
 from lanes.rules import constant, is_bool, type_of
 from lanes.values import (
     OF_LANE,
@@ -33,7 +33,7 @@ from lanes.values import (
 Bound = Mapping[Any, Memory]
 
 
-def _rebuilt(value: Elements, left: Iterator[ir.Value]) -> Elements:
+def _with_llvm_values(value: Elements, left: Iterator[ir.Value]) -> Elements:
     """Return an array in registers with the LLVM values that come next; tangents lie in memory."""
     return array_of(
         [e if isinstance(e, Tangent) else next(left) for e in value.ravel()],
@@ -53,7 +53,7 @@ class _Carry:
     ) -> None:
         """Lay values out, each of its kind.
 
-        What the loop also reads as it was before, ``read``, is carried as a copy.
+        Values that the loop also reads as they were before it, ``read``, are carried as copies.
         """
         self.lower, self.kinds = lower, list(kinds)
         self._taken = {id(v.storage.pointer) for v in read if isinstance(v, Memory)}
@@ -77,7 +77,7 @@ class _Carry:
                 for slot, element in zip(value.ravel(), new.ravel(), strict=True):
                     if isinstance(slot, Tangent) and slot is not element:
                         outs.append((element, self.lower.into(slot)))
-        self.lower.flushed(outs)
+        self.lower.flush(outs)
 
     def _laid(self, value: Value, kind: int) -> Elements | Memory:
         if isinstance(value, Memory) and value.storage.writable:
@@ -85,26 +85,26 @@ class _Carry:
             if alike and id(value.storage.pointer) not in self._taken:
                 self._taken.add(id(value.storage.pointer))
                 return value
-        if prod(value.shape) > SPILLED:
-            return self.lower.spilled(value, kind)
-        return self.lower.promoted(value, kind)
+        if prod(value.shape) > MAX_CARRIED_IN_REGISTERS:
+            return self.lower.copied_to_memory(value, kind)
+        return self.lower.in_registers(value, kind)
 
     def parts(self, values: Sequence[Value]) -> list[ir.Value]:
-        """Return what is carried of values as LLVM values."""
+        """Return the LLVM values among carried values; arrays in memory have none."""
         return [x for v in values if isinstance(v, np.ndarray) for x in parts_of(v.ravel())]
 
-    def rebuilt(self, parts: Sequence[ir.Value]) -> list[Value]:
+    def with_llvm_values(self, parts: Sequence[ir.Value]) -> list[Value]:
         """Return the carried values with other LLVM values, in the order of `parts`."""
         left = iter(parts)
         return [
             Memory(value.storage, value.shape, value.storage.version)
             if isinstance(value, Memory)
-            else _rebuilt(value, left)
+            else _with_llvm_values(value, left)
             for value in self.values
         ]
 
-    def handed_on(self, outs: Sequence[Value]) -> list[Value]:
-        """Return what one turn gives as what the next one is given."""
+    def next_turn(self, outs: Sequence[Value]) -> list[Value]:
+        """Return the outputs of one turn as the inputs of the next."""
         following: list[Value] = []
         for value, out, kind in zip(self.values, outs, self.kinds, strict=True):
             if isinstance(value, Memory):
@@ -113,7 +113,7 @@ class _Carry:
                     value.storage.version += 1
                 following.append(value)
             else:
-                following.append(self.lower.promoted(out, kind))
+                following.append(self.lower.in_registers(out, kind))
         self._move(following)
         return following
 
@@ -127,11 +127,11 @@ class _Carry:
         self.lower.carried.append({e.operands[0] for e in slots if isinstance(e, Tangent)})
         nodes = self.lower.loop(
             self.parts(self.values),
-            lambda nodes: goes_on(self.rebuilt(nodes)),
-            lambda nodes: self.parts(turn(self.rebuilt(nodes))),
+            lambda nodes: goes_on(self.with_llvm_values(nodes)),
+            lambda nodes: self.parts(turn(self.with_llvm_values(nodes))),
         )
         self.lower.carried.pop()
-        return self.rebuilt(nodes)
+        return self.with_llvm_values(nodes)
 
 
 def _row(lower: Lowering, value: Value, number: ir.Value) -> Value:
@@ -141,8 +141,12 @@ def _row(lower: Lowering, value: Value, number: ir.Value) -> Value:
 
 
 def _laid_before(lower: Lowering, value: Value, *, indexed: bool) -> Value:
-    """Return what a loop reads, in memory where it is long or read row by row; for reading only."""
-    if isinstance(value, np.ndarray) and value.size and (value.size > SPILLED or indexed):
+    """Return an operand of a loop, in memory if it is long or read by row; for reading only."""
+    if (
+        isinstance(value, np.ndarray)
+        and value.size
+        and (value.size > MAX_CARRIED_IN_REGISTERS or indexed)
+    ):
         value = lower.readable(value)
     if isinstance(value, Memory) and value.storage.writable:
         if value.version != value.storage.version:
@@ -157,8 +161,8 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     body = p["jaxpr"]
     once = length == 1
     if not once:
-        operands = lower.computed(operands, consts)
-        lower.settle(before=True)
+        operands = lower.with_tangents_in_memory(operands, consts)
+        lower.write_queued(before=True)
     fixed = [_laid_before(lower, v, indexed=False) for v in operands[:consts]]
     rows = [_laid_before(lower, v, indexed=not once) for v in operands[consts + carried :]]
     given = [*fixed, *operands[consts : consts + carried], *rows]
@@ -186,8 +190,12 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
         now = [_row(lower, v, place) for v in rows]
         outs = lower.run(body.jaxpr, body.consts, [*fixed, *carry, *now])
         whole = [few is memory for memory, few in zip(into, collected, strict=True)]
-        with lower.holding(outs):
-            single = lower.computed(list(compress(outs[carried:], whole))) if any(whole) else []
+        with lower.keeping_alive(outs):
+            single = (
+                lower.with_tangents_in_memory(list(compress(outs[carried:], whole)))
+                if any(whole)
+                else []
+            )
             for memory, out in zip(compress(into, whole), single, strict=True):
                 lower.store_rows(memory, place, out)
         for few, out in zip(collected, outs[carried:], strict=True):
@@ -205,8 +213,8 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     start = operands[consts : consts + carried]
     if once:
         ends = turn(constant(I64, 0), start)
-        with lower.holding(ends):
-            lower.settle()
+        with lower.keeping_alive(ends):
+            lower.write_queued()
         return [*ends, *into]
     first, size = array_of([constant(I64, 0)], ()), lower.size(length)
     carry = _Carry(lower, [first, *start], [0, *kinds[:carried]], [*fixed, *rows])
@@ -214,7 +222,7 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     def again(inside: list[Value]) -> list[Value]:
         number = lower.elements(inside[0])[()]
         outs = turn(number, inside[1:])
-        following = carry.handed_on([array_of([b.add(number, constant(I64, 1))], ()), *outs])
+        following = carry.next_turn([array_of([b.add(number, constant(I64, 1))], ()), *outs])
         lay_full(number)
         return following
 
@@ -229,8 +237,8 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
 def _while(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> list[Value]:
     p = eqn.params
     conds, consts = p["cond_nconsts"], p["body_nconsts"]
-    operands = lower.computed(operands, conds + consts)
-    lower.settle(before=True)
+    operands = lower.with_tangents_in_memory(operands, conds + consts)
+    lower.write_queued(before=True)
     operands = [
         *(_laid_before(lower, v, indexed=False) for v in operands[: conds + consts]),
         *operands[conds + consts :],
@@ -251,9 +259,9 @@ def _while(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> l
     def turn(inside: list[Value]) -> list[Value]:
         outs = lower.run(p["body_jaxpr"].jaxpr, p["body_jaxpr"].consts, [*of_body, *inside])
         if not kind_of(going[0]):
-            return carry.handed_on(outs)
+            return carry.next_turn(outs)
         # lanes that have ended stay as they are
-        return carry.handed_on(
+        return carry.next_turn(
             [
                 lower.elementwise("select_n", {}, [going[0], old, new], new.shape)
                 for old, new in zip(inside, outs, strict=True)
@@ -268,8 +276,8 @@ def _cond(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> li
     which = lower.elements(operands[0])[()]
     rest = operands[1:]
     if is_vector(which) or not isinstance(which, ir.Constant):
-        rest = lower.computed(rest)
-    if is_vector(which):  # what one lane changes in place would change for all
+        rest = lower.with_tangents_in_memory(rest)
+    if is_vector(which):  # a change in place by one lane would be a change for all
         rest = [_laid_before(lower, v, indexed=False) for v in rest]
     kinds = [OF_LANE * is_vector(which)] * len(eqn.outvars)
     for branch in branches:
@@ -278,7 +286,9 @@ def _cond(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> li
     def result_of(branch: Any) -> list[Value]:
         outs = lower.run(branch.jaxpr, branch.consts, rest)
         return [
-            out if isinstance(out, Memory) and out.storage.writable else lower.promoted(out, kind)
+            out
+            if isinstance(out, Memory) and out.storage.writable
+            else lower.in_registers(out, kind)
             for out, kind in zip(outs, kinds, strict=True)
         ]
 
@@ -309,7 +319,7 @@ def _branched(
 ) -> list[Value]:
     """Compute one of two lists of values of the same kinds, by a branch."""
     b = lower.b
-    lower.settle(before=True)
+    lower.write_queued(before=True)
     before = [storage.version for storage in lower.storages]
     ends: list[_End] = []
     begins = [b.append_basic_block(name) for name in ("yes", "no")]
@@ -319,8 +329,8 @@ def _branched(
             storage.version = version
         b.position_at_end(begin)
         found = compute()
-        with lower.holding(found):
-            lower.settle()
+        with lower.keeping_alive(found):
+            lower.write_queued()
         ends.append(_End(found, b.block, [s.version for s in lower.storages]))
     stays = [
         isinstance(x, Memory) and isinstance(y, Memory) and x.storage is y.storage
@@ -337,7 +347,7 @@ def _branched(
         end.block = b.block
     taken: set[int] = set()
     merged: list[Any] = [
-        x if stay else _met_all(lower, x, y, taken)
+        x if stay else _slots_after(lower, x, y, taken)
         for x, y, stay in zip(ends[0].values, ends[1].values, stays, strict=True)
     ]
     after = b.append_basic_block("after")
@@ -350,7 +360,7 @@ def _branched(
             for to, element in zip(into.ravel(), value.ravel(), strict=True)
             if isinstance(to, Tangent) and to is not element
         ]
-        lower.flushed(outs)
+        lower.flush(outs)
         b.branch(after)
         end.block = b.block
     b.position_at_end(after)
@@ -362,15 +372,15 @@ def _branched(
     ]
 
 
-def _met_all(lower: Lowering, x: Any, y: Any, taken: set[int]) -> Elements:
+def _slots_after(lower: Lowering, x: Any, y: Any, taken: set[int]) -> Elements:
     pairs = zip(x.ravel(), y.ravel(), strict=True)
-    return array_of([_met(lower, *pair, taken) for pair in pairs], x.shape)
+    return array_of([_slot_after(lower, *pair, taken) for pair in pairs], x.shape)
 
 
-def _met(lower: Lowering, x: Any, y: Any, taken: set[int]) -> Any:
+def _slot_after(lower: Lowering, x: Any, y: Any, taken: set[int]) -> Any:
     """Return where a tangent of either branch lies; else nothing.
 
-    What a branch leaves where a loop carries it is changed there, if it is not asked for again.
+    A tangent that a loop carries is changed in place, if it is not read again.
     """
     if x is y or not isinstance(x, Tangent):
         return x if x is y else None
@@ -390,7 +400,7 @@ def _met(lower: Lowering, x: Any, y: Any, taken: set[int]) -> Any:
 
 @dataclass
 class _End:
-    """What a branch comes to, the block in which it ends, and how often memory was written to."""
+    """Results of a branch, the block in which it ends, and the versions of memory there."""
 
     values: list[Value]
     block: ir.Block
@@ -422,7 +432,7 @@ def _selected(
     result_of: Callable[[Any], list[Value]],
 ) -> list[Value]:
     """Compute the first branch, each other one where a lane asks for it, and select."""
-    chosen = lower.computed(result_of(branches[0]))
+    chosen = lower.with_tangents_in_memory(result_of(branches[0]))
     for number, branch in enumerate(branches[1:], start=1):
         flag = _is_number(lower, which, number, len(branches))
 

@@ -37,7 +37,7 @@ def called(params: Any) -> tuple[Jaxpr, Sequence[Any]]:
 def dependent(jaxpr: Jaxpr, flags: Sequence[int]) -> list[int]:
     """Return for each output whether it depends on a flagged input.
 
-    What decides a branch or the length of a loop counts too. A flag is a truth value, or a set of
+    The condition of a branch or of a loop counts too. A flag is a truth value, or a set of
     bits: then an output has the bits of all inputs that it depends on.
     """
     known = dict(zip(jaxpr.invars, flags, strict=True))

@@ -1,9 +1,9 @@
-"""What a program is made of, as a digest: equal digests stand for equal programs.
+"""Digests of programs: equal digests stand for equal programs.
 
 A function that jax traces is determined by the code that is run, by the layout of its arguments and
-by what it reads besides. A program whose digest is known is not traced again. So a digest is of
-everything, or there is none: of source files by their content, of values by what they hold, never
-by how they are printed; what cannot be told so has no digest.
+by the values that it closes over. A program whose digest is known is not traced again. So a digest
+covers everything, or there is none: source files by content, values by content and never by how
+they print.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _named(code: Any, packages: tuple[str, ...]) -> str:
 
 
 def _of_one(value: Any, packages: tuple[str, ...]) -> str:
-    """Return what tells a value that holds no others from all of its type."""
+    """Return a text that identifies a value without parts among those of its type."""
     if value is None or isinstance(value, bool | int | str):
         content = repr(value)
     elif isinstance(value, float):

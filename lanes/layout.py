@@ -18,7 +18,7 @@ from lanes.values import Memory, Storage, Value
 Length: TypeAlias = "int | str"
 Lengths: TypeAlias = Mapping[str, int]
 
-IN_REGISTERS = 64
+MAX_READ_AHEAD = 64
 """Numbers up to which an argument is read before anything is computed."""
 
 
@@ -56,7 +56,7 @@ class Argument:
 
 
 class _Frame(NamedTuple):
-    """What the function is called with, and what holds for the block of lanes under way.
+    """Arguments of the kernel, and the place of the block of lanes that it computes.
 
     A block takes some columns for each of its lanes. ``segment`` is whose results a lane computes,
     ``turn`` which column is its first; there are ``columns``.
@@ -75,7 +75,7 @@ class _Frame(NamedTuple):
 
 @dataclass(frozen=True)
 class Layout:
-    """What a kernel takes and returns.
+    """Arguments and results of a kernel.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Layout:
     outputs: Sequence[Any]
     moved: Sequence[int]
 
-    def written(self, closed: Any, width: int) -> str:
+    def module_text(self, closed: Any, width: int) -> str:
         """Return the module of a traced function, as text, for so many lanes at a time.
 
         Its function ``run`` takes tables of the addresses of arguments and results, the lengths,
@@ -164,7 +164,7 @@ class Layout:
                 for var, memory in zip(closed.jaxpr.outvars, memories, strict=True)
                 if not isinstance(var, Literal)
             }
-            taking = self._taken(lower, frame, closed.jaxpr.invars)
+            taking = self._arguments(lower, frame, closed.jaxpr.invars)
             results = lower.run(closed.jaxpr, closed.consts, taking, bound)
             for result, memory in zip(results, memories, strict=True):
                 if isinstance(result, Memory) and result.storage is memory.storage:
@@ -176,7 +176,7 @@ class Layout:
         stack.branch(body)
         return str(module)
 
-    def _taken(self, lower: Lowering, frame: _Frame, variables: Sequence[Any]) -> list[Value]:
+    def _arguments(self, lower: Lowering, frame: _Frame, variables: Sequence[Any]) -> list[Value]:
         """Return the arguments, and the tangents behind them: short ones in registers."""
         count = len(self.arguments)
         taking = [*self.arguments, *(self.arguments[number] for number in self.moving)]
@@ -197,7 +197,7 @@ class Layout:
                 begins=lower.begins([(frame.segment, column)]) if apart else None,
             )
             memory = Memory(storage, shape)
-            values.append(lower.elements(memory) if prod(shape) <= IN_REGISTERS else memory)
+            values.append(lower.elements(memory) if prod(shape) <= MAX_READ_AHEAD else memory)
         return values
 
     def _results(self, lower: Lowering, frame: _Frame) -> list[Memory]:

@@ -1,6 +1,7 @@
-"""A jaxpr written as instructions: what moves elements about, and what reads and writes memory.
+"""A jaxpr written as instructions, and how they read and write memory.
 
-`lanes.rules` has the elementwise primitives, `lanes.control` loops and conditions.
+`lanes.rules` has the elementwise primitives, `lanes.structural` those that move elements,
+`lanes.control` loops and conditions.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import replace
 from functools import reduce
 from itertools import product
 from math import gcd, prod
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -52,19 +53,19 @@ from lanes.values import (
 )
 
 I64 = ir.IntType(64)
-FEW = 512
+MAX_IN_REGISTERS = 512
 """Elements up to which an array may lie in registers."""
-MOST_COLUMNS = 15
-"""Columns that a block of lanes takes at most; odd, for what lies an even number of lines apart
+MAX_COLUMNS = 15
+"""Columns that a block of lanes takes at most; odd, for numbers an even number of lines apart
 meets in a few sets of the cache."""
-FEWEST = 2
+MIN_SKIPPED_SUMS = 2
 """Sums from which it is asked whether a number moves before it is added to them."""
-SPILLED = 24
+MAX_CARRIED_IN_REGISTERS = 24
 """Elements above which an array that enters a loop is laid in memory."""
 
 
 class Lowering:
-    """Writes one function; holds what all its primitives need.
+    """Writes one function; holds the state that all primitives share.
 
     Parameters
     ----------
@@ -89,13 +90,13 @@ class Lowering:
         self._column: ir.Value | None = None
         """The number of the column that is computed."""
         self._alive: list[dict[Any, Value]] = []
-        """What is asked for later, by the jaxprs that are under way."""
+        """Values that are read later, by each jaxpr under way."""
         self.carried: list[set[Storage]] = []
         """Where the loops that are under way carry tangents."""
         self._queue: list[tuple[Element, Tangent]] = []
-        """What is to be written where, with what is computed next."""
+        """Tangents to be written, with the place of each, by the next loop over columns."""
         self._pending: dict[int, list[Tangent]] = {}
-        """What is read of memory that may change."""
+        """Reads of memory that may change before they are computed."""
         self.storages: list[Storage] = []
         """All that is written to."""
 
@@ -138,7 +139,7 @@ class Lowering:
         return any(node.operands[0] is storage for node in self._held().values())
 
     def _held(self) -> dict[int, Tangent]:
-        """Return tangents' numbers that are asked for later, and what they are computed of."""
+        """Return the tangents that are read later, and their operands, by number."""
         left: list[Any] = [v for values in self._alive for v in values.values()]
         seen: dict[int, Tangent] = {}
         while left:
@@ -167,7 +168,7 @@ class Lowering:
         kind = type_of(array.dtype)
         if array.dtype == jax.dtypes.float0:
             array = np.zeros(array.shape, bool)
-        if array.size > FEW:
+        if array.size > MAX_IN_REGISTERS:
             return self._laid_out(array, kind)
         return array_of([self._number(kind, x) for x in array.ravel().tolist()], array.shape)
 
@@ -252,14 +253,16 @@ class Lowering:
             to = name == "convert_element_type"
             kind = type_of(params["new_dtype"]) if to else moving[0].kind
             return Tangent(kind, name, params, elements)
-        own = 1 if name == "select_n" else 0  # what chooses need not be what is chosen from
+        own = (
+            1 if name == "select_n" else 0
+        )  # the condition may be of another width than the choices
         return rule(self.e, params, *elements[:own], *self.e.alike(*elements[own:]))
 
     def is_long(self, shape: Sequence[int]) -> bool:
         """Return whether an array of a shape does not lie in registers."""
-        return prod(shape) > FEW
+        return prod(shape) > MAX_IN_REGISTERS
 
-    def where_read(
+    def deferred(
         self, shape: Sequence[int], at: Callable[[Index], Element], sources: Sequence[Value]
     ) -> Value:
         """Return an array whose elements are computed where they are read; now, if it is short."""
@@ -284,7 +287,7 @@ class Lowering:
         """Return a whole number as an index."""
         return converted(self.e, number, I64)
 
-    def promoted(self, value: Value, kind: int) -> Elements:
+    def in_registers(self, value: Value, kind: int) -> Elements:
         """Return an array in registers, of every lane and of every column if it is to be."""
 
         def of(element: Element) -> Element:
@@ -298,15 +301,15 @@ class Lowering:
 
     # tangents
 
-    def flushed(
+    def flush(
         self,
         outs: Sequence[tuple[Element, Callable[[ir.Value], None]]],
         changed: Set[int] = frozenset(),
     ) -> None:
         """Compute tangents' numbers, column by column, and hand them on.
 
-        With them is written what is to be written; what is asked for of memory that changes so, or
-        is ``changed`` next, is kept before.
+        Queued tangents are written in the same loop. Reads of memory that changes so, or is
+        ``changed`` next, are copied before if they are needed later.
         """
         changed = changed | {id(to.operands[0]) for _, to in self._queue}
         held = self._held() if changed & self._pending.keys() else {}
@@ -356,19 +359,21 @@ class Lowering:
     def _begun(
         self, graph: Graph, factors: Mapping[Any, ir.Value]
     ) -> dict[Node, tuple[ir.Value, Set[Node]]]:
-        """Begin sums with what moves in a few columns; return them, and what is in them.
+        """Begin sums with the terms that move in few columns; return the sums and those terms.
 
         Where it does not move in a column, nothing is computed of it there.
         """
         begun: dict[Node, tuple[ir.Value, Set[Node]]] = {}
         for node in graph.nodes:
             sums = [reader for reader in node.readers if reader.terms is not None]
-            if not node.is_told or len(sums) < FEWEST:
+            if not node.has_column_flags or len(sums) < MIN_SKIPPED_SUMS:
                 continue
             for reader in sums:
                 if reader not in begun:
                     first = next(iter(reader.sum))
-                    ready = reader.sum[first] == 1.0 and first.is_read and not first.is_told
+                    ready = (
+                        reader.sum[first] == 1.0 and first.is_read and not first.has_column_flags
+                    )
                     begun[reader] = (
                         (self._number_of(first), {first})
                         if ready
@@ -419,27 +424,27 @@ class Lowering:
         part = number if factor == 1.0 else self.apply("mul", {}, number, value)
         return part if total is None else self.apply("add", {}, total, part)
 
-    def settle(self, *, before: bool = False) -> None:
-        """Write what is to be written; before loops and branches read what they may change."""
-        self.flushed([], changed=set(self._pending) if before else set())
+    def write_queued(self, *, before: bool = False) -> None:
+        """Write queued tangents; before loops and branches, copy reads that they may change."""
+        self.flush([], changed=set(self._pending) if before else set())
 
     @contextmanager
-    def holding(self, values: Sequence[Value]) -> Iterator[None]:
+    def keeping_alive(self, values: Sequence[Value]) -> Iterator[None]:
         """Know that values are asked for later."""
         self._alive.append(dict(enumerate(values)))
         yield
         self._alive.pop()
 
-    def slot(self, kind: ir.Type, *, tells: bool = False) -> Tangent:
+    def slot(self, kind: ir.Type, *, flags_columns: bool = False) -> Tangent:
         """Return a tangent's number that lies in memory of its own; it tells where it moves."""
         storage = self.local((), kind, OF_LANE | OF_COLUMN).storage
         storage.writable = False
-        if tells:
-            storage.moves = self._allocate(ir.IntType(8), MOST_COLUMNS)
+        if flags_columns:
+            storage.moves = self._allocate(ir.IntType(8), MAX_COLUMNS)
         return Tangent(kind, READ, {}, (storage,))
 
     def into(self, slot: Tangent) -> Callable[[ir.Value], None]:
-        """Return what writes a column where a tangent's number lies."""
+        """Return a function that writes one column of a tangent into its memory."""
         storage, *index = slot.operands
 
         def write(value: ir.Value) -> None:
@@ -451,7 +456,7 @@ class Lowering:
 
         return write
 
-    def computed(self, values: Sequence[Value], fixed: int = 0) -> list[Value]:
+    def with_tangents_in_memory(self, values: Sequence[Value], fixed: int = 0) -> list[Value]:
         """Return arrays whose tangents lie in memory: those that do not are computed now.
 
         The first so many stay as they are while others change, and tell in which columns they move.
@@ -459,24 +464,24 @@ class Lowering:
         known: dict[int, Tangent] = {}
         outs = []
 
-        def of(element: Element, *, tells: bool) -> Element:
+        def of(element: Element, *, flags_columns: bool) -> Element:
             if not isinstance(element, Tangent):
                 return element
             told = element.is_read and element.operands[0].moves is not None
-            if element.is_read and not element.operands[0].writable and told >= tells:
+            if element.is_read and not element.operands[0].writable and told >= flags_columns:
                 return element
             if element.number not in known:
-                known[element.number] = self.slot(element.kind, tells=tells)
+                known[element.number] = self.slot(element.kind, flags_columns=flags_columns)
                 outs.append((element, self.into(known[element.number])))
             return known[element.number]
 
         found = [
-            array_of([of(e, tells=place < fixed) for e in v.ravel()], v.shape)
+            array_of([of(e, flags_columns=place < fixed) for e in v.ravel()], v.shape)
             if isinstance(v, np.ndarray)
             else v
             for place, v in enumerate(values)
         ]
-        self.flushed(outs)
+        self.flush(outs)
         return found
 
     # memory
@@ -487,10 +492,11 @@ class Lowering:
         strides: list[ir.Value] = []
         for length in reversed(shape):
             strides.insert(0, stride)
-            stride = self._product(stride, self.size(length))
+            stride = self.product_of(stride, self.size(length))
         return tuple(strides)
 
-    def _product(self, first: ir.Value, second: ir.Value) -> ir.Value:
+    def product_of(self, first: ir.Value, second: ir.Value) -> ir.Value:
+        """Return a product of two indices, a constant if both are."""
         if isinstance(first, ir.Constant) and isinstance(second, ir.Constant):
             return constant(I64, first.constant * second.constant)
         return self.b.mul(first, second)
@@ -512,7 +518,7 @@ class Lowering:
         if storage.column_stride is None:
             return self._read_number(storage, index)
         if any(to.operands[0] is storage for _, to in self._queue):
-            self.settle()
+            self.write_queued()
         node = Tangent(storage.kind, READ, {}, (storage, *index))
         if storage.writable:
             self._pending.setdefault(id(storage), []).append(node)
@@ -524,11 +530,11 @@ class Lowering:
                 raise UnsupportedError("an index of each lane's own where lanes lie apart")
             return self._gathered(storage, index)
         if storage.begins:
-            return self._collected(storage, index, 1)[0]
+            return self.read_row(storage, index, 1)[0]
         place = self._place(storage, index)
         return self._read_at(storage, place, wide=storage.lane_stride is not None)
 
-    def _collected(self, storage: Storage, index: Index, count: int) -> list[ir.Value]:
+    def read_row(self, storage: Storage, index: Index, count: int) -> list[ir.Value]:
         """Read so many numbers that lie side by side in each lane's part."""
         place, width = self._place(storage, index), self.e.width
         lanes = self._parts(storage, place)
@@ -569,7 +575,7 @@ class Lowering:
                 own = [self.b.extract_element(i, number) for i in index]
                 place = self._place(storage, own)
                 if storage.lane_stride is not None:
-                    step = self._product(storage.lane_stride, constant(I64, lane))
+                    step = self.product_of(storage.lane_stride, constant(I64, lane))
                     place = self.b.add(place, step)
                 one = self._read_at(storage, place, wide=False)
                 result = self.b.insert_element(result, one, number)
@@ -597,16 +603,17 @@ class Lowering:
     def _place(self, storage: Storage, index: Index) -> ir.Value:
         place = constant(I64, 0)
         for i, stride in zip(index, storage.strides, strict=True):
-            place = self._sum(place, self._product(self.as_index(i), stride))
+            place = self.sum_of(place, self.product_of(self.as_index(i), stride))
         if storage.first_lane is not None and not storage.begins:
             assert storage.lane_stride is not None
-            place = self._sum(place, self._product(storage.first_lane, storage.lane_stride))
+            place = self.sum_of(place, self.product_of(storage.first_lane, storage.lane_stride))
         if storage.column_stride is not None:
             assert self._column is not None
-            place = self.b.add(place, self._product(storage.column_stride, self._column))
+            place = self.b.add(place, self.product_of(storage.column_stride, self._column))
         return place
 
-    def _sum(self, first: ir.Value, second: ir.Value) -> ir.Value:
+    def sum_of(self, first: ir.Value, second: ir.Value) -> ir.Value:
+        """Return a sum of two indices, a constant if both are."""
         if isinstance(first, ir.Constant):
             if first.constant == 0:
                 return second
@@ -659,9 +666,9 @@ class Lowering:
         storage, first = memory.storage, constant(I64, 0)
         guard, own = storage.guard, storage.strides if number is None else storage.strides[1:]
         if guard is not None:
-            self.settle()
+            self.write_queued()
         if storage.begins and number is not None:
-            first = self._product(number, storage.strides[0])
+            first = self.product_of(number, storage.strides[0])
         with nullcontext() if guard is None else self.b.if_then(guard):
             if storage.begins and not isinstance(rows, np.ndarray) and self.is_long(rows.shape):
 
@@ -673,7 +680,9 @@ class Lowering:
                         ],
                         rows.shape[1:],
                     )
-                    self._scatter(storage, self._sum(first, self._product(index[0], own[0])), part)
+                    self._scatter(
+                        storage, self.sum_of(first, self.product_of(index[0], own[0])), part
+                    )
 
                 self.for_each(rows.shape[:1], row)
                 return
@@ -687,7 +696,7 @@ class Lowering:
                 places.append((index if number is None else [number, *index], given[place]))
             self.store(memory, places)
             if guard is not None:
-                self.settle()
+                self.write_queued()
 
     def _scatter(self, storage: Storage, first: ir.Value, given: Elements) -> None:
         """Write numbers of an output that lie side by side, from ``first``, in each lane's part."""
@@ -703,10 +712,10 @@ class Lowering:
             parts.append(value)
             if len(parts) == len(elements):
                 assert self._column is not None
-                step = self._product(storage.column_stride, self._column)
-                self._lay_all(storage, self._sum(first, step), parts)
+                step = self.product_of(storage.column_stride, self._column)
+                self._lay_all(storage, self.sum_of(first, step), parts)
 
-        self.flushed([(e, lay) for e in elements])
+        self.flush([(e, lay) for e in elements])
 
     def _lay_all(self, storage: Storage, first: ir.Value, parts: list[ir.Value]) -> None:
         """Write numbers side by side in each lane's part."""
@@ -765,7 +774,7 @@ class Lowering:
             storage,
             pointer=self._allocate(
                 stored,
-                rows * size * width * (1 if storage.column_stride is None else MOST_COLUMNS),
+                rows * size * width * (1 if storage.column_stride is None else MAX_COLUMNS),
             ),
             strides=self.row_major((rows, *shape), constant(I64, width)),
             lane_stride=constant(I64, 1),
@@ -779,16 +788,16 @@ class Lowering:
         """Write so many rows that were collected where a first one belongs."""
         storage, collected = memory.storage, rows.storage
         size = constant(I64, collected.strides[0].constant // self.e.width)
-        into = self.b.gep(storage.pointer, [self._product(first, storage.strides[0])])
-        length, begins = self._product(count, size), storage.begins
+        into = self.b.gep(storage.pointer, [self.product_of(first, storage.strides[0])])
+        length, begins = self.product_of(count, size), storage.begins
 
         def lay(into: ir.Value, rows: ir.Value) -> None:
             self.b.call(self._laying(into.type), [into, begins, rows, length])
 
         def of_column(number: ir.Value) -> None:
             lay(
-                self.b.gep(into, [self._product(storage.column_stride, number)]),
-                self.b.gep(collected.pointer, [self._product(collected.column_stride, number)]),
+                self.b.gep(into, [self.product_of(storage.column_stride, number)]),
+                self.b.gep(collected.pointer, [self.product_of(collected.column_stride, number)]),
             )
 
         with nullcontext() if storage.guard is None else self.b.if_then(storage.guard):
@@ -857,7 +866,7 @@ class Lowering:
             raise UnsupportedError(f"an array of shape {shape} that is no output")
         count, stored = prod(shape), ir.IntType(8) if number == BOOL else number
         width = self.e.width if kind & OF_LANE else 1
-        total = count * width * (MOST_COLUMNS if kind & OF_COLUMN else 1)
+        total = count * width * (MAX_COLUMNS if kind & OF_COLUMN else 1)
         unit = constant(I64, width)
         storage = Storage(
             pointer=self._allocate(stored, total),
@@ -877,10 +886,10 @@ class Lowering:
         if all(isinstance(e, ir.Constant) and not is_vector(e) and e.type != BOOL for e in flat):
             numbers = np.array([e.constant for e in flat]).reshape(elements.shape)
             return self._laid_out(numbers, flat[0].type)
-        return self.spilled(elements)
+        return self.copied_to_memory(elements)
 
-    def spilled(self, value: Value, kind: int = 0) -> Memory:
-        """Return an array as memory of this lowering's own, a copy of what lies elsewhere."""
+    def copied_to_memory(self, value: Value, kind: int = 0) -> Memory:
+        """Return a copy of an array in memory on the stack."""
         if not isinstance(value, np.ndarray):
             return self._copied(value, kind)
         memory = self.local(value.shape, _type_in(value), kind | kind_of(value))
@@ -917,11 +926,11 @@ class Lowering:
         self, begin: ir.Value, end: ir.Value, step: int, body: Callable[[ir.Value], None]
     ) -> None:
         """Write a loop over numbers from one to before another."""
-        self.settle()
+        self.write_queued()
 
         def turn(carried: Sequence[ir.Value]) -> list[ir.Value]:
             body(carried[0])
-            self.settle()
+            self.write_queued()
             return [self.b.add(carried[0], constant(I64, step))]
 
         self.loop([begin], lambda carried: self.b.icmp_signed("<", carried[0], end), turn)
@@ -995,221 +1004,8 @@ def _bytes(kind: ir.Type) -> int:
     return 8 if isinstance(kind, ir.DoubleType) else 4
 
 
-# primitives that move elements
-
-Structural = Callable[[Lowering, JaxprEqn, list[Value]], "Value | list[Value]"]
-
-
-def _broadcast_in_dim(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    shape, kept = eqn.params["shape"], eqn.params["broadcast_dimensions"]
-    value = operands[0] if lower.is_long(shape) else lower.elements(operands[0])
-
-    def at(index: Index) -> Element:
-        own = [
-            constant(I64, 0) if length == 1 else index[axis]
-            for axis, length in zip(kept, value.shape, strict=True)
-        ]
-        return lower.at(value, own)
-
-    return lower.where_read(shape, at, (value,))
-
-
-def _reshape(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    (value,), shape = operands, shape_of(eqn.outvars[0])
-    if not lower.is_long(shape):
-        return lower.elements(value).reshape(shape)
-    if [n for n in shape if n != 1] != [n for n in value.shape if n != 1]:
-        raise UnsupportedError(f"reshape of {value.shape} to {shape}")
-
-    def at(index: Index) -> Element:
-        own = iter([i for i, n in zip(index, shape, strict=True) if n != 1])
-        return lower.at(value, [constant(I64, 0) if n == 1 else next(own) for n in value.shape])
-
-    return Deferred(tuple(shape), at, (value,))
-
-
-def _concatenate(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    axis, shape = eqn.params["dimension"], shape_of(eqn.outvars[0])
-    if not lower.is_long(shape):
-        return np.concatenate([lower.elements(o) for o in operands], axis=axis)
-    firsts = np.cumsum([0, *(o.shape[axis] for o in operands)]).tolist()
-
-    def at(index: Index) -> Element:
-        """Read every part at the place nearest to the one asked for, and choose."""
-        number, chosen = lower.as_index(index[axis]), None
-        for operand, first in zip(operands, firsts, strict=False):
-            own = lower.b.sub(number, lower.e.number(number, first))
-            own = lower.start_within(own, operand.shape[axis], 1)
-            read = lower.at(operand, [*index[:axis], own, *index[axis + 1 :]])
-            if chosen is None:
-                chosen = read
-                continue
-            behind = lower.b.icmp_signed(">=", number, lower.e.number(number, first))
-            chosen = lower.apply("select_n", {}, behind, chosen, read)
-        return chosen
-
-    return Deferred(shape, at, tuple(operands))
-
-
-def _slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    (value,), p = operands, eqn.params
-    strides = p["strides"] or (1,) * len(value.shape)
-
-    def at(index: Index) -> Element:
-        moved = [
-            lower._sum(
-                constant(I64, start), lower._product(lower.as_index(i), constant(I64, stride))
-            )
-            for i, start, stride in zip(index, p["start_indices"], strides, strict=True)
-        ]
-        return lower.at(value, moved)
-
-    return lower.where_read(shape_of(eqn.outvars[0]), at, (value,))
-
-
-def _pad(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    given, filling = lower.elements(operands[0]), lower.elements(operands[1])[()]
-    shape = shape_of(eqn.outvars[0])
-    padded = array_of([filling] * prod(shape), shape)
-    for place in np.ndindex(given.shape):
-        to = [
-            low + i * (interior + 1)
-            for i, (low, _, interior) in zip(place, eqn.params["padding_config"], strict=True)
-        ]
-        if all(0 <= i < n for i, n in zip(to, shape, strict=True)):
-            padded[tuple(to)] = given[place]
-    return padded
-
-
-def _iota(lower: Lowering, eqn: JaxprEqn, _: list[Value]) -> Value:
-    shape, axis = eqn.params["shape"], eqn.params["dimension"]
-    kind = type_of(eqn.params["dtype"])
-
-    def at(index: Index) -> Element:
-        return converted(lower.e, lower.as_index(index[axis]), kind)
-
-    if lower.is_long(shape):
-        return Deferred(tuple(shape), at)
-    numbers = [constant(kind, place[axis]) for place in np.ndindex(*shape)]
-    return array_of(numbers, shape)
-
-
-def _reduce(name: str) -> Structural:
-    def rule(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-        given, axes = lower.elements(operands[0]), eqn.params["axes"]
-        kept = [axis for axis in range(given.ndim) if axis not in axes]
-        shape = [given.shape[axis] for axis in kept]
-        rows = given.transpose([*kept, *axes]).reshape(prod(shape), -1)
-        if rows.shape[1] == 0:
-            raise UnsupportedError(f"{eqn.primitive.name} over nothing")
-        return array_of(
-            [reduce(lambda x, y: lower.apply(name, {}, x, y), list(row)) for row in rows], shape
-        )
-
-    return rule
-
-
-def _dot_general(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    (left_sum, right_sum), (left_batch, right_batch) = eqn.params["dimension_numbers"]
-    left, right = map(lower.elements, operands)
-
-    def rows(array: Elements, batch: Sequence[int], summed: Sequence[int]) -> Elements:
-        free = [a for a in range(array.ndim) if a not in (*batch, *summed)]
-        lengths = [prod(array.shape[a] for a in group) for group in (batch, free, summed)]
-        return array.transpose([*batch, *free, *summed]).reshape(lengths)
-
-    first, second = rows(left, left_batch, left_sum), rows(right, right_batch, right_sum)
-
-    def dot(x: Elements, y: Elements) -> Element:
-        products = [lower.apply("mul", {}, a, b) for a, b in zip(x, y, strict=True)]
-        return reduce(lambda a, b: lower.apply("add", {}, a, b), products)
-
-    found = [dot(x, y) for xs, ys in zip(first, second, strict=True) for x in xs for y in ys]
-    return array_of(found, shape_of(eqn.outvars[0]))
-
-
-def _dynamic_slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    value, sizes = operands[0], eqn.params["slice_sizes"]
-    starts = [
-        lower.start_within(lower.elements(s)[()], length, size)
-        for s, length, size in zip(operands[1:], value.shape, sizes, strict=True)
-    ]
-    if isinstance(value, np.ndarray) and not all(isinstance(s, ir.Constant) for s in starts):
-        value = lower.readable(value)
-    if isinstance(value, Memory) and value.storage.begins and prod(sizes[:-1]) == 1:
-        return array_of(lower._collected(value.storage, starts, sizes[-1]), sizes)
-    found = [
-        lower.at(
-            value, [lower._sum(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]
-        )
-        for place in np.ndindex(*sizes)
-    ]
-    return array_of(found, sizes)
-
-
-def _dynamic_update_slice(lower: Lowering, _: JaxprEqn, operands: list[Value]) -> Value:
-    value, update = operands[0], lower.elements(operands[1])
-    starts = [
-        lower.start_within(lower.elements(s)[()], length, size)
-        for s, length, size in zip(operands[2:], value.shape, update.shape, strict=True)
-    ]
-    if isinstance(value, np.ndarray) and all(isinstance(s, ir.Constant) for s in starts):
-        changed = value.copy()
-        for place in np.ndindex(update.shape):
-            to = tuple(i + s.constant for i, s in zip(place, starts, strict=True))
-            changed[to] = update[place]
-        return changed
-    if not isinstance(value, Memory) or not value.storage.writable:
-        value = lower.spilled(value, kind_of(update))
-    if any(map(is_vector, starts)):
-        raise UnsupportedError("a change in place at an index of each lane's own")
-    if value.version != value.storage.version:
-        raise UnsupportedError("an array that is changed after it was changed in place")
-    places = []
-    for place in np.ndindex(update.shape):
-        at = [lower._sum(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]
-        places.append((at, update[place]))
-    lower.store(value, places)
-    value.storage.version += 1
-    return Memory(value.storage, value.shape, value.storage.version)
-
-
-STRUCTURAL: dict[str, Structural] = {
-    "broadcast_in_dim": _broadcast_in_dim,
-    "reshape": _reshape,
-    "squeeze": _reshape,
-    "expand_dims": _reshape,
-    "transpose": lambda lower, eqn, operands: lower.elements(operands[0]).transpose(
-        eqn.params["permutation"]
-    ),
-    "concatenate": _concatenate,
-    "stack": lambda lower, eqn, operands: np.stack(
-        [lower.elements(o) for o in operands], axis=eqn.params.get("axis", 0)
-    ),
-    "slice": _slice,
-    "split": lambda lower, eqn, operands: list[Value](
-        np.split(
-            lower.elements(operands[0]),
-            np.cumsum(eqn.params["sizes"])[:-1],
-            axis=eqn.params["axis"],
-        )
-    ),
-    "rev": lambda lower, eqn, operands: np.flip(
-        lower.elements(operands[0]), eqn.params["dimensions"]
-    ),
-    "pad": _pad,
-    "iota": _iota,
-    "reduce_sum": _reduce("add"),
-    "reduce_max": _reduce("max"),
-    "reduce_min": _reduce("min"),
-    "reduce_prod": _reduce("mul"),
-    "reduce_or": _reduce("or"),
-    "reduce_and": _reduce("and"),
-    "dot_general": _dot_general,
-    "dynamic_slice": _dynamic_slice,
-    "dynamic_update_slice": _dynamic_update_slice,
-}
-"""Primitive -> rule, for those that move elements or gather them."""
-
+Rule: TypeAlias = Callable[["Lowering", JaxprEqn, list[Value]], "Value | list[Value]"]
+STRUCTURAL: dict[str, Rule] = {}
+"""Primitives that move elements or gather them, which `lanes.structural` fills in."""
 CONTROL: dict[str, Callable[..., list[Value]]] = {}
 """Loops and conditions, which `lanes.control` fills in."""

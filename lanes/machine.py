@@ -1,4 +1,4 @@
-"""LLVM on this machine: modules into object code, kept on disk by what they are made of."""
+"""LLVM on this machine: modules into object code, cached on disk by content."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ import llvmlite.binding as llvm
 
 logger = logging.getLogger(__name__)
 
-MOST = 256 * 2**20
+MAX_CODE_BYTES = 256 * 2**20
 """bytes of object code that are kept; the longest unused goes first."""
 _BYTES_OF_DIGEST = 32
 UNOPTIMISED = "LANES_UNOPTIMISED"
-"""An environment variable: where it is set, LLVM optimises nothing, which builds in half the time
-what runs more slowly and fuses no product with a sum, and one kernel serves few lanes and many."""
+"""An environment variable: where it is set, LLVM optimises nothing: kernels build in half the
+time, run more slowly, fuse no product with a sum, and one kernel serves few lanes and many."""
 
 _SCHEDULERS = ("fast", "default")
 """How LLVM orders the instructions that it selects where nothing is optimised, and where it is.
@@ -115,8 +115,8 @@ def _compiled(text: str) -> bytes:
     return code
 
 
-def kept(key: str, made: Callable[[], bytes]) -> bytes:
-    """Return what a key stands for on this machine: as it is kept, or made now and kept."""
+def load_or_make(key: str, made: Callable[[], bytes]) -> bytes:
+    """Return the content for a key on this machine, from the cache or made now and cached."""
     if not _folder:
         return made()
     digest = hashlib.sha256(f"{_machine_name()}\n{key}".encode()).hexdigest()
@@ -129,12 +129,12 @@ def kept(key: str, made: Callable[[], bytes]) -> bytes:
 
 
 def object_code(text: str) -> bytes:
-    """Return the object code of a module's text, compiled or as it is kept."""
-    return kept(text, lambda: _compiled(text))
+    """Return the object code of a module's text, compiled or from the cache."""
+    return load_or_make(text, lambda: _compiled(text))
 
 
 def _read(path: Path) -> bytes | None:
-    """Return what a file holds behind its digest; None if there is none or it is damaged."""
+    """Return the content of a file behind its digest; None if it is missing or damaged."""
     try:
         held = path.read_bytes()
         os.utime(path)
@@ -163,7 +163,7 @@ def _write(path: Path, code: bytes) -> None:
 
 
 def _bound(folder: Path) -> None:
-    """Remove what was not used for longest, down to `MOST` bytes."""
+    """Remove the least recently used files, down to `MAX_CODE_BYTES` bytes."""
     found = []
     for path in folder.glob("*.o"):
         with suppress(OSError):
@@ -171,7 +171,7 @@ def _bound(folder: Path) -> None:
             found.append((state.st_mtime, state.st_size, path))
     total = sum(size for _, size, _ in found)
     for _, size, path in sorted(found):
-        if total <= MOST:
+        if total <= MAX_CODE_BYTES:
             break
         with suppress(OSError):
             path.unlink()

@@ -23,12 +23,13 @@ from jax.interpreters import partial_eval
 from jax.tree_util import PyTreeDef, default_registry
 from numpy.typing import NDArray
 
-import lanes.control  # noqa: F401 (fills in the rules of loops)
+import lanes.control
+import lanes.structural  # noqa: F401 (both fill in rules)
 from lanes.dependence import dependent
 from lanes.digest import UnknownError, digest_of
 from lanes.layout import Argument, Layout, Lengths, is_laid_by_loop
-from lanes.lowering import MOST_COLUMNS
-from lanes.machine import Code, keep_code_in, kept, object_code, optimises, register_bytes
+from lanes.lowering import MAX_COLUMNS
+from lanes.machine import Code, keep_code_in, load_or_make, object_code, optimises, register_bytes
 from lanes.values import UnsupportedError
 
 __all__ = ["Argument", "Program", "Run", "joined", "keep_code_in", "program_of"]
@@ -40,32 +41,32 @@ _STAND_INS = (
     1_000_133, 1_000_151, 1_000_159, 1_000_171, 1_000_183, 1_000_187, 1_000_193, 1_000_199,
 )  # fmt: skip
 """Lengths under which a function is traced; no number of a program is likely to be one of them."""
-BUILT = "/lanes/build_duration"
-"""What `jax.monitoring` calls the end of building a kernel, once it is traced."""
-FALLBACK = "/lanes/fallback"
-"""What it calls that a program has no kernel, and why."""
-TASKS_A_CORE = 4
+BUILD_EVENT = "/lanes/build_duration"
+"""The event of `jax.monitoring` at the end of building a kernel, once it is traced."""
+FALLBACK_EVENT = "/lanes/fallback"
+"""The event of a program that has no kernel, with the reason."""
+TASKS_PER_CORE = 4
 """Pieces of work a core: their sizes differ."""
-WASTE = 0.15
+MAX_EMPTY_LANES = 0.15
 """Share of lanes left empty from which blocks take several turns of columns."""
-REPEATED = 2**27
+MAX_REPEATED_BYTES = 2**27
 """bytes of arguments up to which they are laid out once for every pass."""
-ONE_BY_ONE = 64
+MAX_LANES_COPIED_SINGLY = 64
 """Lanes up to which they are copied one after the other."""
-IN_CACHE = 2**18
+CACHE_BYTES = 2**18
 """bytes that are laid out at a time."""
-MANY = 256
+MIN_LANES_OF_TWO_VECTORS = 256
 """Lanes from which a block without columns is two vectors wide, where LLVM optimises: one computes
 while one waits."""
-FORWARD = 3
+COLUMNS_OF_VALUES = 3
 """Columns that take as long as the values and the factors that columns share."""
-FEW = 512
+MAX_BLOCKS_ON_ONE_THREAD = 512
 """Blocks without a loop that are computed sooner than another thread begins."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a program returns.
+    """Results of a program.
 
     Attributes
     ----------
@@ -165,15 +166,13 @@ class Program:
             with suppress(UnknownError):
                 self.key = digest_of((made_of, arguments), packages)
 
-    # what is computed
-
-    def _pushed(self, lengths: Lengths) -> Callable[..., Any]:
+    def _with_tangents(self, lengths: Lengths) -> Callable[..., Any]:
         """Return the function of flat arguments and tangents, or of arguments alone."""
 
         def flown(*leaves: Any) -> Any:
             return self.function(jax.tree.unflatten(self.structure, leaves), lengths)
 
-        def pushed(leaves: Sequence[Any], tangents: Sequence[Any]) -> Any:
+        def with_tangents(leaves: Sequence[Any], tangents: Sequence[Any]) -> Any:
             def of_moving(*moved: Any) -> Any:
                 whole = list(leaves)
                 for number, leaf in zip(self.moving, moved, strict=True):
@@ -182,14 +181,14 @@ class Program:
 
             given = [leaves[number] for number in self.moving]
             found, moved = jax.jvp(of_moving, given, list(tangents))
-            # what is no real number has no derivative
+            # integers and truth values have no derivative
             return found, jax.tree.map(
                 lambda t: jnp.zeros(()) if t.dtype == jax.dtypes.float0 else t, moved
             )
 
         if not self.moving:
             return lambda leaves, _: flown(*leaves)
-        return pushed
+        return with_tangents
 
     def _shaped(self, argument: Argument, lengths: Lengths) -> jax.ShapeDtypeStruct:
         shape = tuple(lengths[n] if isinstance(n, str) else n for n in argument.shape)
@@ -201,8 +200,10 @@ class Program:
         lengths = self.stand_ins
         given = [self._shaped(a, lengths) for a in self.arguments]
         tangents = [given[number] for number in self.moving]
-        closed, shapes = jax.make_jaxpr(self._pushed(lengths), return_shape=True)(given, tangents)
-        # what a loop computes and nobody reads is neither lowered nor in need of a rule
+        closed, shapes = jax.make_jaxpr(self._with_tangents(lengths), return_shape=True)(
+            given, tangents
+        )
+        # unread results of loops are not lowered and need no rule
         used = [True] * len(closed.jaxpr.outvars)
         jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, used, instantiate=True)
         return closed.replace(jaxpr=jaxpr), shapes, lengths
@@ -214,7 +215,7 @@ class Program:
 
     def _kernel(self, lanes: int = 1) -> _Compiled | None:
         """Return the kernel for so many lanes, or None where something has no rule."""
-        vectors = 2 if lanes >= MANY and not self.moving and optimises() else 1
+        vectors = 2 if lanes >= MIN_LANES_OF_TWO_VECTORS and not self.moving and optimises() else 1
         if vectors not in self._kernels:
             self._kernels[vectors] = None
             try:
@@ -222,7 +223,7 @@ class Program:
             except UnsupportedError as missing:
                 logger.debug("%s runs through XLA: no rule for %s", self.name, missing)
                 what = f"{self.name}: no rule for {missing}"
-                jax.monitoring.record_event_duration_secs(FALLBACK, 0.0, fun_name=what)
+                jax.monitoring.record_event_duration_secs(FALLBACK_EVENT, 0.0, fun_name=what)
         return self._kernels[vectors]
 
     @property
@@ -278,7 +279,7 @@ class Program:
         return lengths
 
     def by_xla(self, values: Any, tangents: Any = None, *, turns: int = 0) -> Run:
-        """Compute the same through `jax.vmap` and XLA: what a kernel is held against."""
+        """Compute the same through `jax.vmap` and XLA; tests compare kernels with it."""
         leaves = [jnp.asarray(leaf) for leaf in self.structure.flatten_up_to(values)]
         moved = [jnp.asarray(t) for t in (tangents or [])]
         lengths = self._lengths([np.asarray(leaf) for leaf in leaves], turns)
@@ -297,8 +298,8 @@ class Program:
         known: dict[Any, Callable[..., Any]] = self.__dict__.setdefault("_programs", {})
         if lengths not in known:
             axes = [(0 if a.apart else -1) if a.lanes else None for a in self.arguments]
-            pushed = self._pushed(dict(lengths))
-            by_lane = jax.vmap(pushed, in_axes=(axes, None))
+            with_tangents = self._with_tangents(dict(lengths))
+            by_lane = jax.vmap(with_tangents, in_axes=(axes, None))
             if self.moving:
                 out = (None, 0)
                 by_lane = jax.vmap(by_lane, in_axes=(None, 0), out_axes=out)
@@ -336,9 +337,11 @@ class _Compiled:
         self.outputs: list[jax.ShapeDtypeStruct]
         self.moved: list[bool]
         if program.key is None:
-            self.structure, self.outputs, self.moved, code = self._made()
+            self.structure, self.outputs, self.moved, code = self._build()
         else:
-            head, _, code = kept(f"{program.key} {self.width}", self._to_keep).partition(b"\n")
+            head, _, code = load_or_make(f"{program.key} {self.width}", self._to_keep).partition(
+                b"\n"
+            )
             known = json.loads(head)
             self.structure = PyTreeDef.deserialize_using_proto(
                 default_registry, bytes.fromhex(known["structure"])
@@ -351,8 +354,8 @@ class _Compiled:
         void, whole = ctypes.c_void_p, ctypes.c_int64
         self.function = ctypes.CFUNCTYPE(None, *[void] * 5, *[whole] * 6)(self.code.address)
 
-    def _made(self) -> tuple[Any, list[jax.ShapeDtypeStruct], list[bool], bytes]:
-        """Return what the program returns, which of it moves, and the object code."""
+    def _build(self) -> tuple[Any, list[jax.ShapeDtypeStruct], list[bool], bytes]:
+        """Return the structure and shapes of the outputs, which of them move, and object code."""
         program = self.program
         closed, shapes, lengths = program._traced
         outputs, structure = jax.tree.flatten(shapes)
@@ -360,16 +363,16 @@ class _Compiled:
         moved = [bool(moves) for moves in dependent(closed.jaxpr, flags)]
         layout = Layout(program.arguments, program.moving, lengths, outputs, moved)
         began = time.perf_counter()
-        code = object_code(layout.written(closed, self.width))
+        code = object_code(layout.module_text(closed, self.width))
         spent = time.perf_counter() - began
-        jax.monitoring.record_event_duration_secs(BUILT, spent, fun_name=program.name)
+        jax.monitoring.record_event_duration_secs(BUILD_EVENT, spent, fun_name=program.name)
         # tens of megabytes that a kernel has no use for
         program.__dict__.pop("_traced", None)
         return structure, outputs, moved, code
 
     def _to_keep(self) -> bytes:
-        """Return the object code behind a line on what it returns."""
-        structure, outputs, moved, code = self._made()
+        """Return the object code behind a line that describes its outputs."""
+        structure, outputs, moved, code = self._build()
         head = {
             "structure": structure.serialize_using_proto().hex(),
             "outputs": [(shape.shape, str(shape.dtype)) for shape in outputs],
@@ -394,11 +397,14 @@ class _Compiled:
             if a.lanes and not a.apart
         )
         own_lanes, each, blocks = min(
-            (_laid(lanes, width, columns, each, tables) for each in range(1, MOST_COLUMNS + 1)),
-            key=lambda laid: (-(-laid[2] // _cores()) * (FORWARD + laid[1]), laid[2]),
+            (
+                _block_layout(lanes, width, columns, each, tables)
+                for each in range(1, MAX_COLUMNS + 1)
+            ),
+            key=lambda laid: (-(-laid[2] // _cores()) * (COLUMNS_OF_VALUES + laid[1]), laid[2]),
         )
         place = np.arange(blocks * width)
-        # lanes that fill a block up, and columns, compute and write what others do
+        # lanes and columns that fill a block repeat others
         segment = np.minimum(place % own_lanes, lanes - 1)
         turn = np.minimum(place // own_lanes * each, columns - each)
         own_blocks = min(lcm(own_lanes, width) // width, blocks)
@@ -447,7 +453,11 @@ class _Compiled:
                 *task,
             )
 
-        pieces = min(blocks, TASKS_A_CORE * _cores()) if lengths["turns"] or blocks > FEW else 1
+        pieces = (
+            min(blocks, TASKS_PER_CORE * _cores())
+            if lengths["turns"] or blocks > MAX_BLOCKS_ON_ONE_THREAD
+            else 1
+        )
         bounds = [blocks * number // pieces for number in range(pieces + 1)]
         tasks = list(pairwise(bounds))
         if len(tasks) == 1:
@@ -473,7 +483,9 @@ class _Compiled:
         )
 
 
-def _laid(lanes: int, width: int, columns: int, each: int, tables: int) -> tuple[int, int, int]:
+def _block_layout(
+    lanes: int, width: int, columns: int, each: int, tables: int
+) -> tuple[int, int, int]:
     """Return after how many lanes the next columns begin, how many a block takes, and its number.
 
     Each lane takes some columns over what is its own: few segments fill a block with several turns
@@ -482,7 +494,7 @@ def _laid(lanes: int, width: int, columns: int, each: int, tables: int) -> tuple
     each = min(each, columns)
     turns = -(-columns // each)
     own = -(-lanes // width) * width
-    if turns > 1 and own - lanes > WASTE * lanes and tables * turns <= REPEATED:
+    if turns > 1 and own - lanes > MAX_EMPTY_LANES * lanes and tables * turns <= MAX_REPEATED_BYTES:
         own = lanes
     return own, each, -(-own * turns // width)
 
@@ -491,10 +503,10 @@ def _side_by_side(leaf: NDArray[Any], taken: NDArray[np.intp], lanes: int) -> ND
     """Return an array whose last axis holds the lanes of all blocks."""
     if len(taken) == lanes:
         return np.ascontiguousarray(leaf)
-    if lanes > ONE_BY_ONE or leaf.ndim == 1:
+    if lanes > MAX_LANES_COPIED_SINGLY or leaf.ndim == 1:
         return np.ascontiguousarray(leaf[..., taken])
     laid = np.empty((*leaf.shape[:-1], len(taken)), leaf.dtype)
-    rows = max(IN_CACHE // max(laid[:1].nbytes, 1), 1)
+    rows = max(CACHE_BYTES // max(laid[:1].nbytes, 1), 1)
     for first in range(0, len(laid), rows):
         some = slice(first, first + rows)
         for place, lane in enumerate(taken.tolist()):

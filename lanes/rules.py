@@ -20,8 +20,8 @@ Parameters: TypeAlias = Mapping[str, Any]
 Rule: TypeAlias = Callable[..., ir.Value]
 
 CONTRACT = ("contract",)
-"""A product may be fused with a sum. Nothing else of fast-math is safe for values: in another order
-what cancels cancels no more, and without NaN and infinity the test for a crash is folded away."""
+"""A product may be fused with a sum. Nothing else of fast-math is safe for values: in another
+order terms cancel no more, and without NaN and infinity the test for a crash is folded away."""
 LINEAR = ("contract", "reassoc", "nsz")
 """Of derivatives, which are products and sums of others: these may be factored and reordered."""
 
@@ -32,7 +32,7 @@ TYPES: Mapping[np.dtype[Any], ir.Type] = {
     np.dtype(np.int64): ir.IntType(64),
     np.dtype(np.int32): ir.IntType(32),
     np.dtype(np.bool_): BOOL,
-    np.dtype(jax.dtypes.float0): BOOL,  # of what has no derivative: never looked at
+    np.dtype(jax.dtypes.float0): BOOL,  # the tangent of an integer: never read
 }
 
 
@@ -74,13 +74,13 @@ def _constant(kind: ir.Type, number: float, _: str) -> ir.Constant:
 
 
 class Emitter:
-    """Writes instructions; what several rules need."""
+    """Writes instructions that several rules need."""
 
     def __init__(self, module: ir.Module, width: int) -> None:
         self.module, self.width = module, width
         self.b = ir.IRBuilder()
         self.flags: tuple[str, ...] = CONTRACT
-        """What may be done to sums, products and quotients."""
+        """Fast-math flags of sums, products and quotients."""
         self._splats: dict[tuple[ir.Block, ir.Value], ir.Value] = {}
 
     def vector(self, kind: ir.Type) -> ir.VectorType:
@@ -336,7 +336,7 @@ def _expm1(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
     q, s, t, inverse = _exponential(e, x)
     rest = e.b.fmul(t, e.b.fadd(e.b.fmul(q, s), e.b.fsub(s, inverse)))
     tiny = e.b.fcmp_ordered("<", e.intrinsic("fabs", x), e.number(x, 1e-30))
-    return e.select(tiny, x, rest)  # the sign of zero, and what has no square
+    return e.select(tiny, x, rest)  # keeps the sign of zero; the square of a tiny number is zero
 
 
 def _logistic(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
@@ -462,4 +462,4 @@ ELEMENTWISE: dict[str, Rule] = {
         ("copy", "copy_p", "stop_gradient", "real", "optimization_barrier"), lambda _, __, x: x
     ),
 }
-"""Primitive -> rule, for those that do to arrays what they do to each element."""
+"""Primitive -> rule, for elementwise primitives."""

@@ -1,10 +1,10 @@
 """Tangents as sums of others times factors that all columns share, in as few terms as can be.
 
-Derivatives are linear: what a column computes is a graph of sums, from tangents in memory
-to those that are asked for. A node of it whose own terms, put in where it is read, are no more than
-what is saved is eliminated (vertex elimination; Griewank and Walther, Evaluating Derivatives, ch.
-9); products of factors are then computed once, for all columns. A choice between a sum and zero is
-that sum with chosen factors.
+Derivatives are linear: a column is computed by a graph of sums, from tangents in memory to those
+that are wanted. A node is eliminated where its terms, put in where it is read, cost no more than it
+saves (vertex elimination; Griewank and Walther, Evaluating Derivatives, ch. 9); products of factors
+are then computed once, for all columns. A choice between a sum and zero is that sum with chosen
+factors.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from llvmlite import ir
 from lanes.rules import constant, is_bool
 from lanes.values import Element, Tangent
 
-_Made: TypeAlias = "_Product | _Sum | _Choice | _Inverse"
-Factor: TypeAlias = "float | ir.Value | _Made"
-SHARED = 0.1
-"""What an operation on factors costs, of one that each column needs."""
-MOST_TERMS = 6
+_FactorExpression: TypeAlias = "_Product | _Sum | _Choice | _Inverse"
+Factor: TypeAlias = "float | ir.Value | _FactorExpression"
+SHARED_COST = 0.1
+"""Cost of an operation on factors, over that of one in each column."""
+MAX_CHOSEN_TERMS = 6
 """Terms up to which a choice is made for each of a sum's."""
 
 
@@ -89,22 +89,22 @@ def _is_sign(factor: Factor) -> bool:
 
 @dataclass(eq=False)
 class Node:
-    """A number of a tangent: a sum, or what else a primitive makes of others.
+    """A number of a tangent: a sum, or the result of another primitive.
 
     Attributes
     ----------
     of
         The tangent, or an LLVM value that all columns share.
     terms
-        Of a sum: node -> factor. None for what is no sum.
+        Of a sum: node -> factor. None for other primitives.
     operands
-        Of what is no sum.
+        Of other primitives.
     readers
         The nodes that it is read by.
     kept
         Whether it is not eliminated.
     finite
-        Whether it surely is, as long as what it is read from memory for is.
+        Whether it surely is, if the tangents in memory are.
     """
 
     of: Any
@@ -125,13 +125,13 @@ class Node:
         return isinstance(self.of, Tangent) and self.terms is None and self.of.is_read
 
     @property
-    def is_told(self) -> bool:
+    def has_column_flags(self) -> bool:
         """Whether it lies in memory that tells in which columns it moves."""
         return self.is_read and self.of.operands[0].moves is not None
 
     @property
     def sum(self) -> dict[Node, Factor]:
-        """The terms of what is a sum."""
+        """The terms of a sum."""
         assert self.terms is not None
         return self.terms
 
@@ -154,13 +154,13 @@ def _number(value: ir.Value) -> Factor:
 
 _CARRIED = frozenset({"phi", "load"})
 _SUMS = frozenset({"fadd", "fsub", "fmul", "fneg", "select", "shufflevector", "insertelement"})
-"""Instructions whose results are finite where what they are made of is."""
+"""Instructions whose results are finite where their operands are."""
 
 
 class _Finite:
-    """Which factors are finite if what loops carry and memory holds is.
+    """Which factors are finite if values in memory and carried by loops are.
 
-    Quotients of what is no constant, roots and functions of a library may not be.
+    Quotients by other than constants, roots and library functions may not be.
     """
 
     def __init__(self) -> None:
@@ -191,12 +191,12 @@ class _Finite:
 
 
 class Graph:
-    """What a column computes.
+    """The sums that a column computes.
 
     Parameters
     ----------
     outs
-        What is asked for.
+        Wanted elements.
     """
 
     def __init__(self, outs: Sequence[Element]) -> None:
@@ -211,7 +211,7 @@ class Graph:
         self._plain: dict[int, Node] = {}
         self._known: dict[Any, Node] = {}
         self._found: dict[int, Node] = {}
-        self._finite = _Finite()
+        self._is_finite = _Finite()
         for number in sorted(needed):
             self._found[number] = self._node(needed[number])
         self.outs = [self._of(x) for x in outs]
@@ -261,7 +261,7 @@ class Graph:
             )
             if key in self._known:
                 return self._known[key]
-            finite = all(of.finite and self._finite(factor) for of, factor in terms.items())
+            finite = all(of.finite and self._is_finite(factor) for of, factor in terms.items())
             node = Node(tangent, terms, finite=finite)
             self._known[key] = node
             for operand in terms:
@@ -270,7 +270,7 @@ class Graph:
         return node
 
     def _terms(self, tangent: Tangent) -> Sequence[tuple[Any, Factor]] | None:
-        """Return what a tangent is the sum of."""
+        """Return the terms of a tangent that is a sum; else None."""
         name, operands = tangent.name, tangent.operands
         moving = [isinstance(x, Tangent) for x in operands]
         found: Sequence[tuple[Any, Factor]] | None = None
@@ -293,7 +293,7 @@ class Graph:
     def _chosen(self, which: ir.Value, *either: Tangent) -> Sequence[tuple[Any, Factor]] | None:
         """Return a choice between multiples of one number as that number times a chosen factor.
 
-        One between others stays a choice: what is not chosen may be no number.
+        One between others stays a choice: the other one may be NaN.
         """
         parts: list[tuple[Node, Factor]] = []
         for node in map(self._of, either):
@@ -302,14 +302,14 @@ class Graph:
         (of, factor), (other, own) = parts
         if of is other:
             return [(of, _Choice(which, factor, own))]
-        if of.is_told and other.is_told:
+        if of.has_column_flags and other.has_column_flags:
             return [(of, _Choice(which, factor, 0.0)), (other, _Choice(which, 0.0, own))]
         return None
 
     def _left_out(self, which: ir.Value, *either: Element) -> Sequence[tuple[Any, Factor]] | None:
         """Return a choice between a sum and zero as that sum with factors that are chosen.
 
-        Zero times what is no number is none: what is summed must be finite.
+        Zero times NaN is NaN: the terms must be finite.
         """
         first_moves = isinstance(either[0], Tangent)
         left: list[tuple[Node, Factor]] = [(self._of(either[0 if first_moves else 1]), 1.0)]
@@ -318,7 +318,7 @@ class Graph:
             node, factor = left.pop()
             if node.finite:
                 _add(parts, node, factor)
-            elif node.terms is None or len(left) + len(parts) > MOST_TERMS:
+            elif node.terms is None or len(left) + len(parts) > MAX_CHOSEN_TERMS:
                 return None
             else:
                 left += [(of, _times(factor, own)) for of, own in node.terms.items()]
@@ -341,18 +341,18 @@ class Graph:
         while changed:
             changed = False
             for node in reversed(self.nodes):
-                changed |= self._put_in([node])
+                changed |= self._eliminate_nodes([node])
             together: dict[frozenset[Node], list[Node]] = {}
             for node in self.nodes:
                 together.setdefault(frozenset(node.readers), []).append(node)
             for nodes in together.values():
                 if len(nodes) > 1:
-                    changed |= self._put_in(nodes)
+                    changed |= self._eliminate_nodes(nodes)
         self.nodes = [n for n in self.nodes if n.kept or n.terms is None or n.readers]
         self._order()
 
     def _order(self) -> None:
-        """Put what is known late last in its sums."""
+        """Put terms that are computed late last in their sums."""
         known: dict[Node, int] = {}
         for node in self.nodes:
             if node.terms is None:
@@ -365,7 +365,7 @@ class Graph:
                 ready = max(ready, known[operand]) + 1
             node.terms, known[node] = dict(rows), ready
 
-    def _put_in(self, nodes: Sequence[Node]) -> bool:
+    def _eliminate_nodes(self, nodes: Sequence[Node]) -> bool:
         """Put nodes' terms in where they are read, if that saves something."""
         nodes = [
             n
@@ -388,7 +388,7 @@ class Graph:
                     shared += (not _is_sign(each) and not _is_sign(factor)) + (operand in terms)
                     _add(terms, operand, _times(factor, each))
             change += _cost(terms) - _cost(reader.sum)
-        if change + SHARED * shared > 0:
+        if change + SHARED_COST * shared > 0:
             return False
         for node in nodes:
             for operand in node.sum:
@@ -429,10 +429,10 @@ class Factors:
         if isinstance(factor, ir.Value):
             return factor
         if id(factor) not in self._known:
-            self._known[id(factor)] = self._made(factor, kind)
+            self._known[id(factor)] = self._emit(factor, kind)
         return self._known[id(factor)]
 
-    def _made(self, factor: _Made, kind: ir.Type) -> ir.Value:
+    def _emit(self, factor: _FactorExpression, kind: ir.Type) -> ir.Value:
         if isinstance(factor, _Inverse):
             return self._apply("div", {}, constant(kind, 1.0), self.of(factor.of, kind))
         either = self.of(factor.first, kind), self.of(factor.second, kind)

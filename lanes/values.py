@@ -1,4 +1,4 @@
-"""What a variable of a jaxpr is while it is lowered: elements in registers, or an array elsewhere.
+"""Values of the variables of a jaxpr: elements in registers, or an array elsewhere.
 
 An array of a few numbers is a NumPy array of `Element`. An element is an LLVM value, scalar if all
 lanes share it and a vector if each has its own, or a `Tangent`. Reshaping, slicing or stacking such
@@ -96,7 +96,7 @@ class Tangent:
 
 
 READ = "read"
-"""The name of what lies in memory: its operands are a storage and an index."""
+"""The name of a tangent in memory: its operands are a storage and an index."""
 
 
 @dataclass(eq=False)
@@ -143,7 +143,7 @@ class Deferred:
     shape: tuple[int, ...]
     at: Callable[[Index], Element] = field(repr=False)
     sources: tuple[Any, ...] = ()
-    """What it is computed of, to see what it depends on."""
+    """Arrays that it is computed from."""
 
 
 Array: TypeAlias = "Memory | Deferred"

@@ -89,7 +89,7 @@ def test_one_program_serves_every_length_and_every_number_of_lanes(program, coun
 @pytest.mark.parametrize(("real", "turns"), [(float, 9), (np.float32, 37)])
 def test_many_lanes_in_wider_blocks_give_what_few_do(real, turns):
     still = {name: replace(a, moves=False, dtype=real) for name, a in ARGUMENTS.items()}
-    program, count = Program(filtered, still), lanes.program.MANY + 3
+    program, count = Program(filtered, still), lanes.program.MIN_LANES_OF_TWO_VECTORS + 3
     values, _ = given(count, turns)
     few = {name: v if name == "gain" else v[..., -5:] for name, v in values.items()}
     wide, narrow = program(values, lanes=count, turns=turns), program(few, lanes=5, turns=turns)
@@ -173,7 +173,7 @@ def test_an_output_has_the_bits_of_all_inputs_that_it_depends_on():
 def test_results_do_not_depend_on_threads_nor_on_other_lanes(program, monkeypatch):
     values, tangents = given(37, 25)
     together = flat(program(values, tangents, lanes=37, turns=25))
-    monkeypatch.setattr(lanes.program, "TASKS_A_CORE", 64)
+    monkeypatch.setattr(lanes.program, "TASKS_PER_CORE", 64)
     for mine, theirs in zip(
         together, flat(program(values, tangents, lanes=37, turns=25)), strict=True
     ):
@@ -351,7 +351,7 @@ def test_kept_code_is_used_and_damage_is_noticed(kernels):
 
 
 def test_kept_code_is_bounded_and_the_longest_unused_goes(kernels, monkeypatch):
-    monkeypatch.setattr(lanes.machine, "MOST", 1500)
+    monkeypatch.setattr(lanes.machine, "MAX_CODE_BYTES", 1500)
     for number in range(6):
         object_code(TEXT.replace("7", str(number)))
     held = list(kernels.glob("*.o"))

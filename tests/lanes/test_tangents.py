@@ -10,7 +10,7 @@ from jax import lax
 from llvmlite import ir
 
 from lanes import Argument, Program, joined
-from lanes.lowering import MOST_COLUMNS
+from lanes.lowering import MAX_COLUMNS
 from lanes.tangents import Graph
 from lanes.values import READ, Tangent
 
@@ -78,7 +78,7 @@ def flown(function, size, columns, turns=1, lanes=3):
     return [np.asarray(run.columns) for run in runs]
 
 
-@pytest.mark.parametrize("columns", [1, 2, MOST_COLUMNS, MOST_COLUMNS + 1, 3 * MOST_COLUMNS + 2])
+@pytest.mark.parametrize("columns", [1, 2, MAX_COLUMNS, MAX_COLUMNS + 1, 3 * MAX_COLUMNS + 2])
 @pytest.mark.parametrize("lanes", [1, 3, 17])
 def test_any_number_of_columns_is_laid_side_by_side(columns, lanes):
     def function(x, lengths):
