@@ -50,6 +50,9 @@ class Estimate:
     explained
         (6,) share of the variance of recorded specific force and angular acceleration that the
         physical values explain; negative where they make it worse.
+    turning
+        Largest share of roll's and pitch's angular acceleration that any values explain, those of
+        ordinary least squares: the rest are disturbances and noise.
     horizon
         s up to which a prediction of roll and pitch rate, along the recorded motion, is better than
         holding them; None if none is.
@@ -59,12 +62,8 @@ class Estimate:
     errors: Mapping[str, float]
     rows: tuple[SelectionRow, ...]
     explained: Array
+    turning: float
     horizon: float | None
-
-    @property
-    def turning(self) -> float:
-        """The share of roll's and pitch's angular acceleration that is explained."""
-        return float(np.mean(self.explained[TILTING]))
 
 
 def estimate(
@@ -139,6 +138,7 @@ def estimate(
         errors=named(errors, free),
         rows=rows,
         explained=_explained_shares(made, found.point),
+        turning=float(np.mean(_explained_shares(made, full.ordinary)[TILTING])),
         horizon=_horizon(made, predicted),
     )
 

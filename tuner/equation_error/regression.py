@@ -27,7 +27,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
+from scipy.special import huber, stdtrit  # scipy.stats takes a quarter of a second to import
 
 from tuner.core.numerics import Z95, Array, huber_weights, robust_sd
 from tuner.equation_error.model_accelerations import LinearisedAccelerations, ModelAccelerations
@@ -44,9 +44,11 @@ DELAYS: Delays = (0, 0, 0, 2, 2, 2)
 BIAS_LAGS = 8
 """Number of steps before the instruments in which `feedback_bias` looks for correlation."""
 MAX_ROUNDS = 8
-"""Largest number of Gauss-Newton steps."""
+"""Largest number of steps."""
 MAX_STEP = 0.7
-"""Largest step of a logarithm, or of a number over its prior's deviation: the linear range."""
+"""Largest step of a logarithm, or of a number over its usual size: the linear range."""
+DAMPINGS = (0.0, *(10.0 ** np.arange(-3.0, 9.0)).tolist())
+"""Damping of a step, over squared steps of usual size; the largest leaves no step."""
 STEP_TOLERANCE = 1e-3
 """Step, likewise, below which the iteration has converged."""
 MIN_UNITS = 3
@@ -80,13 +82,20 @@ class NormalEquations:
     pull: Array
     predicted: Array
 
-    def solved(self, free: Mask, units: Mask | slice, moved: Array | None = None) -> Array:
+    def solved(
+        self,
+        free: Mask,
+        units: Mask | slice,
+        moved: Array | None = None,
+        damping: float | Array = 0.0,
+    ) -> Array:
         """Return the change (K,) of least loss of some units (U,) along free coordinates (K,).
 
-        ``moved`` (K,) is the given change of the others; zero by default.
+        ``moved`` (K,) is the given change of the others, zero by default; ``damping`` (K,) adds to
+        the information on changes.
         """
         change = np.zeros(len(free)) if moved is None else np.where(free, 0.0, moved)
-        information = self.information[units].sum(axis=0) + np.diag(self.prior)
+        information = self.information[units].sum(axis=0) + np.diag(self.prior + damping)
         slope = self.slope[units].sum(axis=0) + self.pull - information @ change
         unit = self.prior[free] ** -0.5
         scaled = information[np.ix_(free, free)] * np.outer(unit, unit)
@@ -113,6 +122,8 @@ class Regression:
     ----------
     point
         (K,) scaled coordinates.
+    ordinary
+        (K,) those of ordinary least squares; the start if it was near.
     sums
         Normal equations about it.
     covariance
@@ -120,6 +131,7 @@ class Regression:
     """
 
     point: Array
+    ordinary: Array
     sums: NormalEquations
     covariance: Array
 
@@ -148,11 +160,10 @@ def regress(
     point, mean = np.array(begin, float), np.array([p.prior_mean for p in made.parameters])
     memory = tuple(s if delay else times * s for s, delay in zip(MEMORY_S, DELAYS, strict=True))
     filters, delays = partial(whitening, memory=memory), tuple(times * delay for delay in DELAYS)
-    if not near:
-        point = minimised(made, point, _plain, mean=mean, free=free)
-    point = minimised(made, point, filters, mean=mean, free=free, delays=delays)
+    ordinary = point if near else minimised(made, point, _plain, mean=mean, free=free)
+    point = minimised(made, ordinary, filters, mean=mean, free=free, delays=delays)
     sums = _sums_at(made, point, filters, mean=mean, free=free, delays=delays)
-    return Regression(point, sums, _covariance(sums, free))
+    return Regression(point, ordinary, sums, _covariance(sums, free))
 
 
 def minimised(
@@ -164,9 +175,11 @@ def minimised(
     free: Mask,
     delays: Delays = NO_DELAYS,
 ) -> Array:
-    """Return the coordinates (K,) of least filtered errors, by Gauss-Newton steps.
+    """Return the coordinates (K,) of least filtered errors, by Levenberg-Marquardt steps.
 
     Inside their bounds, with priors about a mean (K,); ``begin`` and ``free`` are as of `regress`.
+    Each step is damped until it is in the linear range and, without instruments, lowers the loss:
+    directions that the flights do not determine would leave it first.
     """
     unit = np.array([p.usual or 1.0 for p in made.parameters])
     low = np.array([p.scaled(p.lower) for p in made.parameters])
@@ -174,12 +187,44 @@ def minimised(
     point = np.array(begin, float)
     for _ in range(MAX_ROUNDS):
         sums = _sums_at(made, point, filters, mean=mean, free=free, delays=delays)
-        change = sums.solved(free, slice(None))
-        step = np.clip(change, -MAX_STEP * unit, MAX_STEP * unit)
-        point = np.clip(point + step, low, high)
-        if np.abs(step / unit).max() < STEP_TOLERANCE:
+        loss = None if any(delays) else _loss_from(made, point, filters, mean)
+        for damping in DAMPINGS:
+            change = sums.solved(free, slice(None), damping=damping * unit**-2.0)
+            there = np.clip(point + change, low, high)
+            in_range = np.abs(change / unit).max() <= MAX_STEP
+            if in_range and (loss is None or loss(there) <= loss(point)):
+                break
+        else:
+            break
+        point = there
+        if np.abs(change / unit).max() < STEP_TOLERANCE:
             break
     return point
+
+
+def _loss_from(
+    made: ModelAccelerations, point: Array, filters: Filter, mean: Array
+) -> Callable[[Array], float]:
+    """Return the loss of coordinates (K,), with the filters and spreads of errors at a point."""
+    column = np.zeros(1, np.intp)  # the kernel with derivatives takes one at least
+    kernels = [filters(one) for one in made.at(point, column)]
+    prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
+
+    def errors_at(at: Array) -> list[Array]:
+        return [
+            convolved(one.errors[:, axis, None], one.steps.known, kernel)[:, 0]
+            for one, of_flight in zip(made.at(at, column), kernels, strict=True)
+            for axis, kernel in enumerate(of_flight)
+        ]
+
+    spreads = [spread(errors) for errors in errors_at(point)]
+
+    def loss(at: Array) -> float:
+        pairs = zip(errors_at(at), spreads, strict=True)
+        of_errors = sum(float(huber(HUBER_LIMIT, errors / unit).sum()) for errors, unit in pairs)
+        return of_errors + 0.5 * float(prior @ (at - mean) ** 2)
+
+    return loss
 
 
 def _sums_at(

@@ -6,9 +6,11 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.signal import lfilter
 
+import tuner
 from benchmarks import fast_flights
 from tuner.config import Options, resolve_settings
 from tuner.config.job import Search
@@ -31,6 +33,7 @@ from tuner.equation_error.regression import (
     regress,
     whitening,
 )
+from tuner.evaluate.simulation_files import write_csv
 from tuner.job.accelerations import of_rigid_body, with_accelerations
 from tuner.recordings.flight import Series
 from tuner.search.inlet_choice import predicts_turning, regressors
@@ -180,7 +183,8 @@ def test_what_comes_a_step_late_is_in_the_errors(lags):
     )
     sums = filtered_sums(linear, whitening(linear), 1)[:3]
     equations = NormalEquations(*sums, 1e-6 * one, 0.0 * one, np.eye(1))
-    found, made = Regression(one, equations, np.eye(1)), SimpleNamespace(at=lambda _: (linear,))
+    found = Regression(one, one, equations, np.eye(1))
+    made = SimpleNamespace(at=lambda _: (linear,))
     (error,) = feedback_bias(made, found, free=np.ones(1, bool))
     chance = 0.5 / np.sqrt(size)
     assert error == pytest.approx(np.hypot(lags / np.sqrt(BIAS_LAGS), chance), abs=chance)
@@ -243,7 +247,7 @@ def test_a_response_within_a_step_biases_no_gain_of_a_moment(responding, monkeyp
 def test_inertia_about_z_is_that_of_a_rigid_body_where_it_may_be(ratio, share):
     values = {"inertia_xx": 1.0, "inertia_yy": 2.0, "inertia_zz": 3.0 * ratio}
     values["moment_constant"] = 0.02
-    found = Estimate(values, {"inertia_zz": 0.1}, (), np.zeros(6), None)
+    found = Estimate(values, {"inertia_zz": 0.1}, (), np.zeros(6), 0.0, None)
     of_body = of_rigid_body(found).values
     assert of_body["inertia_zz"] == pytest.approx(3.0 * ratio / share)
     assert of_body["moment_constant"] == pytest.approx(0.02 / share)
@@ -418,3 +422,17 @@ def test_rotor_speeds_in_bursts_say_too_little(flown):
     assert steps_of(seldom[0].flight) is None
     job = job_of(settings, seldom)
     assert with_accelerations(job) == (job, ())
+
+
+def test_flights_that_determine_few_coefficients_do_not_mislead(tmp_path):
+    """Commands and poses without noise; many laws are free that it does not determine."""
+    path = tmp_path / "circle.csv"
+    write_csv(tuner.simulate("lemniscate", speed=4.0, duration=10.0), path)
+    columns = pd.read_csv(path)
+    fed = [name for name in columns if name.startswith(("ref_", "thrust_"))]
+    columns.drop(columns=fed).to_csv(path, index=False)
+    (tmp_path / "tune.yaml").write_text("inlet: actuator\n")
+    options = Options([str(path)], vehicle="hovergames", config=str(tmp_path / "tune.yaml"))
+    settings = resolve_settings(options)
+    given = job_of(settings, read_recordings(settings)[0])
+    assert with_accelerations(given) == (given, ())  # they explain the turning
