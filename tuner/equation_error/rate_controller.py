@@ -34,6 +34,9 @@ AXES = ("roll", "pitch", "yaw")
 PARTS = ("P", "I", "late")
 MIN_CHANGE = {"P": 0.02, "I": 0.1, "late": 5e-4}
 """Least difference that is reported: relative for gains, s for the latency."""
+MAX_SD_OF_ONE_FLIGHT = 0.1
+"""Largest standard error of one flight's P over the file's: beyond it instruments are weak, and
+estimates far from normal (Staiger and Stock 1997)."""
 MIN_INSTRUMENT_SLOPE = 0.5
 """Least slope of recorded over simulated torque of a flight that is an instrument: near the limit
 of stability a loop oscillates, and a simulation loses its phase."""
@@ -125,7 +128,7 @@ def _apart(
         _axis_estimates([recorded[i] for i in some], [simulated[i] for i in some], axis).get("P")
         for some in ([number], others)
     )
-    if own is None or all_others is None:
+    if own is None or all_others is None or own.sd > MAX_SD_OF_ONE_FLIGHT:
         return 0.0
     sd, off = float(np.hypot(own.sd, all_others.sd)), abs(own.value - all_others.value)
     compared = own._replace(neutral=all_others.value, sd=sd)

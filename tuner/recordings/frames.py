@@ -263,6 +263,8 @@ def _axis_doubts(
 ) -> Iterator[Note]:
     """Yield the axes along which a signal is the pose's derivative with another sign or size.
 
+    Axes turned by less than `MIN_AXES_ANGLE_RAD` mix in a part of the other axes' motion.
+
     Parameters
     ----------
     motion, recorded
@@ -277,7 +279,12 @@ def _axis_doubts(
         if not known.any() or min(rms(a), rms(b)) < least_motion:
             continue
         alike, times = correlation(a, b), rms(b) / rms(a)
-        of_another_size = alike > MIN_SIZE_CORRELATION and not least < times < 1.0 / least
+        mixed_in = MIN_AXES_ANGLE_RAD * rms(np.delete(motion[known], axis, axis=1))
+        of_another_size = (
+            alike > MIN_SIZE_CORRELATION
+            and not least < times < 1.0 / least
+            and abs(rms(b) ** 2 - rms(a) ** 2) > mixed_in**2
+        )
         if alike < -MIN_SIGN_CORRELATION or of_another_size:
             numbers = {"times": float(np.copysign(times, alike))}
             signal, other = names

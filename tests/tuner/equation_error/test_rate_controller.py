@@ -86,6 +86,19 @@ def test_flights_of_the_same_gains_are_not_told_apart():
     assert others_gains(*two) == ()  # nothing says which of them is the other one
 
 
+def test_a_flight_that_hardly_turns_is_not_told_apart():
+    """Its instruments are weak: its P is anything, with a small error."""
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        recorded = [flight(random, gusts=0.2, noise=0.01) for _ in range(3)]
+        simulated, still = flight(random), flight(random)
+        noise = 0.01 * random.normal(size=still.rate.shape)
+        error, rate, torque = (3e-4 * signal for signal in still[1:])
+        recorded.append(Signals(still.step, error - noise, rate + noise, torque))
+        quiet = Signals(simulated.step, *(3e-4 * signal for signal in simulated[1:]))
+        assert others_gains(recorded, [simulated] * 3 + [quiet]) == ()
+
+
 def test_what_a_gyro_reads_at_rest_is_not_what_the_loop_integrated():
     random = np.random.default_rng(0)
     real, made = flight(random, gusts=0.2, noise=0.01, bias=0.02), flight(random)

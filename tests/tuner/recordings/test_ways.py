@@ -19,6 +19,7 @@ from tuner.findings.findings import one_line
 from tuner.objective.rotor_signals import levers, order_findings
 from tuner.recordings.content import ReadOptions, read_content
 from tuner.recordings.flight import Flight, Series
+from tuner.recordings.frames import _axis_doubts
 from tuner.recordings.inspector import suggested_map
 from tuner.recordings.loader import load_flight, read_inertial
 from tuner.recordings.matlab import MAGIC
@@ -497,6 +498,17 @@ def test_single_axes_that_deny_the_pose_are_named(content, said: set, tmp_path: 
     notes = [n for n in read(tmp_path, content()).notes if n.code is NoteCode.AXIS_DOUBTED]
     assert {(*n.names[:2], round(n.numbers["times"], 1)) for n in notes} == said
     assert all(note.kind == "warning" for note in notes)
+
+
+@pytest.mark.parametrize(("wobble", "doubted"), [(0.1, ""), (1.0, "y")])
+def test_a_spin_seen_by_tilted_markers_is_not_another_size(wobble: float, doubted: str) -> None:
+    """Of a fast spin, two degrees of tilt show a part about y as large as a small wobble."""
+    time = np.arange(0.0, 20.0, 0.01)
+    spin = 2.0 * np.sin(time)
+    turning = np.column_stack([0.0 * time, wobble * np.sin(time), spin])
+    gyro = turning + np.column_stack([0.0 * time, 0.1 * wobble * np.sin(time), 0.0 * time])
+    notes = _axis_doubts(turning, gyro, ("body_rate", "attitude"), 0.05)
+    assert "".join(note.names[1] for note in notes) == doubted
 
 
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 45.0])
