@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress
@@ -31,14 +31,6 @@ from lanes.values import (
 )
 
 Bound = Mapping[Any, Memory]
-
-
-def _with_llvm_values(value: Elements, left: Iterator[ir.Value]) -> Elements:
-    """Return an array in registers with the LLVM values that come next; tangents lie in memory."""
-    return array_of(
-        [e if isinstance(e, Tangent) else next(left) for e in value.ravel()],
-        value.shape,
-    )
 
 
 class _Carry:
@@ -94,12 +86,17 @@ class _Carry:
         return [x for v in values if isinstance(v, np.ndarray) for x in parts_of(v.ravel())]
 
     def with_llvm_values(self, parts: Sequence[ir.Value]) -> list[Value]:
-        """Return the carried values with other LLVM values, in the order of `parts`."""
+        """Return the carried values with other LLVM values, in the order of `parts`.
+
+        Tangents lie in memory.
+        """
         left = iter(parts)
         return [
             Memory(value.storage, value.shape, value.storage.version)
             if isinstance(value, Memory)
-            else _with_llvm_values(value, left)
+            else array_of(
+                [e if isinstance(e, Tangent) else next(left) for e in value.ravel()], value.shape
+            )
             for value in self.values
         ]
 

@@ -197,7 +197,3 @@ class Code:
                 .link(_linker(), number)
             )
         self.address: int = self._library[function]
-
-    def __call__(self, kind: Callable[..., Any]) -> Any:
-        """Return the function as one of ctypes' kinds."""
-        return kind(self.address)

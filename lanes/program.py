@@ -27,7 +27,7 @@ import lanes.control
 import lanes.structural  # noqa: F401 (both fill in rules)
 from lanes.dependence import dependent
 from lanes.digest import UnknownError, digest_of
-from lanes.layout import Argument, Layout, Lengths, is_laid_by_loop
+from lanes.layout import Argument, Lengths, is_laid_by_loop, module_text
 from lanes.lowering import MAX_COLUMNS
 from lanes.machine import Code, keep_code_in, load_or_make, object_code, optimises, register_bytes
 from lanes.values import UnsupportedError
@@ -190,15 +190,16 @@ class Program:
             return lambda leaves, _: flown(*leaves)
         return with_tangents
 
-    def _shaped(self, argument: Argument, lengths: Lengths) -> jax.ShapeDtypeStruct:
-        shape = tuple(lengths[n] if isinstance(n, str) else n for n in argument.shape)
-        return jax.ShapeDtypeStruct(shape, argument.dtype)
-
     @cached_property
     def _traced(self) -> tuple[Any, Any, dict[str, int]]:
         """The jaxpr, the structure of its outputs, and the stand-ins of lengths."""
         lengths = self.stand_ins
-        given = [self._shaped(a, lengths) for a in self.arguments]
+        given = [
+            jax.ShapeDtypeStruct(
+                [lengths[n] if isinstance(n, str) else n for n in a.shape], a.dtype
+            )
+            for a in self.arguments
+        ]
         tangents = [given[number] for number in self.moving]
         closed, shapes = jax.make_jaxpr(self._with_tangents(lengths), return_shape=True)(
             given, tangents
@@ -361,9 +362,17 @@ class _Compiled:
         outputs, structure = jax.tree.flatten(shapes)
         flags = [False] * len(program.arguments) + [True] * len(program.moving)
         moved = [bool(moves) for moves in dependent(closed.jaxpr, flags)]
-        layout = Layout(program.arguments, program.moving, lengths, outputs, moved)
         began = time.perf_counter()
-        code = object_code(layout.module_text(closed, self.width))
+        text = module_text(
+            closed,
+            self.width,
+            arguments=program.arguments,
+            moving=program.moving,
+            lengths=lengths,
+            outputs=outputs,
+            moved=moved,
+        )
+        code = object_code(text)
         spent = time.perf_counter() - began
         jax.monitoring.record_event_duration_secs(BUILD_EVENT, spent, fun_name=program.name)
         # tens of megabytes that a kernel has no use for

@@ -108,11 +108,11 @@ class Emitter:
             return tuple(map(self.splat, values))
         return values
 
-    def intrinsic(self, name: str, *operands: ir.Value, suffix: str | None = None) -> ir.Value:
+    def intrinsic(self, name: str, *operands: ir.Value) -> ir.Value:
         """Call an LLVM intrinsic overloaded by its operands' type."""
         kind = operands[0].type
-        full = f"llvm.{name}.{mangled(kind) if suffix is None else suffix}"
-        function = self.declared(full, ir.FunctionType(kind, [o.type for o in operands]))
+        of_operands = ir.FunctionType(kind, [o.type for o in operands])
+        function = self.declared(f"llvm.{name}.{mangled(kind)}", of_operands)
         fast = CONTRACT if is_float(operands[0]) else ()
         return self.b.call(function, operands, fastmath=fast)
 

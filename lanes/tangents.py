@@ -11,15 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 from llvmlite import ir
 
 from lanes.rules import constant, is_bool
 from lanes.values import Element, Tangent
 
-_FactorExpression: TypeAlias = "_Product | _Sum | _Choice | _Inverse"
-Factor: TypeAlias = "float | ir.Value | _FactorExpression"
+Factor: TypeAlias = "float | ir.Value | _Operation"
 SHARED_COST = 0.1
 """Cost of an operation on factors, over that of one in each column."""
 MAX_CHOSEN_TERMS = 6
@@ -27,27 +26,19 @@ MAX_CHOSEN_TERMS = 6
 
 
 @dataclass(eq=False)
-class _Product:
-    first: Any
-    second: Any
+class _Operation:
+    """A primitive of factors: ``mul``, ``add``, ``div`` of 1.0, or ``select_n``."""
+
+    name: str
+    operands: tuple[Any, ...]
 
 
-@dataclass(eq=False)
-class _Sum:
-    first: Any
-    second: Any
+def _is(factor: Factor, name: str) -> TypeGuard[_Operation]:
+    return isinstance(factor, _Operation) and factor.name == name
 
 
-@dataclass(eq=False)
-class _Inverse:
-    of: Any
-
-
-@dataclass(eq=False)
-class _Choice:
-    which: ir.Value
-    first: Any
-    second: Any
+def _chosen_between(which: ir.Value, first: Factor, second: Factor) -> Factor:
+    return _Operation("select_n", (which, first, second))
 
 
 def _times(x: Factor, y: Factor) -> Factor:
@@ -58,19 +49,20 @@ def _times(x: Factor, y: Factor) -> Factor:
     if isinstance(x, float):
         if x in (0.0, 1.0):
             return y if x else x
-        if isinstance(y, _Product) and isinstance(y.first, float):
-            return _times(x * y.first, y.second)
-    if isinstance(x, _Choice):
+        if _is(y, "mul") and isinstance(y.operands[0], float):
+            return _times(x * y.operands[0], y.operands[1])
+    if _is(x, "select_n"):
         x, y = y, x
-    if isinstance(y, _Choice) and 0.0 in (y.first, y.second):
-        return _Choice(y.which, _times(x, y.first), _times(x, y.second))
-    return _Product(x, y)
+    if _is(y, "select_n") and 0.0 in y.operands[1:]:
+        which, *cases = y.operands
+        return _Operation("select_n", (which, *(_times(x, case) for case in cases)))
+    return _Operation("mul", (x, y))
 
 
 def _plus(x: Factor, y: Factor) -> Factor:
     if isinstance(x, float) and isinstance(y, float):
         return x + y
-    return _Sum(x, y)
+    return _Operation("add", (x, y))
 
 
 _SIGNS: Mapping[str, Sequence[float]] = {
@@ -178,8 +170,8 @@ class _Finite:
             if id(made) in seen or name in _CARRIED:
                 continue
             seen[id(made)] = made
-            if isinstance(made, _Product | _Sum | _Choice):
-                left += [made.first, made.second]
+            if isinstance(made, _Operation) and made.name != "div":
+                left += made.operands[-2:]
             elif name in _SUMS:
                 left += [of for of in made.operands if not is_bool(of)]
             elif name == "fdiv" and isinstance(_number(made.operands[1]), float):
@@ -248,7 +240,7 @@ class Graph:
         else:
             terms: dict[Node, Factor] = {}
             for x, factor in given:
-                if isinstance(x, ir.Value) and _number(x) == 0.0:
+                if _is_zero(x):
                     continue
                 node = x if isinstance(x, Node) else self._of(x)
                 if node.terms != {}:
@@ -287,7 +279,12 @@ class Graph:
             found = [(x, _number(y))]
         elif name == "div" and not moving[1]:
             by = _number(operands[1])
-            found = [(operands[0], 1.0 / by if isinstance(by, float) and by else _Inverse(by))]
+            found = [
+                (
+                    operands[0],
+                    1.0 / by if isinstance(by, float) and by else _Operation("div", (1.0, by)),
+                )
+            ]
         return found
 
     def _chosen(self, which: ir.Value, *either: Tangent) -> Sequence[tuple[Any, Factor]] | None:
@@ -301,9 +298,12 @@ class Graph:
             parts += node.sum.items() if single else [(node, 1.0)]
         (of, factor), (other, own) = parts
         if of is other:
-            return [(of, _Choice(which, factor, own))]
+            return [(of, _chosen_between(which, factor, own))]
         if of.has_column_flags and other.has_column_flags:
-            return [(of, _Choice(which, factor, 0.0)), (other, _Choice(which, 0.0, own))]
+            return [
+                (of, _chosen_between(which, factor, 0.0)),
+                (other, _chosen_between(which, 0.0, own)),
+            ]
         return None
 
     def _left_out(self, which: ir.Value, *either: Element) -> Sequence[tuple[Any, Factor]] | None:
@@ -323,7 +323,7 @@ class Graph:
             else:
                 left += [(of, _times(factor, own)) for of, own in node.terms.items()]
         return [
-            (of, _Choice(which, factor, 0.0) if first_moves else _Choice(which, 0.0, factor))
+            (of, _chosen_between(which, *((factor, 0.0) if first_moves else (0.0, factor))))
             for of, factor in parts.items()
         ]
 
@@ -403,7 +403,7 @@ class Graph:
         return True
 
 
-def _is_zero(x: Element) -> bool:
+def _is_zero(x: Any) -> bool:
     return isinstance(x, ir.Value) and _number(x) == 0.0
 
 
@@ -429,13 +429,6 @@ class Factors:
         if isinstance(factor, ir.Value):
             return factor
         if id(factor) not in self._known:
-            self._known[id(factor)] = self._emit(factor, kind)
+            operands = [self.of(x, kind) for x in factor.operands]
+            self._known[id(factor)] = self._apply(factor.name, {}, *operands)
         return self._known[id(factor)]
-
-    def _emit(self, factor: _FactorExpression, kind: ir.Type) -> ir.Value:
-        if isinstance(factor, _Inverse):
-            return self._apply("div", {}, constant(kind, 1.0), self.of(factor.of, kind))
-        either = self.of(factor.first, kind), self.of(factor.second, kind)
-        if isinstance(factor, _Choice):
-            return self._apply("select_n", {}, factor.which, *either)
-        return self._apply("mul" if isinstance(factor, _Product) else "add", {}, *either)

@@ -38,7 +38,6 @@ def trimmed_start(
     resting: Bool[Array, "*batch"],
     *,
     speed_factor: Scalar | None = None,
-    gravity: float = GRAVITY,
 ) -> Start:
     """Return a start whose rotors and integrator are in trim where the vehicle rests.
 
@@ -52,12 +51,10 @@ def trimmed_start(
         Where the vehicle hovers.
     speed_factor
         The battery's factor on reference rotor speeds at the start; None for one.
-    gravity
-        m/s².
     """
     if len(vehicle.rotors) != ROTORS:
         return start
-    speeds = trim_speeds(vehicle, gravity=gravity)
+    speeds = trim_speeds(vehicle)
     asked = speeds if speed_factor is None else tuple(speed / speed_factor for speed in speeds)
     commands = tuple(command_of(vehicle.motor, speed) for speed in asked)
     integral = torque_of(controller.mixer, commands)
@@ -65,7 +62,7 @@ def trimmed_start(
     return Start(start.motion, *where(resting, (speeds, commands, integral), recorded))
 
 
-def trim_speeds(vehicle: Vehicle, *, gravity: float = GRAVITY) -> PerRotor:
+def trim_speeds(vehicle: Vehicle) -> PerRotor:
     """Return the speeds in rad/s at which four rotors carry the weight and all moments cancel.
 
     At rest in still air every force and moment is linear in what the motor constant multiplies, the
@@ -75,8 +72,8 @@ def trim_speeds(vehicle: Vehicle, *, gravity: float = GRAVITY) -> PerRotor:
     exponent = vehicle.effects.get("thrust_exponent")
     if exponent is not None:
         others = {name: e for name, e in vehicle.effects.items() if name != "thrust_exponent"}
-        squares = trim_speeds(replace(vehicle, effects=others), gravity=gravity)
-        hovering = hover_speed(vehicle, gravity=gravity)
+        squares = trim_speeds(replace(vehicle, effects=others))
+        hovering = hover_speed(vehicle)
         return tuple(speed * (speed / hovering) ** (2.0 / exponent - 1.0) for speed in squares)
     rest = Vec3.zeros(vehicle.body.mass)
     motion = Motion(rest, rest, Quaternion.identity(rest.x), rest)
@@ -89,7 +86,7 @@ def trim_speeds(vehicle: Vehicle, *, gravity: float = GRAVITY) -> PerRotor:
     unit = jnp.ones_like(rest.x)
     # one after the other, so that what acts is compiled once
     none, *columns = zip(*lax.map(lift_and_moments, np.eye(1 + ROTORS, ROTORS, -1)), strict=True)
-    weight = vehicle.body.mass * gravity
+    weight = vehicle.body.mass * GRAVITY
     wanted = [weight - none[0], -none[1], -none[2], -none[3]]
     rows = [
         [*(column[axis] - none[axis] for column in columns), wanted[axis]] for axis in range(ROTORS)

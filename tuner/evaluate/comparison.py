@@ -190,13 +190,12 @@ class _Group:
         )
         segments = window_segments(
             flights,
+            pieces,
             inlets=inlets,
-            seconds=self._seconds,
             schedule=self._schedule,
             lag=ROTOR_LAG_S,
             noise=noise_of(flights),
             free_starts=free_starts,
-            pieces=pieces,
         )
         return segments, pieces
 

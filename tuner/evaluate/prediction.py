@@ -172,13 +172,12 @@ class FlightPredictor:
         motor, schedule = vehicle.motor, schedule_of(controller)
         segments = window_segments(
             [self.flight],
+            self._pieces,
             inlets=[self.inlet],
-            seconds=self.seconds,
             schedule=schedule,
             lag=0.5 * (motor.time_constant_up + motor.time_constant_down),
             noise={},
             free_starts=False,
-            pieces=self._pieces,
         )
         segments = _select(segments, self._whole)
         if observer is not None:

@@ -196,7 +196,22 @@ def cut_windows(
     free_starts: bool = True,
     input_late: Mapping[str, float] = MappingProxyType({}),
 ) -> list[FlightWindow]:
-    """Cut flights into the windows that `window_segments` lays out, with parameters as there."""
+    """Cut flights into the windows that `window_segments` lays out.
+
+    Parameters
+    ----------
+    flights, inlets
+        N flights, and the inlet of each.
+    seconds
+        s, length of a window.
+    stride
+        s from the beginning of a window to that of the next; by default its length.
+    free_starts
+        Whether starts are free, about the widely smoothed state; else they are the recorded states
+        (`tuner.recordings.states`).
+    input_late
+        Flight name -> s by which inputs are stamped later than the compared channels.
+    """
     pieces = []
     for number, (flight, name) in enumerate(zip(flights, inlets, strict=True)):
         fed, late = INLETS[name].fed(flight), input_late.get(flight.name, 0.0)
@@ -210,51 +225,30 @@ def cut_windows(
 
 def window_segments(
     flights: Sequence[Flight],
+    pieces: Sequence[FlightWindow],
     *,
     inlets: Sequence[InletName],
-    seconds: float,
     schedule: Schedule,
     lag: float,
     noise: Mapping[str, float],
     weights: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
-    stride: float | None = None,
     free_starts: bool = True,
-    input_late: Mapping[str, float] = MappingProxyType({}),
-    pieces: Sequence[FlightWindow] | None = None,
 ) -> Segments:
     """Lay the windows of all flights side by side.
 
     Parameters
     ----------
-    flights
-        N flights.
+    flights, pieces
+        N flights, and their windows, as of `cut_windows`.
     inlets, schedule
         Inlet of each flight, and the rates of the loop.
-    seconds
-        s, length of a window.
     lag
         Time constant of rotors, s: gives the initial speed of those without tachometer.
     noise, weights
         As of `segments_of`.
-    stride
-        s from the beginning of a window to that of the next; by default its length.
     free_starts
-        Whether starts are free, about the widely smoothed state; else they are the recorded states
-        (`tuner.recordings.states`).
-    input_late
-        Flight name -> s by which inputs are stamped later than the compared channels.
-    pieces
-        The windows, if `cut_windows` has cut them already.
+        Whether starts are free, as of `cut_windows`.
     """
-    if pieces is None:
-        pieces = cut_windows(
-            flights,
-            inlets=inlets,
-            seconds=seconds,
-            stride=stride,
-            free_starts=free_starts,
-            input_late=input_late,
-        )
     cut = [piece.flight for piece in pieces]
     start = start_of([flight.initial for flight in cut], resting=False)
     names = [inlets[piece.number] for piece in pieces]

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit
@@ -92,15 +89,12 @@ class Space:
         own = (scaled - self.prior_mean) / self.prior_sd
         return np.concatenate([own, scaled @ self.joint_rows.T + self.joint_offset], axis=-1)
 
-    def at(self, vector: Any) -> Any:
-        """Return the parameters' values at search vectors (*S, K), which may be traced."""
-        if isinstance(vector, jax.core.Tracer):
-            scaled = self.lower + self.width * jax.nn.sigmoid(vector / self.stretch)
-            return jnp.where(self.is_log, jnp.exp(jnp.where(self.is_log, scaled, 0.0)), scaled)
+    def at(self, vector: ArrayLike) -> Array:
+        """Return the parameters' values at search vectors (*S, K)."""
         scaled = self.scaled(vector)
-        return np.where(self.is_log, np.exp(np.where(self.is_log, scaled, 0.0)), scaled)
+        return np.asarray(np.where(self.is_log, np.exp(np.where(self.is_log, scaled, 0.0)), scaled))
 
-    def values(self, vector: Any) -> dict[str, Any]:
+    def values(self, vector: ArrayLike) -> dict[str, Array]:
         """Return every free coefficient's value (*S,), tied ones too; as of `at`."""
         values = self.at(vector)
         return {

@@ -18,7 +18,13 @@ from tuner.objective.initial_conditions import begins_gently
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal_equations import Objective
-from tuner.objective.segments import Segments, segments_of, stamped_earlier, window_segments
+from tuner.objective.segments import (
+    Segments,
+    cut_windows,
+    segments_of,
+    stamped_earlier,
+    window_segments,
+)
 from tuner.objective.space import Space, space_of
 from tuner.recordings.flight import Flight
 from tuner.search.job_flights import Recording
@@ -186,17 +192,23 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     windows, free_starts = None, _free_starts(job.search.criterion, inlets)
     stride = None if free_starts else WINDOW_STRIDE * seconds
     if not closed or not all(begins_gently(flight) for flight in fitted):
-        segments = window_segments(
+        pieces = cut_windows(
             compared,
             inlets=inlets,
             seconds=seconds,
+            stride=stride,
+            free_starts=free_starts,
+            input_late={recording.flight.name: recording.input_late for recording in to_fit},
+        )
+        segments = window_segments(
+            compared,
+            pieces,
+            inlets=inlets,
             schedule=schedule,
             lag=settings.vehicle.motor.time_constant_up,
             noise=noise,
             weights=_weights(settings, fitted, whole=False),
-            stride=stride,
             free_starts=free_starts,
-            input_late={recording.flight.name: recording.input_late for recording in to_fit},
         )
         windows = problem(segments, min(longest, seconds + 1.0 / fitted[0].rate), AIRBORNE)
     if closed:

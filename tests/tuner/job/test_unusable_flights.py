@@ -15,7 +15,7 @@ from tuner.evaluate.validation import flights_worse
 from tuner.findings.findings import Code, Finding
 from tuner.job.check import merged_by_flight
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by
-from tuner.objective.segments import window_segments
+from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.space import space_of
 from tuner.objective.windows import windows_of
 from tuner.recordings.defects import LIMITS, is_outlier
@@ -46,8 +46,9 @@ def test_windows_without_what_is_fed_in_are_left_out(flight):
     begins = [round(window.begin) for window in windows_of(gap, 1.0, fed=("command",))]
     assert not {3, 4} & set(begins)
     assert {2, 5} <= set(begins)
+    pieces = cut_windows([gap], inlets=["actuator"], seconds=1.0)
     segments = window_segments(
-        [gap], inlets=["actuator"], seconds=1.0, schedule=Schedule(), lag=0.02, noise={}
+        [gap], pieces, inlets=["actuator"], schedule=Schedule(), lag=0.02, noise={}
     )
     assert segments.count == len(begins)
 

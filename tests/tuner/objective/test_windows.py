@@ -10,7 +10,7 @@ from sim_jax.schedule import Schedule
 from tuner.core.errors import RecordingError
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.inlets import INLETS, linear_interpolation, zero_order_hold
-from tuner.objective.segments import window_segments
+from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.windows import windows_of
 from tuner.recordings.flight import Series
 from tuner.search.inlet_choice import inlet_for
@@ -103,8 +103,8 @@ def test_the_actuator_inlet_holds_what_was_recorded(flight):
 def test_every_inlet_gives_segments_whose_starts_are_free(flight, inlet, known):
     segments = window_segments(
         [flight],
+        cut_windows([flight], inlets=[inlet], seconds=1.0),
         inlets=[inlet],
-        seconds=1.0,
         schedule=Schedule(),
         lag=0.02,
         noise={"position": 1e-3, "body_rate": 0.02, "rotor_speed": 2.0, "command": 1e-3},
