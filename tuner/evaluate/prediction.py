@@ -256,11 +256,7 @@ def hold_state(
     ``recorded`` is `FlightPredictor.recorded`, if it is known.
     """
     start = states_at(flight.series, begins)
-    shape = (len(ahead), len(begins))
-    reached = {
-        name: np.broadcast_to(getattr(start, name), (*shape, getattr(start, name).shape[-1]))
-        for name in PREDICTED_UNITS
-    }
+    reached = {name: getattr(start, name)[None] for name in PREDICTED_UNITS}
     if recorded is None:
         recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
-    return Predictions(begins, ahead, errors_of(reached, recorded, shape))
+    return Predictions(begins, ahead, errors_of(reached, recorded, (len(ahead), len(begins))))

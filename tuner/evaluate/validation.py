@@ -142,85 +142,54 @@ class Validation:
     initial: Mapping[str, FlightErrors]
     best: Mapping[str, FlightErrors]
     fitted_starts: Mapping[str, FlightErrors] = field(default_factory=dict)
-    predicted_initial: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
-    predicted_best: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
-    predicted_with_observer: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
-    predicted_holding: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
-    worse_than_holding: Mapping[str, Mapping[float, tuple[str, ...]]] = field(default_factory=dict)
-    turning_explained: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _FlightPredictions:
-    """Predictions of one flight; ``observed`` with an observed torque, for rotor inputs only."""
-
-    initial: Predictions
-    best: Predictions
-    held: Predictions
-    observed: Predictions | None
+    predicted_initial: dict[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
+    predicted_best: dict[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
+    predicted_with_observer: dict[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
+    predicted_holding: dict[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
+    worse_than_holding: dict[str, Mapping[float, tuple[str, ...]]] = field(default_factory=dict)
+    turning_explained: dict[str, float] = field(default_factory=dict)
 
 
 def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
     """Fly every flight with the initial and with the fitted vehicle."""
-    comparison, initial = comparison_of(job, fitted), job.given.vehicle
-    predicted = _predict_flights(job, fitted, vehicle)
-    return Validation(
-        initial=comparison.fly(initial),
+    comparison, controller = comparison_of(job, fitted), controller_flown(job, fitted)
+    validation = Validation(
+        initial=comparison.fly(job.given.vehicle),
         best=comparison.fly(vehicle),
         fitted_starts=comparison.fly(vehicle, fitted_starts=True),
-        predicted_initial={name: _mean_errors(of.initial) for name, of in predicted.items()},
-        predicted_best={name: _mean_errors(of.best) for name, of in predicted.items()},
-        predicted_with_observer={
-            name: _mean_errors(of.observed)
-            for name, of in predicted.items()
-            if of.observed is not None
-        },
-        predicted_holding={name: _mean_errors(of.held) for name, of in predicted.items()},
-        worse_than_holding={
-            name: {seconds: of.best.worse_than(of.held, seconds) for seconds in HORIZONS_S}
-            for name, of in predicted.items()
-        },
-        turning_explained={
-            name: 1.0 - _body_rate_mse(of.best) / _body_rate_mse(of.held)
-            for name, of in predicted.items()
-            if "body_rate" in of.best.errors
-        },
     )
-
-
-def _predict_flights(
-    job: Job, fitted: Fitted, vehicle: VehicleFile
-) -> dict[str, _FlightPredictions]:
-    """Return flight -> its predictions, for flights that are not flown in a closed loop."""
-    controller = controller_flown(job, fitted)
     known = [(r.flight, r.inlet, r.input_late) for r in job.recordings if not r.holdout]
     observer = TorqueObserver.of(vehicle, controller, known)
-    found = {}
     for recording in job.recordings:
         if INLETS[recording.inlet].closed_loop:
             continue
-        predictor = FlightPredictor(
-            recording.flight,
-            recording.inlet,
-            seconds=max(HORIZONS_S),
-            stride=STRIDE_S,
-            input_late=recording.input_late,
+        name, predictor = (
+            recording.flight.name,
+            FlightPredictor(
+                recording.flight,
+                recording.inlet,
+                seconds=max(HORIZONS_S),
+                stride=STRIDE_S,
+                input_late=recording.input_late,
+            ),
         )
+        initial = predictor.predict(job.given.vehicle, controller)
         best = predictor.predict(vehicle, controller)
-        observes = observer is not None and recording.inlet in ROTOR_INLETS
-        found[recording.flight.name] = _FlightPredictions(
-            initial=predictor.predict(job.given.vehicle, controller),
-            best=best,
-            held=_hold_errors(predictor, best),
-            observed=predictor.predict(vehicle, controller, observer) if observes else None,
-        )
-    return found
-
-
-def _hold_errors(predictor: FlightPredictor, predictions: Predictions) -> Predictions:
-    """Return the errors of a constant state in the predicted quantities."""
-    naive = hold_state(predictor.flight, predictor.begins, predictor.ahead, predictor.recorded)
-    return replace(naive, errors={name: naive.errors[name] for name in predictions.errors})
+        held = hold_state(predictor.flight, predictor.begins, predictor.ahead, predictor.recorded)
+        held = replace(held, errors={quantity: held.errors[quantity] for quantity in best.errors})
+        validation.predicted_initial[name] = _mean_errors(initial)
+        validation.predicted_best[name] = _mean_errors(best)
+        validation.predicted_holding[name] = _mean_errors(held)
+        validation.worse_than_holding[name] = {
+            seconds: best.worse_than(held, seconds) for seconds in HORIZONS_S
+        }
+        if observer is not None and recording.inlet in ROTOR_INLETS:
+            observed = predictor.predict(vehicle, controller, observer)
+            validation.predicted_with_observer[name] = _mean_errors(observed)
+        if "body_rate" in best.errors:
+            explained = 1.0 - _body_rate_mse(best) / _body_rate_mse(held)
+            validation.turning_explained[name] = explained
+    return validation
 
 
 def _mean_errors(of: Predictions) -> tuple[PredictedErrors, ...]:
