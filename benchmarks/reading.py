@@ -19,7 +19,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from benchmarks.table import Section
 from tuner.recordings.formats import open_recording
-from tuner.recordings.recording import Request
 from tuner.recordings.sources import choose_map, locate
 from tuner.recordings.topics import shipped_maps
 
@@ -60,18 +59,22 @@ def to_ros2(bag: Path, folder: Path, storage: StoragePlugin) -> Path:
     return folder
 
 
-def wanted(path: Path) -> dict[str, Request]:
-    """Return the requests of a flight to a recording."""
+Wanted = dict[str, tuple[str, ...]]
+"""Topic -> fields."""
+
+
+def wanted(path: Path) -> Wanted:
+    """Return the fields of a recording that a flight needs."""
     recording = open_recording(path)
     places, _ = locate(recording, choose_map(recording, shipped_maps(recording.format)))
     fields: dict[str, list[str]] = {}
     for place in places.values():
         rotor = [place.source.rotor] if place.source.rotor else []
         fields.setdefault(place.topic, []).extend([*place.fields, *rotor])
-    return {topic: Request(tuple(names)) for topic, names in fields.items()}
+    return {topic: tuple(names) for topic, names in fields.items()}
 
 
-def with_rosbags(path: Path, requests: dict[str, Request]) -> int:
+def with_rosbags(path: Path, requests: Wanted) -> int:
     """Deserialise the wanted topics with rosbags; return how many messages."""
     count = 0
     with AnyReader([path]) as reader:
@@ -82,13 +85,13 @@ def with_rosbags(path: Path, requests: dict[str, Request]) -> int:
     return count
 
 
-def with_tuner(path: Path, requests: dict[str, Request]) -> int:
+def with_tuner(path: Path, requests: Wanted) -> int:
     """Read the wanted fields; return how many messages."""
     contents = open_recording(path).read(requests)
     return sum(len(samples.receive) for samples in contents.samples.values())
 
 
-def best(work: Callable[[Path, dict[str, Request]], int], path: Path) -> tuple[float, int]:
+def best(work: Callable[[Path, Wanted], int], path: Path) -> tuple[float, int]:
     """Return the least processor time of three, and the count."""
     requests = wanted(path)
     times = []

@@ -22,7 +22,7 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import Z95, Array, robust_sd
 from tuner.ground.measurement import Curve
 from tuner.recordings.content import Content, ReadOptions, read_content
-from tuner.recordings.recording import TABLE_TOPIC, Clock, Request, TabularRecording
+from tuner.recordings.recording import TABLE_TOPIC, Clock, TabularRecording
 
 OUTLIER_SIGMAS = 3.0
 """A tachometer's sample that is off by more robust standard deviations is dropped (6.3.2)."""
@@ -259,7 +259,7 @@ def read_columns(
     if not any(name in table.columns for name in TIME_COLUMNS):
         raise RecordingError(path, "has no column time", "add it, in s")
     clocks = tuple(Clock(field=name, unit="s") for name in TIME_COLUMNS)
-    contents = table.read({TABLE_TOPIC: Request(tuple(chosen.values()), clocks)})
+    contents = table.read({TABLE_TOPIC: tuple(chosen.values())}, clocks)
     rows = contents.samples[TABLE_TOPIC]
     if len(rows.receive) < MIN_SAMPLES:
         what = f"holds {len(rows.receive)} samples with a time"

@@ -17,7 +17,7 @@ from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.frames import DOUBTS, contradiction, correct_frames
 from tuner.recordings.missions import Mission, find_missions, split_into_manoeuvres
 from tuner.recordings.notes import Damage, Note, NoteCode
-from tuner.recordings.recording import Clock, Nanoseconds, ReadResult, Recording, Request, Samples
+from tuner.recordings.recording import Clock, Nanoseconds, ReadResult, Recording, Samples
 from tuner.recordings.sources import (
     Place,
     choose_map,
@@ -408,9 +408,7 @@ def extract(
         fields = wanted.setdefault(place.topic, [])
         extra = [place.source.rotor] if place.source.rotor else []
         fields.extend(name for name in (*place.fields, *extra) if name not in fields)
-    contents = recording.read(
-        {topic: Request(tuple(names), clocks) for topic, names in wanted.items()}
-    )
+    contents = recording.read({topic: tuple(names) for topic, names in wanted.items()}, clocks)
     receive_only = {p.topic for p in places.values() if p.source.stamp == "receive"}
     kinds = {t: {s for s, place in places.items() if place.topic == t} for t in wanted}
     slow_topics = {topic for topic, held in kinds.items() if held <= SLOW_SIGNALS}

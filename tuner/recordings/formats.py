@@ -22,20 +22,6 @@ BINARY_SUFFIXES = (".bag", ".db3", ".mcap", ".ulg")
 
 
 @dataclass(frozen=True)
-class FileStart:
-    """The beginning of a recording.
-
-    Attributes
-    ----------
-    start
-        The first 4096 bytes; empty for a folder.
-    """
-
-    path: Path
-    start: bytes
-
-
-@dataclass(frozen=True)
 class Reader:
     """One format.
 
@@ -46,7 +32,8 @@ class Reader:
     files
         Its files, as the error for an unknown format lists them.
     matches
-        Whether a recording is of this format.
+        Whether a recording is of this format, by its path and its first 4096 bytes; those of a
+        folder are empty.
     open
         Opens a recording, given ``.msg`` files for types that it does not define. It imports the
         format's library on demand: all of them together take half a second.
@@ -56,21 +43,24 @@ class Reader:
 
     format: str
     files: str
-    matches: Callable[[FileStart], bool]
+    matches: Callable[[Path, bytes], bool]
     open: Callable[[Path, tuple[Path, ...]], Recording]
     tabular: bool = False
 
 
-def _is_ros(head: FileStart) -> bool:
-    empty_bag = head.path.suffix == ".bag" and not head.start
-    magic = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3")
-    return head.path.is_dir() or head.start.startswith(magic) or empty_bag
+def _is_ros(path: Path, start: bytes) -> bool:
+    empty_bag = path.suffix == ".bag" and not start
+    return (
+        path.is_dir()
+        or start.startswith((b"#ROSBAG", b"\x89MCAP", b"SQLite format 3"))
+        or empty_bag
+    )
 
 
-def _is_table(head: FileStart) -> bool:
+def _is_table(path: Path, start: bytes) -> bool:
     """Return whether a file is Parquet, or a text with cells that is not called a bag or a log."""
-    text = head.path.suffix.lower() not in BINARY_SUFFIXES and is_table(head.start)
-    return head.start.startswith(b"PAR1") or text
+    is_text = path.suffix.lower() not in BINARY_SUFFIXES and is_table(start)
+    return start.startswith(b"PAR1") or is_text
 
 
 def _lazy_reader(module: str, name: str) -> Callable[[Path, tuple[Path, ...]], Recording]:
@@ -94,19 +84,19 @@ READERS: tuple[Reader, ...] = (
     Reader(
         "ulog",
         "PX4 .ulg",
-        lambda head: head.start.startswith(b"ULog"),
+        lambda _, start: start.startswith(b"ULog"),
         _lazy_reader("ulog", "ULogRecording"),
     ),
     Reader(
         "micro_sd",
         "Crazyflie micro-SD logs",  # a byte 0xBC alone is that of any text
-        lambda head: head.start.startswith((b"\xbc\x01\x00", b"\xbc\x02\x00")),
+        lambda _, start: start.startswith((b"\xbc\x01\x00", b"\xbc\x02\x00")),
         _lazy_reader("micro_sd", "MicroSdRecording"),
     ),
     Reader(
         "table",
         "MATLAB .mat",
-        lambda head: head.start.startswith((b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")),
+        lambda _, start: start.startswith((b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")),
         _lazy_reader("matlab", "MatlabTable"),
         tabular=True,
     ),
@@ -140,9 +130,8 @@ def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
         if not path.is_dir():
             with path.open("rb") as stream:
                 start = stream.read(4096)
-        head = FileStart(path, start)
         for reader in READERS:
-            if reader.matches(head):
+            if reader.matches(path, start):
                 return reader.open(path, messages)
     if start.startswith((b"\x1f\x8b", b"PK\x03\x04", b"BZh", b"\xfd7zXZ")):
         raise RecordingError(path, "is packed", "unpack it first")

@@ -24,7 +24,6 @@ from tuner.recordings.recording import (
     TABLE_TOPIC,
     Clock,
     ReadResult,
-    Request,
     Samples,
     TabularRecording,
     short_reason,
@@ -78,20 +77,21 @@ class MatlabTable(TabularRecording):
             what = f"holds the bare matrix '{name}' of {count} columns, which have no names"
             self.naming_problem = (what, remedy)
 
-    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
+    def read(
+        self, wanted: Mapping[str, tuple[str, ...]], clocks: tuple[Clock, ...] = ()
+    ) -> ReadResult:
         """Read the wanted columns, each at the times of its own structure."""
         if TABLE_TOPIC not in wanted:
             return ReadResult({})
-        request = wanted[TABLE_TOPIC]
-        clock = self.clock(request)
+        clock, wanted_columns = self.clock(clocks), wanted[TABLE_TOPIC]
         groups: dict[str, list[str]] = {}
-        for name in request.fields:
+        for name in wanted_columns:
             time = self._times.get(name) if clock.field == ANY_TIME else clock.field
             if time is not None and len(self._columns[time]) == len(self._columns[name]):
                 groups.setdefault(time, []).append(name)
         parts, notes = [], list[Note]()
         for field, names in groups.items():
-            part, note = self._part(Clock(field=field, unit=clock.unit), names, request.fields)
+            part, note = self._part(Clock(field=field, unit=clock.unit), names, wanted_columns)
             parts.append(part)
             notes += note
         if not parts:
@@ -99,7 +99,7 @@ class MatlabTable(TabularRecording):
                 self.path, f"has no column as long as '{clock.field}'", "name another time"
             )
         stamps = np.concatenate([part.receive for part in parts])
-        fields = {n: np.concatenate([part.fields[n] for part in parts]) for n in request.fields}
+        fields = {n: np.concatenate([part.fields[n] for part in parts]) for n in wanted_columns}
         return ReadResult({TABLE_TOPIC: Samples(stamps, stamps, fields)}, tuple(notes))
 
     def _part(

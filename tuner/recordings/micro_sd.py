@@ -19,7 +19,7 @@ import numpy as np
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
-from tuner.recordings.recording import NS_PER_UNIT, ReadResult, Recording, Request, Samples, Topic
+from tuner.recordings.recording import NS_PER_UNIT, Clock, ReadResult, Recording, Samples, Topic
 
 MAGIC = 0xBC
 #: Logs are read into memory; a kilohertz of ten variables is 3 MB a minute.
@@ -77,9 +77,13 @@ class MicroSdRecording(Recording):
         names = self._events[topic].layout.names if topic in self._events else ()
         return [name for name in names or () if name not in (_NUMBER, _STAMP)]
 
-    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
+    def read(
+        self,
+        wanted: Mapping[str, tuple[str, ...]],
+        clocks: tuple[Clock, ...] = (),  # noqa: ARG002
+    ) -> ReadResult:
         """Read the wanted variables of some events."""
-        samples = {name: self._samples(name, request) for name, request in wanted.items()}
+        samples = {name: self._samples(name, fields) for name, fields in wanted.items()}
         return ReadResult(samples, damage=self._damage())
 
     def _damage(self) -> tuple[Damage, ...]:
@@ -92,8 +96,8 @@ class MicroSdRecording(Recording):
             return (Damage(Cause.LOG_DAMAGED),)
         return (Damage(Cause.END_MISSING, bytes_lost=self._lost),)
 
-    def _samples(self, topic: str, request: Request) -> Samples:
-        event, missing = self._events[topic], self.missing_fields(topic, request.fields)
+    def _samples(self, topic: str, fields: tuple[str, ...]) -> Samples:
+        event, missing = self._events[topic], self.missing_fields(topic, fields)
         if missing:
             raise RecordingError(
                 self.path, f"{topic} has no variable '{missing[0]}'", "correct the topic map"
@@ -105,8 +109,7 @@ class MicroSdRecording(Recording):
         latest = np.uint64(np.iinfo(np.int64).max // self._unit)
         time = np.minimum(rows[_STAMP].astype(np.uint64), latest).astype(np.int64) * self._unit
         with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged log
-            fields = {name: rows[name].astype(np.float64) for name in request.fields}
-        return Samples(time, time, fields)
+            return Samples(time, time, {name: rows[name].astype(np.float64) for name in fields})
 
 
 class _Header:

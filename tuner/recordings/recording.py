@@ -67,22 +67,6 @@ class Clock(Section):
 
 
 @dataclass(frozen=True)
-class Request:
-    """The fields to read of a topic.
-
-    Attributes
-    ----------
-    fields
-        Paths of numbers.
-    clocks
-        Fields that may hold the time, the preferred one first; empty means the message's header.
-    """
-
-    fields: tuple[str, ...]
-    clocks: tuple[Clock, ...] = ()
-
-
-@dataclass(frozen=True)
 class Samples:
     """The messages of one topic, in the order of the file.
 
@@ -169,8 +153,18 @@ class Recording(ABC):
         return True
 
     @abstractmethod
-    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
-        """Read the requested fields: topic -> request.
+    def read(
+        self, wanted: Mapping[str, tuple[str, ...]], clocks: tuple[Clock, ...] = ()
+    ) -> ReadResult:
+        """Read the requested fields of some topics.
+
+        Parameters
+        ----------
+        wanted
+            Topic -> paths of numbers.
+        clocks
+            Fields that may hold the time, the preferred one first; empty means the message's
+            header.
 
         Raises
         ------
@@ -198,15 +192,15 @@ class TabularRecording(Recording):
         """Return the columns."""
         return self.columns
 
-    def clock(self, request: Request) -> Clock:
-        """Return the column that holds the time.
+    def clock(self, clocks: tuple[Clock, ...]) -> Clock:
+        """Return the first of some clocks that it has a column of.
 
         Raises
         ------
         RecordingError
             It has no requested time column.
         """
-        for clock in request.clocks:
+        for clock in clocks:
             if clock.field in self.columns:
                 return clock
         raise RecordingError(

@@ -37,7 +37,6 @@ from tuner.recordings.recording import (
     Clock,
     Nanoseconds,
     ReadResult,
-    Request,
     Samples,
     TabularRecording,
     short_reason,
@@ -82,15 +81,16 @@ class Table(TabularRecording):
             )
         super().__init__(path, "table", columns)
 
-    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
+    def read(
+        self, wanted: Mapping[str, tuple[str, ...]], clocks: tuple[Clock, ...] = ()
+    ) -> ReadResult:
         """Read the wanted columns."""
         if TABLE_TOPIC not in wanted:
             return ReadResult({})
-        request = wanted[TABLE_TOPIC]
-        clock = self.clock(request)
-        names = list(dict.fromkeys([clock.field, *request.fields]))
+        clock = self.clock(clocks)
+        names = list(dict.fromkeys([clock.field, *wanted[TABLE_TOPIC]]))
         table = self._read(names)
-        fields = {name: numbers_of(table.column(name)) for name in request.fields}
+        fields = {name: numbers_of(table.column(name)) for name in wanted[TABLE_TOPIC]}
         time, noted = read_times(self.path, table.column(clock.field), clock, fields.values())
         notes = list(noted)
         damage = [Damage(Cause.ROWS_MALFORMED, lost=self._skipped)] if self._skipped else []

@@ -13,7 +13,7 @@ import contextlib
 import io
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,6 @@ from tuner.recordings.recording import (
     FieldLayout,
     ReadResult,
     Recording,
-    Request,
     Samples,
     Topic,
     short_reason,
@@ -94,7 +93,9 @@ class ULogRecording(Recording):
         kind = topic.partition("[")[0]
         return tuple(path for path in fields if not _has(self._formats, kind, path.split(".")))
 
-    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
+    def read(
+        self, wanted: Mapping[str, tuple[str, ...]], clocks: tuple[Clock, ...] = ()
+    ) -> ReadResult:
         """Read the wanted fields of some messages."""
         names = sorted({topic.partition("[")[0] for topic in wanted})
         log, complaint = _parse(self.path, names)
@@ -102,7 +103,7 @@ class ULogRecording(Recording):
         for data in log.data_list:
             topic = data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
             if topic in wanted:
-                samples[topic] = self._samples(topic, data.data, wanted[topic])
+                samples[topic] = self._samples(topic, data.data, wanted[topic], clocks)
         damage = []
         if log.dropouts:
             starts = [dropout.timestamp * 1e-6 for dropout in log.dropouts]
@@ -123,26 +124,26 @@ class ULogRecording(Recording):
             damage.append(Damage(Cause.END_MISSING, bytes_lost=self._cut_bytes, start=last))
         return ReadResult(samples, damage=tuple(damage))
 
-    def _samples(self, topic: str, data: Mapping[str, Any], request: Request) -> Samples:
+    def _samples(
+        self, topic: str, data: Mapping[str, Any], fields: Sequence[str], clocks: Sequence[Clock]
+    ) -> Samples:
         if "timestamp" not in data:
             raise RecordingError(self.path, f"{topic} has no timestamp", "leave it out of the map")
         receive = data["timestamp"].astype(np.int64) * NS_PER_UNIT["us"]
-        clocks = (*request.clocks, Clock(field="timestamp_sample", unit="us"))
         stamp = receive
-        for clock in clocks:
+        for clock in (*clocks, Clock(field="timestamp_sample", unit="us")):
             if clock.field in data:
                 sampled = data[clock.field].astype(np.int64) * clock.nanoseconds
                 stamp = np.where(sampled > 0, sampled, receive)
                 break
-        missing = [name for name in request.fields if name not in data]
+        missing = [name for name in fields if name not in data]
         if missing:
             raise RecordingError(
                 self.path,
                 f"{topic} has no field '{missing[0]}', it has {', '.join(list(data)[:12])}",
                 "correct the topic map",
             )
-        fields = {name: data[name].astype(np.float64) for name in request.fields}
-        return Samples(receive, stamp, fields)
+        return Samples(receive, stamp, {name: data[name].astype(np.float64) for name in fields})
 
 
 def _blocks(path: Path) -> Iterator[tuple[bytes, list[int]]]:

@@ -15,7 +15,6 @@ from tuner.recordings.flight import Flight
 from tuner.recordings.formats import open_recording
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause
-from tuner.recordings.recording import Request
 from tuner.recordings.ros.mcap import records
 
 
@@ -145,7 +144,7 @@ def test_px4_log_and_bridge(tmp_path: Path, short: Path) -> None:
 
 def test_decoding_agrees_with_rosbags_bit_for_bit(short: Path) -> None:
     expected = making.columns_of(short, {t: list(f) for t, f in making.LAB.items()})
-    wanted = {topic: Request(tuple(fields)) for topic, fields in making.LAB.items()}
+    wanted = {topic: tuple(fields) for topic, fields in making.LAB.items()}
     contents = open_recording(short).read(wanted)
     for topic, column in expected.items():
         samples = contents.samples[topic]

@@ -19,7 +19,6 @@ from tuner.recordings.interpolation import body_rate_of, correlation, smooth
 from tuner.recordings.loader import load_flight
 from tuner.recordings.micro_sd import MicroSdRecording
 from tuner.recordings.notes import Cause
-from tuner.recordings.recording import Request
 
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", Path(__file__).parents[4] / "shared" / "flights"))
 LEE = sorted((REAL / "crazyswarm").glob("log*"))
@@ -57,7 +56,7 @@ def test_what_was_written_is_read(tmp_path_factory: pytest.TempPathFactory, log:
     assert {topic.name: topic.count for topic in recording.topics} == {
         name: len(rows) for name, (_, rows) in events.items()
     }
-    contents = recording.read({name: Request(tuple(v)) for name, (v, _) in events.items()})
+    contents = recording.read({name: tuple(v) for name, (v, _) in events.items()})
     assert not contents.damage
     for name, (variables, rows) in events.items():
         samples = contents.samples[name]
@@ -77,7 +76,7 @@ def short(path: Path) -> Path:
 def test_a_log_whose_end_is_missing_is_read_up_to_there(tmp_path: Path, lost: int) -> None:
     path = short(tmp_path / "log00")
     path.write_bytes(path.read_bytes()[:-lost])
-    contents = open_recording(path).read({"fixedFrequency": Request(("gyro.x",))})
+    contents = open_recording(path).read({"fixedFrequency": ("gyro.x",)})
     samples = contents.samples["fixedFrequency"]
     assert 493 < len(samples.receive) <= 500
     np.testing.assert_allclose(samples.fields["gyro.x"], np.sin(samples.receive * 1e-9), atol=1e-6)
@@ -89,7 +88,7 @@ def test_a_log_that_its_checksum_contradicts_is_said_to_be_damaged(tmp_path: Pat
     raw = bytearray(path.read_bytes())
     raw[-12] ^= 1
     path.write_bytes(raw)
-    contents = open_recording(path).read({"fixedFrequency": Request(("gyro.x",))})
+    contents = open_recording(path).read({"fixedFrequency": ("gyro.x",)})
     assert [damage.cause for damage in contents.damage] == [Cause.LOG_DAMAGED]
 
 

@@ -28,7 +28,6 @@ from tuner.recordings.recording import (
     Nanoseconds,
     ReadResult,
     Recording,
-    Request,
     Samples,
     Topic,
 )
@@ -220,7 +219,7 @@ class RosRecording(Recording):
     def missing_fields(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return the fields that a topic's messages do not have."""
         try:
-            return self._missing(self._kind(topic), fields)
+            return missing_fields(self._definitions, self._kind(topic), fields)
         except RecordingError:
             return fields
 
@@ -236,12 +235,14 @@ class RosRecording(Recording):
     def _kind(self, topic: str) -> str:
         return next((known.type for known in self.topics if known.name == topic), "")
 
-    def read(self, wanted: Mapping[str, Request]) -> ReadResult:
+    def read(
+        self, wanted: Mapping[str, tuple[str, ...]], clocks: tuple[Clock, ...] = ()
+    ) -> ReadResult:
         """Read the wanted fields of some topics."""
         plans: dict[int, tuple[list[str], Clock | None]] = {}
         for connection in self._container.connections.values():
             if connection.topic in wanted and connection.count:
-                plans[connection.id] = self._plan(connection, wanted[connection.topic])
+                plans[connection.id] = self._plan(connection, wanted[connection.topic], clocks)
         parts: dict[str, list[Samples]] = {name: [] for name in wanted}
         broken: dict[str, int] = dict.fromkeys(wanted, 0)
         for number, block in self._container.blocks(plans):
@@ -259,18 +260,17 @@ class RosRecording(Recording):
         samples = {name: _joined(rows) for name, rows in parts.items() if rows}
         return ReadResult(samples, damage=(*self._container.damage, *cut))
 
-    def _missing(self, kind: str, fields: Sequence[str]) -> tuple[str, ...]:
-        return missing_fields(self._definitions, kind, fields)
-
-    def _plan(self, connection: Connection, request: Request) -> tuple[list[str], Clock | None]:
+    def _plan(
+        self, connection: Connection, wanted: Sequence[str], clocks: Sequence[Clock]
+    ) -> tuple[list[str], Clock | None]:
         """Return the fields to read, with those of the time, and the clock (None: the header)."""
-        kind, fields = connection.type, list(request.fields)
-        clock = next((c for c in request.clocks if not self._missing(kind, (c.field,))), None)
+        kind, fields, known = connection.type, list(wanted), self._definitions
+        clock = next((c for c in clocks if not missing_fields(known, kind, (c.field,))), None)
         if clock is not None:
             fields.append(clock.field)
-        elif not self._missing(kind, (_SECONDS,)):
+        elif not missing_fields(known, kind, (_SECONDS,)):
             fields += [_SECONDS, _NANOSECONDS]
-        if missing := self._missing(kind, fields):
+        if missing := missing_fields(known, kind, fields):
             what = f"{connection.topic}: {kind} has no field '{min(missing)}'"
             raise RecordingError(self.path, what, "correct the topic map")
         return fields, clock
