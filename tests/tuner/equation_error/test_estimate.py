@@ -254,6 +254,22 @@ def test_inertia_about_z_is_that_of_a_rigid_body_where_it_may_be(ratio, share):
 
 
 @pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
+def test_a_search_begins_with_a_rigid_body(flown, begun, monkeypatch):
+    """An inertia about z beyond a rigid body's by less than its error refuses no regression."""
+    _, settings, recordings = flown
+    found = begun[1].accelerations
+    most = sum(found.values[name] for name in TILTING)
+    beyond = replace(
+        found,
+        values={**found.values, "inertia_zz": 1.1 * most},
+        errors={**found.errors, "inertia_zz": 0.1},
+    )
+    monkeypatch.setattr("tuner.job.accelerations.estimate", lambda *_: beyond)
+    job, _ = with_accelerations(job_of(settings, recordings))
+    assert job.settings.vehicle.inertia.zz == pytest.approx(most)
+
+
+@pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
 def test_rotors_that_turn_faster_turn_the_vehicle_against_it(racer, flown, monkeypatch):
     """A rotor's inertia is found, and is not taken for the vehicle's."""
     vehicle, signals = racer
