@@ -279,7 +279,7 @@ def exported_vehicle(run: Run, today: date) -> tuple[VehicleFile, tuple[str, ...
     notes = tuple(
         f"{name} = {row.best:g} is {judgement_in_words(row.verdict, row.reason)}"
         for name, row in run.result.coefficients.items()
-        if row.fitted and row.identifiable is False
+        if row.fitted and (row.identifiable is False or row.reason.bound is not None)
     )
     result = run.result
     source: dict[str, JsonValue] = {

@@ -141,18 +141,20 @@ def _worse_flights(run: Run) -> list[str]:
 
 
 def _on_bounds(run: Run) -> list[str]:
+    """Return the coefficients on bounds that flights tell, and that are not zero there.
+
+    The others move no flight: notes of the export name them.
+    """
     objections = []
     for name, coefficient in run.result.coefficients.items():
         lower, upper = coefficient.lower, coefficient.upper
-        if not coefficient.fitted:
+        if not coefficient.fitted or coefficient.identifiable is False:
             continue
         span = upper - lower if lower is not None and upper is not None else None
         for side, bound in (("lower", lower), ("upper", upper)):
             near = BOUND_TOLERANCE * (abs(bound or 0.0) if span is None else span)
             if bound is None or abs(coefficient.initial - bound) <= near:
                 continue  # the search began there: a set-up without a delay has a latency of zero
-            if abs(coefficient.best - bound) <= near:
-                untold = coefficient.identifiable is False
-                to_do = f", and no flight tells it: --fix {name}" if untold else ""
-                objections.append(f"{name} {coefficient.best:g} is its {side} bound{to_do}")
+            if bound != 0.0 and abs(coefficient.best - bound) <= near:
+                objections.append(f"{name} {coefficient.best:g} is its {side} bound")
     return objections

@@ -11,7 +11,12 @@ from tuner.core import shipped
 from tuner.core.errors import ExportError, InputError
 from tuner.exporters import export as exporting
 from tuner.exporters.effective import Effective
-from tuner.exporters.export import export, export_formats_of_job, provenance
+from tuner.exporters.export import (
+    export,
+    export_formats_of_job,
+    exported_vehicle,
+    provenance,
+)
 from tuner.exporters.gates import check
 from tuner.exporters.target import Draft, write
 from tuner.options import ExportOptions
@@ -185,14 +190,21 @@ def test_a_coefficient_may_stay_at_the_bound_where_its_search_began(make_run, be
     assert all(gate.passed for gate in check(run, run.vehicle, as_the_run_says))
 
 
-def test_a_coefficient_on_its_bound_that_no_flight_tells_had_better_be_fixed(make_run):
-    on_bound = {"fitted": True, "lower": 0.0, "upper": 0.04, "best": 0.04}
-    for told in (True, False):
-        row = on_bound | {"identifiable": told}
-        run = make_run(coefficients={"actuator_latency": row})
-        (objection,) = check(run, run.vehicle, as_the_run_says)[-1].objections
-        assert objection.startswith("actuator_latency 0.04 is its upper bound")
-        assert ("--fix actuator_latency" in objection) is not told
+@pytest.mark.parametrize(
+    ("best", "told", "refused"), [(0.04, True, True), (0.04, False, False), (0.0, True, False)]
+)
+def test_a_coefficient_on_its_bound_that_moves_nothing_is_named(make_run, best, told, refused):
+    """Neither one that no flight tells, nor a latency that went to zero, keeps the others back."""
+    row = {"fitted": True, "lower": 0.0, "upper": 0.04, "initial": 0.01, "best": best}
+    side = "upper" if best else "lower"
+    row |= {"identifiable": told, "verdict": "weakly_known" if told else "not_identifiable"}
+    row |= {"reason": {"code": "interval", "bound": side}}
+    run = make_run(coefficients={"actuator_latency": row})
+    objections = check(run, run.vehicle, as_the_run_says)[-1].objections
+    assert objections == (("actuator_latency 0.04 is its upper bound",) if refused else ())
+    (note,) = exported_vehicle(run, TODAY)[1]
+    assert note.startswith(f"actuator_latency = {best:g} is")
+    assert note.endswith(f"; it lies at its {side} bound")
 
 
 def test_a_fixed_coefficient_may_equal_its_bound(make_run):
