@@ -43,11 +43,11 @@ class Shape(eqx.Module):
 
     name: ClassVar[str]
     """Its name in configuration files."""
-    peak_speed: ClassVar[float]
+    peak_speed: ClassVar[float] = 0.0
     """Largest speed of the curve, in radius·omega; 0 for a place."""
-    peak_acceleration: ClassVar[float]
-    """Largest acceleration of the curve, in peak speed²/radius."""
-    extent: ClassVar[tuple[float, float]]
+    peak_acceleration: ClassVar[float] = 0.0
+    """Largest acceleration of the curve, in peak speed²/radius; 0 for a place."""
+    extent: ClassVar[tuple[float, float]] = (0.0, 0.0)
     """Half of what the curve spans along x and along y, in radius."""
     spins: ClassVar[bool] = False
     """Whether the vehicle is commanded a constant yaw rate instead of the position reference."""
@@ -158,9 +158,6 @@ class Hover(Shape):
     """A place."""
 
     name = "hover"
-    peak_speed = 0.0
-    peak_acceleration = 0.0
-    extent = (0.0, 0.0)
 
     def position(self, angle: Scalar) -> Vec3:
         """Return the origin."""
@@ -171,9 +168,6 @@ class YawSpin(Shape):
     """A place at which the vehicle is commanded a constant yaw rate."""
 
     name = "yaw_spin"
-    peak_speed = 0.0
-    peak_acceleration = 0.0
-    extent = (0.0, 0.0)
     spins = True
 
     def position(self, angle: Scalar) -> Vec3:

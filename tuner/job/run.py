@@ -151,8 +151,15 @@ def _fit(
     vehicle = vehicle_fitted(job, fitted)
     if job is not found.job or fitted is not found.fitted:
         validation = _validated(job, fitted, vehicle, listener)
-    explanation.notice(_flight_findings(job, validation))
-    explanation.notice(reference_voltage_findings(settings.vehicle, vehicle))
+    explanation.notice(
+        (
+            *flights_worse(validation.initial, validation.best),
+            *flights_not_followed(job, validation.best),
+            *predicted_worse_than_held(job, validation),
+            *turning_findings(job, validation.turning_explained),
+            *reference_voltage_findings(settings.vehicle, vehicle),
+        )
+    )
     sources = _examination_findings(fitted, examination, explanation)
 
     def written(
@@ -276,16 +283,6 @@ def _validated(job: Job, fitted: Fitted, vehicle: VehicleFile, listener: Listene
         return validate(job, fitted, vehicle)
 
 
-def _flight_findings(job: Job, validation: Validation) -> tuple[Finding, ...]:
-    """Return the findings on a fit's simulated flights."""
-    return (
-        *flights_worse(validation.initial, validation.best),
-        *flights_not_followed(job, validation.best),
-        *predicted_worse_than_held(job, validation),
-        *turning_findings(job, validation.turning_explained),
-    )
-
-
 def _examination_findings(
     fitted: Fitted, examination: Examination | None, explanation: Explanation
 ) -> dict[str, Sources]:
@@ -293,11 +290,15 @@ def _examination_findings(
     if examination is None:
         return {}
     uncertainty, known = examination.uncertainty, examination.known
-    explanation.notice(flights_refute(uncertainty))
-    explanation.notice(finer_than_steps(uncertainty))
-    explanation.notice(model_error_findings(examination.model_errors, uncertainty))
-    explanation.notice(flights_disagree(fitted, examination))
-    explanation.notice(term_findings(fitted, uncertainty))
+    explanation.notice(
+        (
+            *flights_refute(uncertainty),
+            *finer_than_steps(uncertainty),
+            *model_error_findings(examination.model_errors, uncertainty),
+            *flights_disagree(fitted, examination),
+            *term_findings(fitted, uncertainty),
+        )
+    )
     sources: dict[str, Sources] = explanation.part(
         "ground measurements", partial(sources_of, fitted, uncertainty, known), {}
     )

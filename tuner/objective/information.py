@@ -419,7 +419,7 @@ def information_at(
         if space.joint_prior is None
         else criterion.prior**2 * space.joint_rows.T @ space.joint_rows,
         astray=_astray(objective, jacobian, crashed),
-        pull=_prior_slope(space, point, criterion),
+        pull=criterion.prior**2 * (space.prior_rows.T @ space.prior_residuals(point.coefficients)),
         nuisance_pull=pull,
     )
 
@@ -484,12 +484,6 @@ def _nuisance_directions(
             if states is not None:
                 pull += follow @ np.asarray(states)[:, segment]
     return along, prior, pull
-
-
-def _prior_slope(space: Space, point: Point, criterion: Criterion) -> Array:
-    """Return the slope (K,) of the loss of the priors and of ground measurements."""
-    slope = space.prior_rows.T @ space.prior_residuals(point.coefficients)
-    return np.asarray(criterion.prior**2 * slope)
 
 
 def _change(

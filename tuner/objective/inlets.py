@@ -363,7 +363,7 @@ class RecordedAttitude(RecordedInlet):
         return AttitudeInlet(
             Quaternion.of(attitude).normalized(),
             Vec3(*self._resampled("body_rate", with_rate, schedule)),
-            _laid([self.drive(flight) for flight in flights], flights, schedule),
+            inlet_of([self.drive(flight) for flight in flights], flights, schedule),
         )
 
 
@@ -412,23 +412,13 @@ def window_seconds(names: Collection[InletName], given: float | None) -> float:
     return max(INLETS[name].window for name in names) if given is None else given
 
 
-def inlet_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Schedule) -> Inlet:
-    """Return the input of all segments, each for its own inlet.
-
-    Parameters
-    ----------
-    names
-        F inlets.
-    flights, schedule
-        As of `RecordedInlet.lay_out`.
-    """
-    return _laid([INLETS[name] for name in names], flights, schedule)
-
-
-def _laid(
+def inlet_of(
     recorded: Sequence[RecordedInlet], flights: Sequence[Flight], schedule: Schedule
 ) -> Inlet:
-    """Return the input of all segments, each by its own of F recorded inlets."""
+    """Return the input of all segments, each by its own of F recorded inlets.
+
+    Flights and schedule are as of `RecordedInlet.lay_out`.
+    """
     used = list(dict.fromkeys(recorded))
     if len(used) == 1:
         return used[0].lay_out(flights, schedule)

@@ -251,10 +251,10 @@ def window_segments(
     """
     cut = [piece.flight for piece in pieces]
     start = start_of([flight.initial for flight in cut], resting=False)
-    names = [inlets[piece.number] for piece in pieces]
+    recorded = [INLETS[inlets[piece.number]] for piece in pieces]
     freedom, freed = None, np.arange(0)
     if free_starts:
-        of_all = np.stack([freedom_of(INLETS[name].ignores) for name in names], axis=-1)
+        of_all = np.stack([freedom_of(inlet.ignores) for inlet in recorded], axis=-1)
         freed = np.flatnonzero(of_all.any(axis=1))
         freedom = np.asarray(of_all[freed])
     compared = {
@@ -268,7 +268,7 @@ def window_segments(
         for flight, name in zip(flights, inlets, strict=True)
     }
     return Segments(
-        inlet=inlet_of(names, cut, schedule),
+        inlet=inlet_of(recorded, cut, schedule),
         start=start,
         measured={name: _measured(cut, name, sd, weights) for name, sd in compared.items()},
         flight=np.asarray([piece.number for piece in pieces]),

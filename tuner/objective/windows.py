@@ -6,7 +6,7 @@ from almost any start, and a window needs no gentle beginning.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -178,7 +178,9 @@ def _window(
     flight: Flight, first: int, last: int, recorded: InitialState, *, smoothed_widely: bool
 ) -> Window:
     begin, end = float(flight.time[first]), float(flight.time[last])
-    series, initial = _around(flight.series, begin, end), recorded
+    near = {n: s.between(begin - BEFORE_S, end + AFTER_S) for n, s in flight.series.items()}
+    series = {n: Series(s.time - begin, s.values) for n, s in near.items() if len(s.time)}
+    initial = recorded
     if smoothed_widely:  # unless a gap leaves too few samples
         smoothed = initial_state(series)
         initial = smoothed if _is_known(smoothed) else recorded
@@ -195,10 +197,3 @@ def _window(
 def _is_known(state: InitialState) -> bool:
     parts = (state.position, state.velocity, state.attitude)
     return all(bool(np.isfinite(part).all()) for part in parts)
-
-
-def _around(series: Mapping[str, Series], begin: float, end: float) -> dict[str, Series]:
-    near = {
-        name: signal.between(begin - BEFORE_S, end + AFTER_S) for name, signal in series.items()
-    }
-    return {n: Series(s.time - begin, s.values) for n, s in near.items() if len(s.time)}

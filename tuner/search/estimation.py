@@ -27,7 +27,6 @@ from tuner.objective.inlets import INLETS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings.content import ReadOptions
-from tuner.recordings.flight import Flight
 from tuner.recordings.loader import reading_key
 from tuner.search.continuation import Undecided, run_stages
 from tuner.search.findings import unmatched, with_end_findings
@@ -51,22 +50,21 @@ from tuner.search.stages import Stage, plan, remaining_seconds
 
 def fingerprint(job: Job) -> str:
     """Return a digest of everything that a job's numbers depend on."""
-    settings = job.settings
+    settings, given = job.settings, job.settings.job
+    # a topic map or a side-car may change
+    read_by = {
+        flight.path: reading_key(ReadOptions.of(Path(flight.path), given.topics, given.namespace))
+        for flight in job.flights
+    }
     parts = {
-        "flights": [(flight.name, flight.sha256, *_read_by(flight, job)) for flight in job.flights],
+        "flights": [(flight.name, flight.sha256, *read_by[flight.path]) for flight in job.flights],
         "vehicle": settings.vehicle.model_dump(mode="json"),
         "controller": settings.controller.model_dump(mode="json"),
-        "job": settings.job.model_dump(mode="json"),
+        "job": given.model_dump(mode="json"),
     }
     if settings.bench is not None:
         parts["bench"] = [settings.bench.mean.tolist(), settings.bench.information.tolist()]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-
-
-def _read_by(flight: Flight, job: Job) -> tuple[str, ...]:
-    """Return the files that a flight is read by: a topic map or a side-car may change."""
-    given = job.settings.job
-    return reading_key(ReadOptions.of(Path(flight.path), given.topics, given.namespace))
 
 
 def save(path: Path, key: str, progress: Progress, seconds: float) -> None:

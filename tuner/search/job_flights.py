@@ -76,9 +76,8 @@ def with_logged_parameters(settings: Settings) -> tuple[Settings, tuple[Finding,
     findings = []
     if changes:
         named = not settings.origin.get("controller", "default").startswith("default")
-        names = tuple(str(change) for change in changes)
         level: Literal["warning", "info"] = "warning" if named else "info"
-        findings.append(Finding(Code.LOGGED_GAINS, level, next(iter(logs)).stem, names=names))
+        findings.append(Finding(Code.LOGGED_GAINS, level, next(iter(logs)).stem, names=changes))
     if unlike:
         findings.append(Finding(Code.LOGS_DIFFER, "warning", "flights", names=tuple(unlike)))
     origin = {**settings.origin, "controller": f"{settings.origin.get('controller', '')}, the log"}

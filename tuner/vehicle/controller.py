@@ -6,7 +6,6 @@ Defaults are the HoverGames.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -240,35 +239,9 @@ PARAMETER_OF: Mapping[tuple[str, ...], str] = {
 PARAMETER_DIGITS = 6
 
 
-@dataclass(frozen=True)
-class Change:
-    """A setting that differs between a log's parameters and a controller file.
-
-    Attributes
-    ----------
-    place
-        In the controller file, as ``rate.roll.p``.
-    parameter
-        Its name in PX4.
-    before, after
-        In the file and in the log; None is no filter.
-    """
-
-    place: str
-    parameter: str
-    before: float | None
-    after: float | None
-
-    def __str__(self) -> str:
-        """Return it as a clause."""
-        before = "no filter" if self.before is None else f"{self.before:g}"
-        after = "no filter" if self.after is None else f"{self.after:g}"
-        return f"{self.place} {after} ({self.parameter}; the file has {before})"
-
-
 def with_parameters(
     controller: ControllerFile, parameters: Mapping[str, float]
-) -> tuple[ControllerFile, tuple[Change, ...]]:
+) -> tuple[ControllerFile, tuple[str, ...]]:
     """Return a controller file with the rate loop, filters and mixer of a log's parameters.
 
     Parameters
@@ -279,7 +252,8 @@ def with_parameters(
     Returns
     -------
     tuple
-        The controller, and its changes; unchanged if the parameters are not valid together.
+        The controller, and its changes as clauses; unchanged if the parameters are not valid
+        together.
     """
     data: dict[str, Any] = controller.model_dump()
     changes = []
@@ -292,7 +266,8 @@ def with_parameters(
         before, after = section[place[-1]], _setting_of(place, parameters[parameter])
         if before != after:
             section[place[-1]] = after
-            changes.append(Change(".".join(place), parameter, before, after))
+            was, now = ("no filter" if s is None else f"{s:g}" for s in (before, after))
+            changes.append(f"{'.'.join(place)} {now} ({parameter}; the file has {was})")
     data["physics"]["rate"] = max(data["physics"]["rate"], data["rate"]["rate"])
     try:
         return ControllerFile.model_validate(data), tuple(changes)
