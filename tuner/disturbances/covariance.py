@@ -67,7 +67,8 @@ class Sparse(NamedTuple):
             unit = jnp.where(np.array(groups) == group, 1.0, 0.0)
             return jnp.concatenate(push([unit[number] for number in range(columns)]))
 
-        return Sparse(rows, tuple(groups), rows_of(pushed, len(taken)))
+        values = lax.scan(lambda _, group: (None, pushed(group)), None, jnp.arange(len(taken)))[1]
+        return Sparse(rows, tuple(groups), values)
 
 
 class Samples(NamedTuple):
@@ -239,7 +240,7 @@ def propagated(
 
     def kept(number: Array, into: Array) -> Array:
         i = number + size - len(retention)
-        return _with_row(into, i, at(retention, number) * row(scratch, i, size))
+        return _with_row(into, i, at(retention, number) * _part(scratch, i, 0, size))
 
     def added(i: Array, matrix: Array) -> Array:
         return _with_entry(matrix, i, i, _entry(matrix, i, i) + at(process_noise, i))
@@ -254,22 +255,11 @@ def _symmetric(matrix: Array, count: Array) -> Array:
     """Return a square matrix with its first ``count`` rows and columns made symmetric."""
 
     def mean(i: Array, matrix: Array) -> Array:
-        both = 0.5 * (row(matrix, i, len(matrix)) + _column(matrix, i))
+        both = 0.5 * (_part(matrix, i, 0, len(matrix)) + _column(matrix, i))
         return lax.dynamic_update_slice(_with_row(matrix, i, both), both[:, None], (0, i))
 
     found: Array = lax.fori_loop(0, count, mean, matrix)
     return found
-
-
-def rows_of(function: Callable[[Array], Array], count: int) -> Array:
-    """Return the rows of a function of each number, computed in a loop."""
-    rows: Array = lax.scan(lambda _, i: (None, function(i)), None, jnp.arange(count))[1]
-    return rows
-
-
-def row(matrix: Array, number: Array, count: int) -> Array:
-    """Return the first numbers of a row."""
-    return _part(matrix, number, 0, count)
 
 
 def at(vector: Array, number: Array) -> Array:
@@ -284,6 +274,7 @@ def _side_by_side(size: int) -> list[tuple[int, int]]:
 
 
 def _part(matrix: Array, number: Array, first: int, count: int) -> Array:
+    """Return so many numbers of a row from the first on."""
     return lax.dynamic_slice(matrix, (number, first), (1, count))[0]
 
 

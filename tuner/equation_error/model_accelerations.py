@@ -120,14 +120,6 @@ def values_at(parameters: Sequence[Parameter], point: Array) -> dict[str, float]
     }
 
 
-def _side_by_side(flights: Sequence[Steps]) -> Any:
-    """Return motion, rotor speeds and accelerations of all flights' steps (N,)."""
-    return jax.tree.map(
-        lambda *leaves: np.concatenate(leaves, axis=-1),
-        *((part.motion, part.rotor_speed.T, part.rotor_acceleration.T) for part in flights),
-    )
-
-
 def _modelled(
     model: Model,
     parameters: Sequence[Parameter],
@@ -136,15 +128,11 @@ def _modelled(
     by: NDArray[np.intp],
 ) -> list[tuple[Array, Array]]:
     """Return each flight's modelled accelerations (N, 6) and columns (N, 6, k) by k coordinates."""
-    values, columns = _computed(model, parameters, point, _side_by_side(flights), by)
-    ends = np.cumsum([len(part.rotor_speed) for part in flights])[:-1]
-    return list(zip(np.split(values, ends), np.split(columns, ends), strict=True))
-
-
-def _computed(
-    model: Model, parameters: Sequence[Parameter], point: Array, steps: Any, by: NDArray[np.intp]
-) -> tuple[Array, Array]:
-    """Return the modelled accelerations (N, 6) and columns (N, 6, k) of `_side_by_side`'s steps."""
+    # motion, rotor speeds and accelerations of all flights' steps
+    steps: Any = jax.tree.map(
+        lambda *leaves: np.concatenate(leaves, axis=-1),
+        *((part.motion, part.rotor_speed.T, part.rotor_acceleration.T) for part in flights),
+    )
     values, slopes = values_at(parameters, point), dict[str, Array]()
     for number, parameter in enumerate(parameters):
         for name, ratio in parameter.ratios.items():
@@ -161,7 +149,9 @@ def _computed(
         _accelerations, arguments, name="accelerations", made_of=total.TERMS, packages=CODE
     )
     run = program(given, [slopes[name] for name in numbers], lanes=steps[1].shape[1])
-    return run.values, run.columns if numbers else np.zeros((*run.values.shape, 0))
+    columns = run.columns if numbers else np.zeros((*run.values.shape, 0))
+    ends = np.cumsum([len(part.rotor_speed) for part in flights])[:-1]
+    return list(zip(np.split(run.values, ends), np.split(columns, ends), strict=True))
 
 
 def _accelerations(given: Any, _: Mapping[str, int]) -> jax.Array:

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -48,18 +47,6 @@ MAX_LAWS = 5
 SPEED_LAG = ("rotor_speed", "late")
 """The column of a lag of rotor speeds behind the gyro, in all moments."""
 AXES = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z")
-
-
-class StepsPair(NamedTuple):
-    """The steps of a flight as recorded and as simulated by the fit.
-
-    ``by_command``: whether rotor speeds come from commands by the fit's motors, whose errors are
-    then nuisances.
-    """
-
-    recorded: Steps
-    simulated: Steps
-    by_command: bool
 
 
 @dataclass(frozen=True)
@@ -166,12 +153,20 @@ FEATURES: Mapping[str, Mapping[str, Feature]] = {
 
 
 def find_omitted_laws(
-    model: Model, parameters: Sequence[Parameter], point: Array, flights: Sequence[StepsPair]
+    model: Model,
+    parameters: Sequence[Parameter],
+    point: Array,
+    flights: Sequence[tuple[Steps, Steps, bool]],
 ) -> OmittedLaws:
     """Return the laws in recorded accelerations that no fitted coefficient explains.
 
-    ``model``, ``parameters`` and ``point`` are the fit's: fixed coefficients, K parameters, and
-    their scaled coordinates.
+    Parameters
+    ----------
+    model, parameters, point
+        The fit's: fixed coefficients, K parameters, and their scaled coordinates.
+    flights
+        The steps of each as recorded and as simulated by the fit, and whether rotor speeds come
+        from commands by the fit's motors, whose errors are then nuisances.
     """
     recorded, simulated, by_command = zip(*flights, strict=True)
     along = ModelAccelerations(model, tuple(parameters), simulated).at(point)

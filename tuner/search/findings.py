@@ -68,13 +68,8 @@ END_CODES = frozenset(
 
 def with_end_findings(job: Job, fitted: Fitted) -> Fitted:
     """Return a fit with the findings at its end instead of those of the fits before it."""
-    others = [finding for finding in fitted.findings if finding.code not in END_CODES]
-    return replace(fitted, findings=(*others, *findings_at(job, fitted)))
-
-
-def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:
-    """Return a fit's findings on the set-up, the flights, their clocks and their gyros."""
-    findings = [*end_findings(job, loop_of(fitted.objective), fitted.scales)]
+    findings = [finding for finding in fitted.findings if finding.code not in END_CODES]
+    findings += end_findings(job, loop_of(fitted.objective), fitted.scales)
     offsets = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
     for number, flight in enumerate(job.fitted):
         for kind, value in zip(OFFSETS, offsets[:, number].tolist(), strict=True):
@@ -84,7 +79,7 @@ def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:
                 (Code.CLOCK_OFFSET, "seconds") if kind in CLOCKS else (Code.GYRO_OFFSET, "rate")
             )
             findings.append(Finding(code, "info", flight.name, {unit: value}, (kind,)))
-    return tuple(findings)
+    return replace(fitted, findings=tuple(findings))
 
 
 def end_findings(job: Job, loop: Loop, scales: Scales) -> tuple[Finding, ...]:

@@ -64,8 +64,8 @@ class Job:
         all do.
     first_terms
         Groups of terms that are free from the beginning of the search.
-    user_settings
-        The user's settings, if ``settings`` differ.
+    given
+        The user's settings: ``settings`` may start from a regression.
     accelerations
         Estimates by regression of the flights' accelerations, if physical coefficients are taken
         from it (`tuner.job.accelerations`).
@@ -76,15 +76,10 @@ class Job:
     noise: Mapping[str, float]
     space: Space
     objective: Objective
+    given: Settings
     windows: Objective | None = None
     first_terms: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    user_settings: Settings | None = None
     accelerations: Estimate | None = None
-
-    @property
-    def given(self) -> Settings:
-        """The user's settings."""
-        return self.settings if self.user_settings is None else self.user_settings
 
     @property
     def flights(self) -> tuple[Flight, ...]:
@@ -216,9 +211,9 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
             compared, noise=noise, weights=_weights(settings, fitted, whole=True), schedule=schedule
         )
         objective = problem(whole, longest, limits_of(fitted))
-        return Job(settings, recordings, noise, space, objective, windows)
+        return Job(settings, recordings, noise, space, objective, settings, windows)
     assert windows is not None
-    return Job(settings, recordings, noise, space, windows)
+    return Job(settings, recordings, noise, space, windows, settings)
 
 
 def _free_starts(criterion: ErrorKind, inlets: Sequence[InletName]) -> bool:

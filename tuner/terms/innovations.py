@@ -96,8 +96,14 @@ class LinearisedInnovations:
         information = beside.information(objective, wide.point, fitted.criterion)
         space, vector = objective.space, np.asarray(wide.point.coefficients)
         scaled = space.scaled(vector)
-        linear = linearised_from(information, scaled, space.prior_mean, predictor.loss)
-        linear = replace(linear, names=space.names, neutral=neutral_of(space))
+        linear = linearised_from(
+            information,
+            scaled,
+            space.prior_mean,
+            predictor.loss,
+            names=space.names,
+            neutral=neutral_of(space),
+        )
         return LinearisedInnovations(selected, fitted, space, vector, linear)
 
     def with_model_error(

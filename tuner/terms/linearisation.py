@@ -277,8 +277,15 @@ def linearise(
     mean = np.concatenate([objective.space.prior_mean, np.zeros(rows.size)])
     names = (*objective.space.names, *(name for name in conditions for _ in rows[0]))
     neutral = np.concatenate([neutral_of(objective.space), np.zeros(rows.size)])
-    linear = linearised_from(information, scaled, mean, loss, condition_count=len(conditions))
-    return replace(linear, names=names, neutral=neutral)
+    return linearised_from(
+        information,
+        scaled,
+        mean,
+        loss,
+        condition_count=len(conditions),
+        names=names,
+        neutral=neutral,
+    )
 
 
 def neutral_of(space: Space) -> Array:
@@ -360,6 +367,8 @@ def linearised_from(
     loss: float,
     *,
     condition_count: int = 0,
+    names: tuple[str, ...] = (),
+    neutral: Array | None = None,
 ) -> LinearisedLoss:
     """Return the linear approximation from the information at a point and its loss.
 
@@ -374,6 +383,8 @@ def linearised_from(
         Half the robust sum of squares.
     condition_count
         How many conditions.
+    names, neutral
+        As of `LinearisedLoss`.
     """
     size = information.score.shape[-1]
     count, flights = size - condition_count, int(information.flight.max()) + 1
@@ -407,6 +418,8 @@ def linearised_from(
         loss=loss,
         columns_seen=columns_seen if condition_count else None,
         condition_columns=condition_count * flights,
+        names=names,
+        neutral=neutral,
     )
 
 

@@ -28,7 +28,7 @@ from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Array
-from tuner.equation_error.omitted_laws import Law, StepsPair, find_omitted_laws
+from tuner.equation_error.omitted_laws import Law, find_omitted_laws
 from tuner.equation_error.rate_controller import (
     AXES,
     PARTS,
@@ -190,9 +190,7 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
         if (gain := gain_by_commands(name, estimates)) is not None and abs(gain[0] - 1.0) > gain[1]:
             gain_shifts[name] = float(np.sqrt((gain[0] - 1.0) ** 2 - gain[1] ** 2))
     pairs = {
-        number: StepsPair(
-            one, _simulated(one, flown.channels, conditions, number, rate), by_command
-        )
+        number: (one, _simulated(one, flown.channels, conditions, number, rate), by_command)
         for number, (one, by_command) in enumerate(zip(read, driven, strict=True))
         if one is not None and usable[number]
     }
@@ -207,8 +205,8 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
     by = np.array([*[body.mass] * 3, body.inertia_xx, body.inertia_yy, body.inertia_zz], float)
     ticks = np.arange(objective.samples + 2) / rate
     pushes = np.zeros((6, len(ticks), segments.count))
-    for (number, pair), made in zip(pairs.items(), found.accelerations, strict=True):
-        one, acting = pair.recorded, made * by
+    for (number, (one, *_)), of_laws in zip(pairs.items(), found.accelerations, strict=True):
+        acting = of_laws * by
         acting[:, :3] = Rotation.from_quat(
             np.asarray(one.motion.attitude.stacked()).T, scalar_first=True
         ).apply(acting[:, :3])

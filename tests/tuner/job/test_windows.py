@@ -136,9 +136,10 @@ def test_settings_of_coefficients_that_are_not_fitted_are_named(full_flight, ful
     given = dict.fromkeys((*FREE, "mass", "fuselage_drag"), bounded)
     for terms, unused in (("auto", "mass"), ("none", "mass, fuselage_drag")):
         asked = job.settings.job.replace(coefficients=given, terms=terms)
-        said = check_recordings(replace(job, settings=replace(job.settings, job=asked)))
-        (found,) = (one for one in said if one.code is Code.SETTINGS_UNUSED)
-        assert found.subject == unused
+        changed = replace(job.settings, job=asked)
+        findings = check_recordings(replace(job, settings=changed, given=changed))
+        (finding,) = (one for one in findings if one.code is Code.SETTINGS_UNUSED)
+        assert finding.subject == unused
 
 
 @pytest.mark.parametrize("unit", ["dshot", "pwm_us"])
