@@ -70,7 +70,7 @@ def begun(flown):
     return racer, job, findings
 
 
-def test_what_rotors_answer_makes_no_vehicle_heavy(begun):
+def test_the_rotors_response_to_disturbances_does_not_bias_inertia(begun):
     racer, job, _ = begun
     found = job.accelerations
     for name in (*TILTING, "inertia_zz", "motor_constant"):
@@ -80,7 +80,7 @@ def test_what_rotors_answer_makes_no_vehicle_heavy(begun):
 
 
 @pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
-def test_errors_hold_what_instruments_of_longer_ago_move(flown, begun, monkeypatch):
+def test_errors_include_the_shift_by_earlier_instruments(flown, begun, monkeypatch):
     _, settings, recordings = flown
 
     def moved(made, begin, *, times=1, **given):
@@ -108,7 +108,7 @@ def test_errors_hold_the_bias_by_feedback(flown, begun, monkeypatch):
 
 
 @pytest.mark.parametrize("flown", [400.0], ids=["400 Hz"], indirect=True)
-def test_errors_of_others_hold_what_the_power_of_thrust_moves(flown, monkeypatch):
+def test_errors_of_others_include_the_shift_by_the_thrust_exponent(flown, monkeypatch):
     """Another coefficient in its place, which every flight tells."""
     _, settings, recordings = flown
     free_in = []
@@ -173,7 +173,7 @@ def test_vibrations_beyond_the_rate_of_steps_make_no_vehicle_heavy(flown):
 
 
 @pytest.mark.parametrize("lags", [0.0, 0.2])
-def test_what_comes_a_step_late_is_in_the_errors(lags):
+def test_a_response_a_step_late_is_in_the_errors(lags):
     random, size, one = np.random.default_rng(0), 4000, np.ones(1)
     moves, left, columns = random.normal(size=size), np.zeros((size, 6)), np.zeros((size, 6, 1))
     left[:, 0] = lags * np.roll(moves, 1) + 0.5 * random.normal(size=size)

@@ -45,7 +45,7 @@ def told(seed, d=D_GAIN, **changed):
 @pytest.mark.parametrize(
     ("part", "change"), [("P", {"p": 1.05 * P_GAIN}), ("I", {"i": 0.7 * I_GAIN})]
 )
-def test_a_gain_is_told_of_every_axis(part, change):
+def test_a_gain_is_estimated_on_every_axis(part, change):
     found = {estimate.axis: estimate for estimate in told(1, **change) if estimate.part == part}
     assert set(found) == set(AXES)
     true = next(iter(change.values())) / {"P": P_GAIN, "I": I_GAIN}[part]
@@ -55,7 +55,7 @@ def test_a_gain_is_told_of_every_axis(part, change):
     assert {estimate.part for estimate in told(1, **change)} == {part}
 
 
-def test_a_slower_filter_is_told_of_roll_and_pitch_together():
+def test_a_slower_filter_is_estimated_of_roll_and_pitch_together():
     found = told(1, d=0.0, late=3e-3)  # without D, which answers late, too
     assert {(estimate.axis, estimate.part) for estimate in found} == {
         ("roll", "late"),
@@ -76,17 +76,17 @@ def four_flights(seed, p):
     return [flight(random, p=p, gusts=0.2, noise=0.01) for p in gains], 4 * [flight(random)]
 
 
-def test_one_flight_of_another_p_is_told_from_the_others():
+def test_one_flight_of_another_p_is_distinguished():
     assert others_gains(*four_flights(0, 0.6 * P_GAIN)) == (2,)
 
 
-def test_flights_of_the_same_gains_are_not_told_apart():
+def test_flights_of_the_same_gains_are_not_distinguished():
     assert not any(others_gains(*four_flights(seed, P_GAIN)) for seed in range(40))
     two = [part[1:3] for part in four_flights(0, 0.6 * P_GAIN)]
     assert others_gains(*two) == ()  # nothing says which of them is the other one
 
 
-def test_a_flight_that_hardly_turns_is_not_told_apart():
+def test_a_flight_that_hardly_turns_is_not_distinguished():
     """Its instruments are weak: its P is anything, with a small error."""
     for seed in range(20):
         random = np.random.default_rng(seed)
@@ -99,7 +99,7 @@ def test_a_flight_that_hardly_turns_is_not_told_apart():
         assert others_gains(recorded, [simulated] * 3 + [quiet]) == ()
 
 
-def test_what_a_gyro_reads_at_rest_is_not_what_the_loop_integrated():
+def test_the_bias_of_the_gyro_is_not_taken_for_the_loops_integral():
     random = np.random.default_rng(0)
     real, made = flight(random, gusts=0.2, noise=0.01, bias=0.02), flight(random)
     found = estimate_controller([real], [made])

@@ -18,7 +18,7 @@ def fit():
     return problem(FREE)
 
 
-def test_each_vector_gives_what_it_gives_alone(fit):
+def test_each_vector_of_a_batch_gives_the_same_as_alone(fit):
     criterion = replace(criterion_of(fit), huber=2.0)
     steps = np.random.default_rng(1).normal(0.0, 0.2, (VECTORS_AT_ONCE + 1, len(FREE)))
     vectors = np.asarray(fit.space.initial) + steps

@@ -267,7 +267,7 @@ def test_a_resistance_that_loads_hardly_tell_is_shrunk_not_dropped(true, at_most
     assert np.sqrt(np.mean((np.array(found) - true) ** 2)) < at_most
 
 
-def test_a_saturated_moment_tells_the_resistance_where_rotor_speeds_were_recorded():
+def test_a_saturated_moment_shows_the_resistance_where_rotor_speeds_were_recorded():
     time, fine = np.arange(0.0, 20.0, 0.1), np.arange(0.0, 20.0, 0.01)
     random = np.random.default_rng(1)
     load = 1.0 + 0.002 * random.normal(size=len(fine)) + ((fine > 5.0) & (fine < 5.35))

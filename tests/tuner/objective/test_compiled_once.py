@@ -59,11 +59,11 @@ def test_a_flight_of_another_length_is_the_same_program(flight, updated):
     assert built(part) == 0
 
 
-def test_what_flies_is_kept_for_other_processes():
+def test_programs_of_flights_are_kept_for_other_processes():
     assert digest_of((simulation._flight, total.TERMS), simulation.CODE)
 
 
-def test_columns_do_not_depend_on_what_else_is_free():
+def test_columns_do_not_depend_on_other_free_coefficients():
     groups = ("inertia_xx", "inertia_zz", "mass"), ("motor_constant", "moment_constant")
     fit = problem((*groups[0], *groups[1]))
     names, criterion = list(fit.space.names), criterion_of(fit)

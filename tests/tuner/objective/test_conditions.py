@@ -55,7 +55,7 @@ def test_no_wind_and_a_steady_battery_change_nothing():
 
 
 @pytest.mark.parametrize("names", [(), NAMES])
-def test_derivatives_by_what_a_flight_has_of_its_own_are_those_among_all(names):
+def test_derivatives_by_per_flight_parameters_are_those_among_all(names):
     plain = problem(("motor_constant",))
     objective, point = with_conditions(plain, plain.start(plain.space.initial + 0.2), names)
     criterion = criterion_of(objective)
@@ -91,7 +91,7 @@ def test_each_flights_own_are_estimated(fit):
     np.testing.assert_allclose(values, TRUTH, rtol=0.01)
 
 
-def test_what_is_estimated_of_a_flight_costs_information(fit):
+def test_per_flight_parameters_cost_information(fit):
     objective, point = fit
     criterion, known = criterion_of(objective), np.zeros(point.offsets.shape, bool)
     estimated = known.copy()

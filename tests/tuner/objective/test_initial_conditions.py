@@ -64,7 +64,7 @@ def test_elimination_is_the_minimum_over_the_start():
         )
 
 
-def test_the_start_of_a_lost_flight_has_a_minimum():
+def test_the_initial_state_of_a_diverged_flight_has_a_minimum():
     own = np.stack([np.eye(2), 1e20 * np.ones((2, 2))])
     hessian = np.pad(own, ((0, 0), (1, 0), (1, 0)))
     least, *_, best = eliminate_states(np.ones(2), np.ones((2, 3)), hessian, np.zeros((2, 2)))
@@ -78,7 +78,7 @@ def still():
     return model.vehicle, hover(model.vehicle, Vec3(*jnp.ones((3, 2))))
 
 
-def test_a_start_moves_by_what_it_is_told(still):
+def test_a_start_moves_by_the_given_change(still):
     _, start = still
     change = np.zeros((COUNT, 2))
     change[0], change[3 + 1], change[6 + 2], change[12 + 3, 1] = 0.1, 0.2, 0.02, 0.5
@@ -89,12 +89,12 @@ def test_a_start_moves_by_what_it_is_told(still):
     assert np.asarray(there.rotor_speed[3] / start.rotor_speed[3]) == pytest.approx([1.0, 1.5])
 
 
-def test_what_cannot_matter_is_not_free():
+def test_states_without_effect_are_not_free():
     free = freedom_of(("rotor_speed",))
     assert np.count_nonzero(free) == COUNT - 4
 
 
-def test_what_is_free_of_a_start_takes_its_place_in_all_of_it():
+def test_free_rows_of_a_start_are_placed_among_all_rows():
     change = jnp.asarray([[1.0, 2.0], [3.0, 4.0]])
     all_of_it = np.asarray(with_all_rows(change, (1, COUNT - 1)))
     assert all_of_it.shape == (COUNT, 2)
@@ -103,7 +103,7 @@ def test_what_is_free_of_a_start_takes_its_place_in_all_of_it():
 
 
 @pytest.mark.parametrize("share", [1.0, 0.9])
-def test_a_rotor_without_tachometer_turns_as_its_command_asks_of_the_battery(share):
+def test_a_rotor_without_tachometer_starts_at_its_commanded_speed_on_the_battery(share):
     objective = problem(("inertia_zz",))
     vehicle = replace(objective.model.vehicle, effects={"battery_exponent": jnp.asarray(1.0)})
     model = replace(objective.model, vehicle=vehicle, reference_voltage=jnp.asarray(1.0))
@@ -144,7 +144,7 @@ def test_a_spin_leaves_a_tick_of_its_integrator_and_where_it_began_open_and_noth
     assert freedom[YAW] == pytest.approx([0.0, 2 * 0.1 * 2.0 / 400.0])
 
 
-def test_where_a_spin_began_is_not_asked_of_a_fit_that_compares_no_positions():
+def test_a_fit_without_positions_does_not_free_the_initial_position_of_a_spin():
     spin = load_flight(ROOT / "reference_flights" / "yaw_spin_3rps.bag")
     noise = {"attitude": 1e-3, "body_rate": 0.01}
     blind = segments_of([spin], noise=noise, schedule=Schedule())
@@ -163,7 +163,7 @@ def test_where_a_spin_began_is_not_asked_of_a_fit_that_compares_no_positions():
         (ROWS["position"].start, ("center_of_mass_x", "center_of_mass_y", "inertia_yy")),
     ],
 )
-def test_what_a_spin_began_with_says_nothing_of_the_coefficients(row, free):
+def test_the_initial_state_of_a_spin_has_no_information_on_coefficients(row, free):
     """Flown with an integrator a tick off, or from beside: the truth fits as noise allows."""
     fit = problem(free)
     freedom = freedom_of_spin(SPIN_ROWS, PHYSICS, 5.0 * BEGUN)

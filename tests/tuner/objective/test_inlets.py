@@ -16,7 +16,7 @@ from tuner.search.inlet_choice import inlet_for
 from tuner.vehicle import COEFFICIENTS
 
 
-def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():
+def test_every_inlet_has_one_name_in_job_files_and_inspections():
     names = list(INLETS)
     assert list(get_args(InletName)) == names
     assert [inlet.name for inlet in inlet_reports({}, trajectory=False)] == names
@@ -30,7 +30,7 @@ def test_every_inlet_of_the_simulator_is_fed_by_one_class():
 
 
 @pytest.mark.parametrize("inlet", INLETS.values(), ids=lambda inlet: inlet.name)
-def test_what_an_inlet_silences_and_ignores_exists(inlet, flight):
+def test_channels_and_states_that_an_inlet_ignores_exist(inlet, flight):
     assert set(inlet.not_compared) <= set(CHANNELS)
     assert set(inlet.ignores) <= set(STATES)
     assert inlet.can_be_fed(flight) == all(flight.has(signal) for signal in inlet.needs)
@@ -46,7 +46,7 @@ def test_a_coefficients_row_says_which_inlets_say_nothing_of_it(part, without, m
     assert {name for name, inlet in INLETS.items() if "gadget" in inlet.bypasses} == without
 
 
-def test_an_inlet_that_a_recording_cannot_feed_names_what_is_missing(flight):
+def test_an_inlet_that_a_recording_cannot_feed_names_the_missing_signals(flight):
     without = type(flight)(**(vars(flight) | {"signals": {}}))
     with pytest.raises(RecordingError, match="no rate_setpoint and no thrust_setpoint"):
         inlet_for(without, "body_rate")

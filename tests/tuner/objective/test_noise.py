@@ -10,7 +10,7 @@ from tuner.recordings.flight import Series
 
 
 @pytest.mark.parametrize("sigma", [5e-4, 5e-3])
-def test_noise_is_told_from_motion_at_jittering_stamps(sigma):
+def test_noise_is_separated_from_motion_at_jittering_stamps(sigma):
     generator = np.random.default_rng(1)
     time = np.sort(np.arange(4000) / 100 + generator.normal(0, 1e-3, 4000))
     time = np.maximum.accumulate(time + np.arange(4000) * 1e-9)
@@ -41,7 +41,7 @@ def test_a_value_that_rests_is_one_reading():
     assert repeat_counts(values[:0]).shape == (0, 2)
 
 
-def test_a_steady_command_that_was_rounded_says_what_one_reading_says(flight):
+def test_a_steady_rounded_command_counts_as_one_reading(flight):
     """A signal that rests between two steps is off by the same in all of its samples."""
     series = flight.series["command"]
     steady = np.full_like(series.values, 0.488)

@@ -66,7 +66,7 @@ def test_hessian_is_symmetric_and_positive(fit):
     assert np.linalg.eigvalsh(np.asarray(hessian)).min() > 0
 
 
-def test_a_horizon_cuts_what_is_compared(fit):
+def test_a_horizon_cuts_the_compared_samples(fit):
     criterion = criterion_of(fit)
     short = replace(criterion, horizon=400)
     point = Point(jnp.asarray(fit.space.initial + 0.2), jnp.zeros((5, 2)))

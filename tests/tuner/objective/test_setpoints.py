@@ -41,7 +41,7 @@ def test_a_flight_is_matched_within_a_blink(flight):
     assert time.process_time() - before < 0.5
 
 
-def test_another_law_is_said_before_the_search(flight):
+def test_another_attitude_law_is_reported_before_the_search(flight):
     lee = OURS.replace(attitude=OURS.attitude.replace(law="rotation_matrix"))
     findings = setpoint_findings(flight, lee)
     assert {finding.code for finding in findings} == {Code.SETPOINTS_SCALED}
@@ -50,7 +50,7 @@ def test_another_law_is_said_before_the_search(flight):
     assert "as those of the quaternion law would be" in line
 
 
-def test_a_gain_and_a_bias_are_told_apart(flight):
+def test_a_gain_and_a_bias_are_distinguished(flight):
     tripled = with_setpoints(flight, lambda values: values * [1.0, 3.0, 1.0])
     (finding,) = setpoint_findings(tripled, OURS)
     assert (finding.code, finding.names) == (Code.SETPOINTS_SCALED, ("pitch", ""))
@@ -60,7 +60,7 @@ def test_a_gain_and_a_bias_are_told_apart(flight):
     assert finding.numbers["bias"] == pytest.approx(0.2, abs=0.01)
 
 
-def test_set_points_that_answer_an_old_state_are_said_to(flight):
+def test_set_points_that_answer_an_old_state_are_reported(flight):
     prompt = match_setpoints(flight, OURS).delay
     assert prompt < 0.03
     series = dict(flight.series)

@@ -80,7 +80,7 @@ def test_commands_recorded_in_full_are_held_and_sparse_ones_joined():
     assert linear_interpolation(series, clock)[:, 0].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.0])
 
 
-def test_the_actuator_inlet_holds_what_was_recorded(flight):
+def test_the_actuator_inlet_holds_recorded_commands(flight):
     schedule = Schedule()
     inlet = INLETS["actuator"].lay_out([flight], schedule)
     assert isinstance(inlet, ActuatorInlet)

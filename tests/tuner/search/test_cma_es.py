@@ -60,7 +60,7 @@ def test_a_seed_decides_the_numbers(fit):
     assert not np.array_equal(first.points.coefficients, reseeded.points.coefficients)
 
 
-def test_what_is_fixed_stays(fit):
+def test_fixed_parameters_stay(fit):
     free = np.array([True, False, True])
     start, end, _ = evolved(fit, seed=0, free=free)
     vector = np.asarray(end.points.coefficients[0])
@@ -69,7 +69,7 @@ def test_what_is_fixed_stays(fit):
 
 
 @pytest.mark.parametrize("windows", [True, False])
-def test_plans_do_what_their_method_says(windows):
+def test_plans_follow_their_method(windows):
     def optimisers(method):
         stages = plan(method, 4000, 400.0, windows=windows, robust=True, steps=50)
         return [(stage.optimiser, stage.coefficients) for stage in stages]

@@ -70,7 +70,7 @@ def test_starts_that_agree_are_believed(fitted, updated):
     assert (doubt.code, doubt.numbers) == (Code.STARTS_DISAGREE, {"starts": 4})
 
 
-def test_flights_that_stay_far_off_ask_for_a_second_opinion(fitted, updated):
+def test_flights_that_stay_far_off_cause_a_second_search(fitted, updated):
     job = job_with(updated)
     lost = {"a": {"position": 50.0, "body_rate": 30.0}, "b": {"position": 40.0, "body_rate": 3.0}}
     assert module._doubt(job, replace(fitted, scales=lost, outcomes=ends(1.0))) is None
@@ -101,7 +101,7 @@ def test_findings_are_those_of_the_last_polish(fitted, updated, monkeypatch):
     assert [finding.code for finding in again.findings] == [doubt.code, Code.MODEL_UNMATCHED]
 
 
-def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
+def test_an_outlying_flight_is_named_and_a_misfit_of_all_is_the_models():
     job = SimpleNamespace(
         settings=SimpleNamespace(
             controller=SimpleNamespace(

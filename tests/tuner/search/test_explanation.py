@@ -49,7 +49,7 @@ def test_a_full_disk_is_no_part() -> None:
         Explanation(lambda _: None).part("intervals", full, None)
 
 
-def test_a_finding_is_told_once() -> None:
+def test_a_finding_is_reported_once() -> None:
     told: list[str] = []
     explanation = Explanation(told.append)
     finding = Finding(Code.SPINS_REVERSED, "warning", "motors")

@@ -68,7 +68,7 @@ def test_a_search_ends_where_its_loss_is_least_from_the_start_that_it_found(away
     assert np.asarray(found.coefficients) == pytest.approx(true, abs=1e-3)
 
 
-def test_a_start_is_believed_within_reason_and_left_where_nothing_tells_it():
+def test_an_initial_state_is_limited_and_kept_where_it_has_no_estimate():
     fit = begun_elsewhere()
     criterion = replace(
         criterion_of(

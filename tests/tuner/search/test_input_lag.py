@@ -87,7 +87,7 @@ def test_a_lateness_that_may_be_chance_is_not_believed(broadband, updated):
     assert not _is_late(flight, updated, Lag(0.01, 0.005))
 
 
-def test_noise_alone_tells_nothing(broadband, updated):
+def test_noise_alone_shows_no_lag(broadband, updated):
     generator = np.random.default_rng(1)
     speed = broadband.series["rotor_speed"]
     noise = Series(speed.time, generator.normal(600.0, 10.0, speed.values.shape))
@@ -110,7 +110,7 @@ def test_each_fitted_flight_has_its_own_lateness_and_a_held_out_one_the_mean(bro
     assert late[3:] == [0.0, 0.0]
 
 
-def test_what_commands_are_late_by_together_is_the_vehicles_own_lag(broadband, updated):
+def test_the_mean_lateness_of_commands_is_the_vehicles_own_lag(broadband, updated):
     command = broadband.series["command"]
 
     def moved(seconds, name):
@@ -150,7 +150,7 @@ def test_the_order_of_measured_speeds_is_seen_in_how_they_turn_the_vehicle(broad
     assert (said.code, said.names) == (finding.code, finding.names)
 
 
-def test_what_the_loop_answers_to_hidden_torques_is_no_lateness(tmp_path):
+def test_the_loops_response_to_hidden_torques_is_no_lateness(tmp_path):
     racer = fast_flights.drawn(32)
     signals = fast_flights.fly(racer, seed=32, seconds=10.0)
     paths = fast_flights.write(racer, signals, tmp_path, seed=32)

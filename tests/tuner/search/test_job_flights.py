@@ -43,7 +43,7 @@ def test_the_shipped_job_holds_one_flight_out_and_estimates_the_clocks(settings)
     assert not any(recording.holdout for recording in read_recordings(settings, holdout=())[0])
 
 
-def test_what_is_set_for_a_flight_wins_over_what_is_set_for_all(settings, flights):
+def test_settings_of_a_flight_win_over_settings_of_all(settings, flights):
     recordings = assigned(
         settings,
         flights,

@@ -102,12 +102,12 @@ def test_the_first_step_is_the_damped_one(advanced):
     assert first.step_reduction[0] == pytest.approx(step_reduction / valley(START).loss)
 
 
-def test_what_is_held_stays(advanced):
+def test_held_parameters_stay(advanced):
     *_, last = advanced([START], 30, free=(0.0, 1.0))
     np.testing.assert_allclose(last.point.coefficients[0], [-1.2, 1.44], atol=1e-9)
 
 
-def test_what_is_no_number_is_never_better(advanced):
+def test_a_loss_that_is_no_number_is_never_better(advanced):
     *_, last = advanced([START, [np.nan, 0.0]], 3)
     assert np.isfinite(last.loss[0])
     assert not last.accepted[1]

@@ -67,7 +67,7 @@ def test_who_sees_the_markers_is_tried_from_where_the_search_began():
 
 
 @pytest.mark.parametrize("flown", [0.0, 1.0])
-def test_what_saturates_is_decided_by_the_flights_that_clip(flown):
+def test_saturation_feedback_is_decided_by_the_flights_that_clip(flown):
     """The other was recorded metres away, which takes up most of the loss."""
     fit, turning = problem(("inertia_zz",)), jnp.asarray([0.0, 12.0])
     fit = eqx.tree_at(lambda o: o.segments.inlet.yaw_rate, fit, turning)

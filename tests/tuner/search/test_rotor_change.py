@@ -61,7 +61,7 @@ def test_flights_without_a_change_raise_no_alarm(flown):
     assert cut_at_rotor_changes(recordings, settings.vehicle) == (recordings, ())
 
 
-def test_what_wanders_is_no_change(flown):
+def test_a_wandering_share_is_no_change(flown):
     settings, recordings = flown
     random, alarms = np.random.default_rng(0), 0
     for number in range(40):

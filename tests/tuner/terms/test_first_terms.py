@@ -78,7 +78,7 @@ def with_free(fitted, names, file):
     return replace(fitted, objective=objective, point=point)
 
 
-def test_a_named_term_has_a_row_with_what_it_is_worth(jobs):
+def test_a_named_term_has_a_row_with_its_gain(jobs):
     """On flights that know nothing of it as on flights through a drag of 0.05."""
     file, worth = JobFile(terms=("fuselage_drag",)), []
     for job, fitted in (jobs[(0.0, 0.001)], unfitted_with(0.05, seed=0, tilt=(0.0, 0.001))):

@@ -144,7 +144,7 @@ def test_a_term_that_least_squares_missed_is_called_for(chosen) -> None:
     assert float(numbers["fuselage_drag"]) == pytest.approx(0.5 * USUAL["fuselage_drag"], rel=0.05)
 
 
-def test_chance_calls_for_nothing(chosen) -> None:
+def test_chance_adds_no_term(chosen) -> None:
     assert chosen(seen([DRAG, INFLOW, FLAPPING], {})) is None
 
 
@@ -153,7 +153,7 @@ def test_a_term_as_good_as_absent_is_not_worth_a_coefficient(chosen) -> None:
     assert chosen(seen([DRAG], {"fuselage_drag": 0.05})) is None
 
 
-def test_a_term_that_stood_in_for_another_goes_as_that_one_comes(chosen) -> None:
+def test_a_term_that_replaced_another_is_removed_as_that_one_is_added(chosen) -> None:
     there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
     innovation = seen(
         [there, INFLOW],
@@ -168,7 +168,7 @@ def test_a_term_that_stood_in_for_another_goes_as_that_one_comes(chosen) -> None
     ]
 
 
-def test_what_least_squares_let_stand_in_goes_first_and_comes_back_where_nothing_else_does(
+def test_a_lumped_term_of_least_squares_is_removed_first_and_returns_where_no_other_is_kept(
     chosen,
 ) -> None:
     """Gusts pass for it, and from there what it stands in for looks as if it were not there."""
@@ -184,7 +184,7 @@ def test_what_least_squares_let_stand_in_goes_first_and_comes_back_where_nothing
     assert chosen(seen([gone, INFLOW], truth), ()) is None
 
 
-def test_others_are_judged_as_if_what_stood_in_were_not_there(chosen) -> None:
+def test_others_are_judged_without_the_lumped_term(chosen) -> None:
     """A fit with it leaves nothing for another to do that does the same."""
     there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
     innovation = seen(
@@ -222,7 +222,7 @@ def test_of_some_terms_innovations_do_not_judge(chosen, rows) -> None:
     assert chosen(seen(rows, {name: 0.5 for name in rows[0].names[:1] if not rows[0].kept})) is None
 
 
-def test_what_acts_as_another_where_it_is_neutral_is_put_in_where_it_does_not(chosen) -> None:
+def test_a_term_equivalent_to_another_at_neutral_starts_away_from_it(chosen) -> None:
     lag, drag = (
         row("motor_lag", SelectionCode.IMMATERIAL),
         row("fuselage_drag", SelectionCode.SIGNIFICANT, kept=True),
@@ -250,12 +250,12 @@ def test_nothing_else_is_put_in_unjudged(chosen, lag) -> None:
     assert chosen(seen([lag], {lag.names[0]: 0.1}), lags=True) is None
 
 
-def test_what_chance_explains_is_not_worth_a_fit(chosen) -> None:
+def test_an_insignificant_term_is_not_refitted(chosen) -> None:
     assert chosen(seen([row("motor_lag", SelectionCode.IMMATERIAL)], {}), lags=True) is None
 
 
 @pytest.mark.parametrize("alike", [True, False])
-def test_terms_left_out_are_in_doubt_by_what_innovations_say_of_them(alike: bool) -> None:
+def test_shifts_by_omitted_terms_follow_from_innovations(alike: bool) -> None:
     """As far as they do what a coefficient does; what set-points hide stays as it was."""
     before = {"inertia_xx": 9.0, "estimate_latency": 7.0}
     found = seen(
@@ -283,7 +283,7 @@ class Problem:
         return information(self.space, shown, alike={"fuselage_drag": "inertia_xx"})
 
 
-def test_terms_are_judged_with_what_the_model_lacks_acting(monkeypatch) -> None:
+def test_terms_are_judged_with_model_errors_acting(monkeypatch) -> None:
     """A force that nothing explains hides a drag: with it the drag may be there."""
     plain = seen([DRAG], {})
     there = Problem(plain.space)
@@ -301,7 +301,7 @@ def test_terms_are_judged_with_what_the_model_lacks_acting(monkeypatch) -> None:
     assert doubt(model_errors) > 10.0 * doubt(None) > 0.0
 
 
-def test_what_innovations_surely_put_elsewhere_is_contradicted() -> None:
+def test_a_value_far_from_the_innovations_estimate_is_contradicted() -> None:
     usual, said = USUAL["fuselage_drag"], seen([DRAG], {"fuselage_drag": 2.0})
     sizes = (-2.0, 0.0, 1.98, 2.0, 2.02, 2.1)
     found = [said.contradicts("fuselage_drag", size * usual) for size in sizes]

@@ -116,7 +116,7 @@ def test_where_flights_say_little_of_a_term_chance_counts_for_less_than_a_refit_
     assert np.sqrt(np.mean(parts)) < 0.6 * np.sqrt(np.mean(steps))
 
 
-def test_what_the_flights_call_for_counts_in_full(fits):
+def test_a_significant_omitted_term_shifts_in_full(fits):
     for linear, _ in fits[:20]:
         fit = with_term(replace(linear, prior_sd=np.array([1e3, 30.0])), 12.0)
         every = np.ones(len(fit.flight), bool)
@@ -124,7 +124,7 @@ def test_what_the_flights_call_for_counts_in_full(fits):
         assert selection_shifts(fit, MODEL, [PRESENT])[0] == pytest.approx(abs(moved[0]), rel=0.15)
 
 
-def test_what_is_seldom_there_counts_for_less_and_in_full_where_the_flights_call_for_it(fits):
+def test_an_improbable_term_shifts_less_and_in_full_where_it_is_significant(fits):
     seldom = (TERM, 0.1)
     absent = [[selection_shifts(fit, MODEL, [g])[0] for g in (seldom, PRESENT)] for fit, _ in fits]
     assert np.median([one / other for one, other in absent]) < 0.4
@@ -134,7 +134,7 @@ def test_what_is_seldom_there_counts_for_less_and_in_full_where_the_flights_call
         assert called_for[0] == pytest.approx(called_for[1], rel=1e-3)
 
 
-def test_what_no_flight_tells_from_the_model_is_as_wide_as_it_may_be(fits):
+def test_a_term_collinear_with_the_model_shifts_by_its_prior(fits):
     """The flights leave it to the prior: as likely small as large, up to the usual size."""
     linear, _ = fits[0]
     same = replace(
@@ -170,7 +170,7 @@ def crowded(random, count, absent=1):
 
 
 @pytest.mark.parametrize("count", [3, 20])
-def test_an_absent_term_is_told_no_surer_than_it_is_whatever_a_fit_takes_out_of_the_gusts(count):
+def test_the_evidence_of_an_absent_term_includes_gusts_that_the_fit_absorbed(count):
     random, model, term = np.random.default_rng(3), np.arange(count), np.array([count])
     held = []
     for linear in (crowded(random, count) for _ in range(DRAWS)):
@@ -181,7 +181,7 @@ def test_an_absent_term_is_told_no_surer_than_it_is_whatever_a_fit_takes_out_of_
     assert np.mean(held) > 0.86  # 0.79 were twenty coefficients' leverage not allowed for
 
 
-def test_of_many_axes_of_a_group_none_is_told_much_surer_than_it_is_by_the_scatter_of_a_few():
+def test_no_axis_of_a_group_is_too_certain_by_the_scatter_of_a_few_stretches():
     """Six stretches of time always scatter little along some axis of six."""
     random, model, group = np.random.default_rng(5), np.arange(4), np.arange(4, 10)
     sizes = []

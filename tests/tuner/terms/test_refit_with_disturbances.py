@@ -139,7 +139,7 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
     assert within[-1] == [group for group in called_for[: len(descents) - 1] if group]
 
 
-def test_no_terms_are_chosen_by_innovations_of_a_filter_that_lost_a_flight(monkeypatch):
+def test_no_terms_are_selected_by_innovations_of_a_diverged_filter(monkeypatch):
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
     predictor = SimpleNamespace(memory=0, is_lost=True)
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
@@ -292,7 +292,7 @@ def test_a_lateness_that_samples_contradict_is_not_believed():
     ],
     ids=["surely likelier", "others come with it", "by chance", "loses track"],
 )
-def test_what_no_derivative_tells_is_judged_by_a_fit_with_it(
+def test_a_term_without_a_derivative_is_judged_by_a_fit_with_it(
     monkeypatch, likelier, tracks, called_for, expected
 ):
     full = SimpleNamespace(objective=NOBODY, point=SimpleNamespace(coefficients=np.zeros(0)))

@@ -67,7 +67,7 @@ def test_neither_terms_nor_disturbances_explain_a_vehicle_that_falls(thrust, fli
 
 
 @pytest.mark.parametrize(("others", "follows"), [(1.0, False), (2.0 * COLOURED_RATIO, True)])
-def test_what_one_flight_alone_lacks_is_no_disturbance(others, follows, monkeypatch):
+def test_a_misfit_of_one_flight_alone_is_no_disturbance(others, follows, monkeypatch):
     found, _ = ended_with(1.0, monkeypatch)
     scales = {"a": {"position": others}, "stray": {"position": 50.0}, "b": {"position": others}}
     found = replace(found, fitted=replace(found.fitted, scales=scales))

@@ -83,7 +83,7 @@ def test_gusts_that_last_buy_a_term_no_more_often_than_chance_is_let(shown_by):
     assert np.mean(bought) <= 0.02
 
 
-def test_what_chance_explains_goes_before_what_it_does_not(monkeypatch):
+def test_insignificant_groups_are_removed_before_significant_ones(monkeypatch):
     """Whichever predicts more by chance: a flight that alone shows something is a poor judge."""
 
     def scored(_, others, columns, **__):
@@ -98,7 +98,7 @@ def test_what_chance_explains_goes_before_what_it_does_not(monkeypatch):
     assert (list(kept), list(taken)) == (["first"], ["second"])
 
 
-def test_beside_what_is_there_in_vain_nothing_else_goes(monkeypatch):
+def test_beside_a_group_without_gain_no_other_is_removed(monkeypatch):
     """Whatever chance says of it there: it is judged once the fit is without the others."""
 
     def scored(_, __, columns, **___):
@@ -132,7 +132,7 @@ def test_backward_elimination_leaves_the_term_of_the_truth_at_the_fit_with_both(
 
 
 @pytest.mark.parametrize("stand_in", ["first", "copy"])
-def test_of_two_that_do_the_same_the_stand_in_goes(stand_in):
+def test_of_two_equivalent_groups_the_lumped_one_is_removed(stand_in):
     linear = moved_to_minimum(linear_fit(0.5), FIRST)
     twin = replace(linear, **_with_a_twin(linear))
     kept, taken = backward_elimination(
@@ -160,7 +160,7 @@ def _with_a_twin(linear):
     }
 
 
-def test_what_the_flights_disagree_about_lowers_the_loss_and_is_not_added():
+def test_a_term_that_flights_disagree_about_lowers_the_loss_and_is_not_added():
     found = score(linear_fit(1.0, 0.0, 0.0, 0.0), MODEL, FIRST, candidates=1)
     assert found.gain_fit > 0.01 > found.gain_holdout
     assert not found.is_accepted
@@ -209,7 +209,7 @@ def test_a_flight_that_is_alone_is_bought_a_term_no_more_often_than_chance_is_le
     assert np.mean(bought) <= 0.01
 
 
-def test_what_surrounds_a_flight_that_is_alone_has_to_stand_out_from_its_gusts(monkeypatch):
+def test_a_condition_of_a_single_flight_must_exceed_its_gusts(monkeypatch):
     """Its column is no term of the vehicle's, though all stretches see it."""
     own = replace(alone(by_flight(linear_fit(0.5), 1)), condition_columns=FLIGHTS)
     group = np.array([3])
@@ -230,7 +230,7 @@ def test_a_term_that_a_coefficient_of_the_model_copies_is_not_distinguished():
     assert found.reason is SelectionCode.NO_INFORMATION
 
 
-def test_a_term_in_the_model_is_worth_what_taking_it_away_would_cost():
+def test_the_gain_of_a_term_in_the_model_is_the_loss_without_it():
     before = linear_fit(0.5)
     added = score(before, MODEL, FIRST, candidates=1)
     after = moved_to_minimum(before, np.concatenate([MODEL, FIRST]))
@@ -240,7 +240,7 @@ def test_a_term_in_the_model_is_worth_what_taking_it_away_would_cost():
     assert inside.is_accepted
 
 
-def test_what_is_in_the_model_stays_where_flights_left_out_are_of_two_minds():
+def test_a_term_in_the_model_stays_where_held_out_flights_disagree():
     """Flights that show it unequally, in gusts: chance does not explain it, nor do they predict."""
     before = linear_fit(0.8, 0.0, 0.8, 0.4, seed=14, gusts=True)
     assert score(before, MODEL, FIRST, candidates=1).reason is SelectionCode.NOT_PREDICTED
@@ -252,7 +252,7 @@ def test_what_is_in_the_model_stays_where_flights_left_out_are_of_two_minds():
     assert shared.reason is SelectionCode.NOT_SIGNIFICANT
 
 
-def test_a_gust_that_does_what_a_term_would_is_not_feared_where_a_recorded_signal_says_when():
+def test_a_gust_cannot_imitate_a_term_that_reads_a_recorded_signal():
     """One flight shows it, in gusts that are worst in one of its sections."""
     both = np.concatenate([MODEL, FIRST])
     after = moved_to_minimum(linear_fit(0.8, seed=6, gusts=True, shown_by=1), both)
@@ -319,7 +319,7 @@ def by_flight(linear, column):
     )
 
 
-def test_flights_that_differ_by_noise_alone_are_as_likely_as_is_said():
+def test_the_p_value_of_flights_that_differ_by_noise_alone_is_uniform():
     begin, group = np.zeros(3 + FLIGHTS), np.arange(3, 3 + FLIGHTS)
     fits = (by_flight(linear_fit(0.0, seed=seed), 1) for seed in range(200))
     chances = np.array([chance_of_gusts(fit, MODEL, group, begin) for fit in fits])
@@ -327,7 +327,7 @@ def test_flights_that_differ_by_noise_alone_are_as_likely_as_is_said():
         assert np.mean(chances < level) == pytest.approx(level, abs=0.07)
 
 
-def test_longer_stretches_are_as_long_as_asked_and_say_the_same_together():
+def test_longer_stretches_have_the_given_length_and_the_same_sum():
     linear = linear_fit(0.5)
     longer = linear.stretches(FIRST, np.zeros(4), 8.0)
     assert longer.score.shape == (3 * FLIGHTS, 1)  # of twelve times two seconds
@@ -361,7 +361,7 @@ def test_columns_that_one_flight_sees_are_columns_like_others():
     assert max(found.chance, wanted.chance) < 1e-10
 
 
-def test_flights_show_what_surrounds_them_however_strongly_each_does():
+def test_flights_show_conditions_of_any_strength():
     """One flight shows a hundred times more than another: sections of both are predicted."""
     own = by_flight(linear_fit(5.0, -0.5, 0.5, -0.5), 1)
     found = score(own, MODEL, 3 + np.arange(FLIGHTS), candidates=2)
@@ -383,7 +383,7 @@ def test_noise_buys_no_column_for_each_flight(seed, correlated):
         (SelectionCode.IMMATERIAL, False, SelectionCode.IMMATERIAL),
     ],
 )
-def test_the_table_does_not_say_that_what_is_left_out_predicts(found, kept, reason):
+def test_the_table_does_not_call_omitted_groups_predictive(found, kept, reason):
     """A group may earn its place beside one fit, and not hold it beside what came with it."""
     worth = Score(0.1, 0.1, 0.01, 1e-6, found)
     assert row_of("drag", ("drag_x",), worth, kept=kept).reason is reason

@@ -41,7 +41,7 @@ def selected(drag, *, seed=0, job=None, around=None):
         ("battery_decline", {"battery_decline": (0.004, 0.006)}),
     ],
 )
-def test_what_surrounded_each_flight_is_found_and_estimated(monkeypatch, group, around):
+def test_conditions_of_each_flight_are_selected_and_estimated(monkeypatch, group, around):
     """Among what may surround a flight alone, which makes it cheap."""
     monkeypatch.setattr(terms, "candidate_groups", lambda *_: {})
     result, _ = selected(0.0, around=around)
@@ -77,7 +77,7 @@ def test_a_term_that_was_flown_is_found_and_its_interval_holds_the_truth():
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_what_a_term_that_was_missed_would_change_widens_the_intervals_that_hold_the_truth():
+def test_the_shift_by_a_missed_term_widens_intervals_so_that_they_hold_the_truth():
     """Of a fifth of the drag two flights of six seconds show too little to predict each other."""
     result, _ = selected(DRAG / 5.0, seed=4)
     row = next(row for row in result.rows if row.group == "fuselage_drag")
@@ -170,7 +170,7 @@ def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
     assert bool(searched) is tried
 
 
-def test_what_an_elimination_took_is_not_tried_again_unless_it_was_no_part_of_it(monkeypatch):
+def test_eliminated_groups_are_not_tried_again(monkeypatch):
     own, wanted = selection.Selection, []
     fitted = SimpleNamespace(residuals_at_noise_level=False, point=None, objective=None)
     standing = LinearisedFit(fitted, {}, None)
@@ -191,7 +191,7 @@ def test_what_an_elimination_took_is_not_tried_again_unless_it_was_no_part_of_it
 
 
 @pytest.mark.slow
-def test_terms_that_are_free_from_the_beginning_stand_in_the_table_with_what_they_are_worth(
+def test_terms_free_from_the_beginning_are_in_the_table_with_their_gain(
     monkeypatch,
 ):
     worth = Score(0.4, 0.3, 0.1, 0.5, SelectionCode.NOT_SIGNIFICANT)

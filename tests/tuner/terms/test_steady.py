@@ -23,14 +23,14 @@ def chances(*effects, **noise):
 
 
 @pytest.mark.parametrize("noise", [{}, {"correlated": True}, {"gusts": True}])
-def test_what_varies_in_flights_is_as_seldom_taken_for_steady_as_it_says(noise):
+def test_gusts_are_taken_for_steady_as_seldom_as_the_level_of_significance(noise):
     found = chances(0.0, **noise)
     assert np.mean(found < 0.01) <= 0.03
     assert 0.02 <= np.mean(found < 0.1) <= 0.2
     assert 0.35 <= np.mean(found < 0.5) <= 0.65
 
 
-def test_what_is_steady_stands_out_from_gusts():
+def test_a_steady_wind_exceeds_gusts():
     assert np.median(chances(2.0, -1.2, 0.0, 0.8, gusts=True)) < 1e-4
     assert np.max(chances(0.5, -0.3, 0.0, 0.2)) < 1e-6
 
@@ -55,7 +55,7 @@ def test_it_makes_no_difference_from_where_columns_are_led_to_nothing():
     assert chance_of_gusts(moved, MODEL, WINDS, to_neutral) == pytest.approx(wanted, rel=1e-6)
 
 
-def test_a_flight_of_one_stretch_says_nothing_of_what_is_steady():
+def test_a_flight_of_one_stretch_has_no_information_on_steady_wind():
     own = by_flight(linear_fit(2.0), 1)
     first = np.arange(len(own.flight)) % STRETCHES == 0
     short = replace(

@@ -57,7 +57,7 @@ def fit_of(
     return SimpleNamespace(findings=(), held={}), examination
 
 
-def test_flights_of_another_vehicle_are_named_with_what_differs():
+def test_flights_of_another_vehicle_are_named_with_the_coefficient():
     (found,) = flights_disagree(*fit_of(0, 0.1))
     assert (found.subject, found.names) in (("a, c", NAMES[1:2]), ("b, d", NAMES[1:2]))
     sign = 1.0 if found.subject == "b, d" else -1.0
@@ -77,13 +77,13 @@ def test_a_coefficient_that_one_flight_determines_has_no_second_value():
     assert not any(flights_disagree(*fit_of(seed, 0.0, seen=1)) for seed in range(100))
 
 
-def test_a_difference_that_does_not_matter_is_not_said():
+def test_a_negligible_difference_is_not_reported():
     fitted, examination = fit_of(0, 0.1)
     examination.uncertainty.reference[:] = 20.0
     assert not flights_disagree(fitted, examination)
 
 
-def test_what_is_held_and_flights_that_are_told_already_are_left():
+def test_held_coefficients_and_reported_flights_are_left_out():
     fitted, examination = fit_of(0, 0.1)
     fitted.held["motor_constant"] = "motor_constant"
     assert not flights_disagree(fitted, examination)

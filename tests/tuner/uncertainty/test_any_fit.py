@@ -105,7 +105,7 @@ def test_every_error_is_a_number(fit: Fit) -> None:
     assert np.isfinite(of_priors).all()
 
 
-def test_a_flight_that_alone_tells_of_a_coefficient_is_no_contradiction() -> None:
+def test_a_flight_that_alone_determines_a_coefficient_is_no_contradiction() -> None:
     found = left_out(information_of(ALONE))
     assert found is not None
     noise = covariance_of(information_of(ALONE)).error

@@ -62,7 +62,7 @@ def test_the_standard_error_is_the_spread_of_repeated_fits(memory: float) -> Non
     assert np.median(errors, axis=0) == pytest.approx(spread, rel=0.2)
 
 
-def test_white_noise_widens_by_what_few_stretches_leave_open() -> None:
+def test_white_noise_widens_by_the_few_degrees_of_freedom_of_stretches() -> None:
     generator = np.random.default_rng(5)
     design = smooth_design(2)
     covariances = [
@@ -73,7 +73,7 @@ def test_white_noise_widens_by_what_few_stretches_leave_open() -> None:
     assert min(covariance.inflation.min() for covariance in covariances) >= 1.0
 
 
-def test_what_one_stretch_alone_determines_is_not_known_the_worse_for_it() -> None:
+def test_a_coefficient_that_one_stretch_determines_is_not_widened_for_it() -> None:
     """The jackknife, which leaves it out, would have noise alone three times as wide and more."""
     generator = np.random.default_rng(6)
     design = smooth_design(2)
@@ -110,7 +110,7 @@ def test_a_direction_without_data_is_known_from_the_prior_alone() -> None:
 
 
 @pytest.mark.parametrize("size", [1e5, 1e8])
-def test_rounding_errors_of_what_is_known_well_are_no_information(size: float) -> None:
+def test_rounding_errors_of_large_information_are_no_information(size: float) -> None:
     generator = np.random.default_rng(11)
     design = size * smooth_design(5)
     design[:, 2] = design[:, 0] * (1.0 + 1e-13 * generator.normal(size=len(design)))

@@ -36,7 +36,7 @@ def test_one_coefficient_alone() -> None:
     assert worst.error == pytest.approx(0.2, rel=1e-3)
 
 
-def test_the_reference_says_what_counts_as_a_hundred_percent() -> None:
+def test_the_reference_is_the_change_of_a_hundred_percent() -> None:
     covariance = np.diag([1e-4, 1e-4, 1e-4, 4e-6])
     reference = np.array([1.0, 1.0, 1.0, 0.01])
     worst = worst_directions(covariance, reference, NAMES)[0]
@@ -53,5 +53,5 @@ def test_the_reference_says_what_counts_as_a_hundred_percent() -> None:
         ({"motor_constant": 1.0, "inertia_xx": 1.0}, False),
     ],
 )
-def test_what_a_common_scale_is(moves: dict[str, float], common: bool) -> None:
+def test_directions_of_a_common_scale(moves: dict[str, float], common: bool) -> None:
     assert is_common_scale(moves) is common

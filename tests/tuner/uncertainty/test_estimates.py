@@ -145,7 +145,9 @@ def test_tied_coefficients_share_their_estimate() -> None:
     assert second.reason == first.reason.model_copy(update={"tied_to": "inertia_xx"})
 
 
-def test_a_rotor_and_what_delays_its_command_are_lags_the_estimate_of_the_state_is_none() -> None:
+def test_rotor_time_constants_and_command_delays_are_lags_and_the_estimates_latency_is_none() -> (
+    None
+):
     fit = making.problem(("inertia_xx", "time_constant_up", "estimate_latency", "actuator_latency"))
     moved = fit.space.numbers(fit.space.initial)
     lags = _lags(fit.space, np.asarray(fit.space.scaled(jnp.asarray(fit.space.initial))))

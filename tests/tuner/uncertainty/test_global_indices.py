@@ -39,7 +39,7 @@ def indices(objective: Objective, method: Method, samples: int) -> GlobalSensiti
 @pytest.mark.parametrize(
     ("method", "samples", "simulations"), [("morris", 4, 16), ("sobol", 7, 40)]
 )
-def test_indices_put_first_what_matters_most(
+def test_indices_rank_the_most_influential_coefficient_first(
     objective: Objective, method: Method, samples: int, simulations: int, tmp_path: Path
 ) -> None:
     result = indices(objective, method, samples)

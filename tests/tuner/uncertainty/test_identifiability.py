@@ -38,12 +38,14 @@ def known(error, *, beyond_noise, code=ReasonCode.WIDE_INTERVAL):
     ],
     ids=["known", "noise leaves it open", "gusts do", "neither tells", "the prior alone tells"],
 )
-def test_what_is_held(uncertainty, held):
+def test_held_coefficients(uncertainty, held):
     assert bool(stand_ins_of(uncertainty)) is held
 
 
 @pytest.mark.parametrize(("after", "is_held"), [(1000.5, True), (990.0, True), (1040.0, False)])
-def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, after, is_held):
+def test_coefficients_that_trade_off_are_held_only_where_that_costs_nothing(
+    monkeypatch, after, is_held
+):
     objective = SimpleNamespace(
         segments=SimpleNamespace(windowed=True, freedom=None),
         sums=lambda point, *_, **__: SimpleNamespace(loss=np.array([point, 0.0])),
@@ -85,7 +87,7 @@ IDLE = {"name": "ground_effect", "bound": "upper", "code": ReasonCode.NULL_DIREC
     ],
     ids=["idle", "inside", "identified", "named", "asked to be free", "of the base model"],
 )
-def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
+def test_a_term_at_its_bound_that_flights_do_not_identify_is_removed(
     monkeypatch, freedom, idle, file, goes
 ):
     """Though the fitted flights lose by it, and though it is held for another one already."""

@@ -178,7 +178,7 @@ def fitted_at(objective: Objective, point: Point, flights: list[Flight]) -> Fitt
 
 
 @pytest.mark.parametrize("gusts", [False, True], ids=["still", "gusts"])
-def test_drag_of_a_fuselage_is_told_without_its_name(gusts):
+def test_drag_of_a_fuselage_is_found_without_its_name(gusts):
     fitted, flights = fit_of(FUSELAGE, 0, gusts=gusts)
     model_errors = model_errors_of(fitted, flights)
     axes = {
@@ -198,7 +198,7 @@ def test_the_right_model_lacks_nothing():
     assert alarms <= 1
 
 
-def test_the_intervals_of_what_it_moves_hold_it():
+def test_intervals_include_the_shift_by_an_omitted_law():
     fitted, flights = fit_of(FUSELAGE, 0, gusts=False)
     model_errors = model_errors_of(fitted, flights)
     without, held = examine(fitted), examine(fitted, model_errors=model_errors)
@@ -223,7 +223,7 @@ def test_markers_beside_the_centre_of_mass_are_no_law(sees):
     assert model_errors_of(fitted, flights) is None
 
 
-def test_a_hover_tells_of_no_law():
+def test_a_hover_shows_no_omitted_law():
     score = np.random.default_rng(0).normal(size=(9, 3))
     information = np.zeros((9, 3, 3))
     information[:, 0, 0] = 1.0
@@ -239,7 +239,7 @@ def test_commands_stand_in_for_tachometers():
     assert model_errors_of(fitted, blind) is None
 
 
-def test_what_a_logger_filters_sample_by_sample_is_half_a_period_off():
+def test_a_loggers_sampled_filter_is_half_a_period_off():
     objective = problem({"tachometer_lag": 0.008})
     measured, flights = flown(objective, 0)
     objective = replace(objective, segments=replace(objective.segments, measured=measured))
@@ -255,7 +255,7 @@ def test_what_a_logger_filters_sample_by_sample_is_half_a_period_off():
     assert inertia.parts.step < 0.005 * inertia.value  # the lag takes it up
 
 
-def test_rotors_whose_speed_nothing_tells_are_known_as_well_as_their_limit():
+def test_rotors_of_unrecorded_speed_are_known_as_well_as_their_limit():
     """Twice as fast, with a quarter of the motor constant and twice the limit, flies alike."""
     truth = problem({}, free=(*FREE, "zero_position_armed"))
     fastest = np.asarray(flown(truth, 0)[0]["rotor_speed"].values).max()
@@ -298,7 +298,7 @@ def test_gains_that_were_found_fly_the_other_model():
 
 
 @pytest.mark.parametrize(("speed_lag", "said"), [(1e-3, False), (-2e-3, True)])
-def test_lateness_within_a_period_of_the_loop_is_not_said(speed_lag, said):
+def test_lateness_within_a_period_of_the_loop_is_not_reported(speed_lag, said):
     """Stamps do not tell when in a period a sample was taken."""
     model_errors = ModelErrors(
         (), None, (ControllerEstimate("roll", "late", speed_lag, 1e-4, True),)
@@ -328,7 +328,7 @@ def flown_with_p(factor):
 
 
 @pytest.mark.parametrize("factor", [1.06, 1.5])
-def test_a_gain_that_is_far_off_is_told_beside_the_fit(factor):
+def test_a_gain_that_is_far_off_is_reported_beside_the_fit(factor):
     said = gains_far_off(*flown_with_p(factor))
     if factor < 1.3:
         assert not said
@@ -356,7 +356,7 @@ def test_one_flight_of_another_p_is_named_and_moves_no_gain_of_the_others():
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.06])
-def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
+def test_intervals_include_the_shift_by_another_controller(factor):
     """Flights of a P that is not the file's, whose set-points and commands were recorded."""
     fitted, flights = flown_with_p(factor)
     model_errors = model_errors_of(fitted, flights)
@@ -396,7 +396,7 @@ def test_the_interval_of_a_gain_holds_the_one_of_recorded_commands(gain):
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.012])
-def test_rotor_speeds_that_were_filtered_are_told_and_in_the_intervals(seconds):
+def test_filtered_rotor_speeds_are_reported_and_in_the_intervals(seconds):
     objective = problem({})
     measured, flights = flown(problem({}, random=np.random.default_rng(5)), 0)
     if seconds:

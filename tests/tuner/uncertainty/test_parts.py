@@ -89,7 +89,7 @@ def test_the_error_of_left_out_flights_covers_however_far_they_lie_apart(apart):
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.5])
-def test_what_one_flight_alone_tells_is_as_doubtful_as_what_all_tell(apart):
+def test_the_error_by_one_flight_alone_is_as_large_as_by_all(apart):
     """It cannot contradict itself; how flights disagree elsewhere is all that is known of it."""
     noise, found = errors(regression(np.random.default_rng(1), apart=apart, one_tells=True)[0])
     wider = found / noise
@@ -124,7 +124,7 @@ def test_one_flight_is_left_out_in_parts_if_it_is_long():
     assert left_out(replace(one, begins=2.0 * np.arange(FLIGHTS))) is None
 
 
-def test_noise_alone_is_what_it_would_be_without_the_scales_of_the_residuals():
+def test_the_error_by_noise_alone_ignores_the_scales_of_residuals():
     information, _ = regression(np.random.default_rng(3), apart=0.0)
     scaled = replace(information, blocks=information.blocks / 9.0, scale=3.0 * information.scale)
     assert noise_alone(scaled) == pytest.approx(noise_alone(information), rel=1e-6)
@@ -184,7 +184,7 @@ def test_readings_drawn_again_count_as_far_as_they_scatter_the_estimates():
 
 @pytest.mark.parametrize("excess", [0.0, 1.0, 5.0, 1e4])
 @pytest.mark.parametrize("freedom", [2, 3, 10])
-def test_what_is_allowed_for_covers_whatever_adds_to_noise(freedom, excess):
+def test_overdispersion_factors_cover_any_excess_over_noise(freedom, excess):
     generator = np.random.default_rng(6)
     variance = 1.0 + excess**2
     ratio = variance * generator.chisquare(freedom, 2000) / freedom
@@ -202,7 +202,7 @@ def test_what_is_allowed_for_covers_whatever_adds_to_noise(freedom, excess):
 
 
 @pytest.mark.parametrize(("excess", "width"), [(0.0, 1.1), (1.0, 1.15), (30.0, 1.45)])
-def test_coefficients_share_what_is_known_of_the_disturbance(excess, width):
+def test_coefficients_share_the_estimate_of_the_disturbance(excess, width):
     """Three degrees of freedom each, twelve coefficients: narrower than alone, and they cover."""
     generator, own = np.random.default_rng(7), np.eye(12)
     covered, shared, alone = [], [], []
@@ -218,7 +218,7 @@ def test_coefficients_share_what_is_known_of_the_disturbance(excess, width):
     assert np.median(shared) < np.median(alone) + 0.1
 
 
-def test_one_coefficient_that_scatters_is_not_lost_among_others():
+def test_one_coefficient_that_scatters_keeps_its_wide_interval_among_others():
     ratio = np.append(np.ones(11), 400.0)
     factor = overdispersion_factors(ratio, np.full(12, 3.0), np.eye(12), np.ones(12))
     assert factor[-1] > 15.0

@@ -65,7 +65,7 @@ def test_a_well_known_coefficients_profile_is_its_interval(
 
 
 @pytest.mark.slow
-def test_what_is_not_identifiable_has_an_open_profile(
+def test_an_unidentifiable_coefficient_has_an_open_profile(
     full_problem: FullProblem,
     uncertainty: Uncertainty,
     fitted: Fitted,

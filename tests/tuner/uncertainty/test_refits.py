@@ -50,7 +50,7 @@ def result_with(**errors):
     return SimpleNamespace(coefficients=dict(zip(errors, found, strict=True)), flights=flights)
 
 
-def test_what_the_flights_disagree_about_is_named():
+def test_a_coefficient_that_flights_disagree_about_is_named():
     precision, disagree = refits_in_words(result_with(inertia_xx=1.2, moment_constant=2.5))
     assert precision.endswith("known to about ±50 %.")
     assert disagree.startswith("The flights disagree about moment_constant by more than twice")

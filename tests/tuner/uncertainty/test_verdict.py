@@ -45,13 +45,13 @@ def test_well_known() -> None:
     assert judged() == (Verdict.WELL_KNOWN, INTERVAL)
 
 
-def test_weakly_known_names_what_it_is_confused_with() -> None:
+def test_weakly_known_names_the_correlated_coefficient() -> None:
     verdict, reason = judged(half=0.2, error=0.1)
     assert verdict is Verdict.WEAKLY_KNOWN
     assert (reason.correlated_with, reason.correlation) == ("estimate_latency", 0.95)
 
 
-def test_an_interval_that_the_prior_made_is_not_identifiable() -> None:
+def test_an_interval_by_the_prior_is_not_identifiable() -> None:
     verdict, reason = judged(half=0.03, error=0.8)
     assert verdict is Verdict.NOT_IDENTIFIABLE
     assert reason.code is ReasonCode.WIDE_INTERVAL

@@ -57,7 +57,7 @@ def test_an_interval_in_its_unit() -> None:
     assert reason_in_words(reason) == "±0.031 ms (95 %), mostly from command"
 
 
-def test_what_the_prior_determines() -> None:
+def test_a_coefficient_that_the_prior_determines() -> None:
     reason = Reason(code=ReasonCode.WIDE_INTERVAL, half_width=1.57, prior_given=False)
     assert reason_in_words(reason) == (
         "the flights alone determine it only to ±381 %; the interval leans on the default prior"
