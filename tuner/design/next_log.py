@@ -149,7 +149,7 @@ def _faster_inputs(job: Job, fitted: Fitted) -> list[LogProposal]:
     Its gain is extrapolated from fits with every second and every fourth sample.
     """
     segments, inlets = fitted.objective.segments, set(job.inlets)
-    if len(inlets) > 1 or not segments.windowed or segments.freedom is not None:
+    if len(inlets) > 1 or not segments.windowed or segments.start_sd is not None:
         return []
     signal = INLETS[inlets.pop()].needs[0]
     losses = [_loss(fitted, fitted.objective)]

@@ -150,8 +150,8 @@ def candidate_problem(
         flight=np.arange(count),
         resting=None if recorded.resting is None else np.ones(count, bool),
         log_voltage=_filled_like(recorded.log_voltage, count, np.nan),
-        freedom=_filled_like(recorded.freedom, count, 0.0),
-        freed=recorded.freed,
+        start_sd=_filled_like(recorded.start_sd, count, 0.0),
+        free_rows=recorded.free_rows,
     )
     return replace(
         objective, segments=segments, samples=round(seconds * schedule.log_rate), multiplicity=None
@@ -262,13 +262,15 @@ def rank_next_flights(
     names, fitted = tuple(examination.sensitivity.steps), examination.uncertainty
     count = len(fitted.names)
     verdicts = {name: fitted.estimates[name].verdict for name in fitted.names}
-    verdicts |= {name: freed.estimates[name].verdict for name, freed in examination.freed.items()}
+    verdicts |= {
+        name: fixed_one.estimates[name].verdict for name, fixed_one in examination.of_fixed.items()
+    }
     weak = [name for name in names if verdicts[name] is not Verdict.WELL_KNOWN]
     free = [name for name in weak if name in fitted.names]
     fixed = [
         name
         for name in weak
-        if name in examination.freed and COEFFICIENTS[name].informed_by != "weighing"
+        if name in examination.of_fixed and COEFFICIENTS[name].informed_by != "weighing"
     ]
     targets = free or fixed or list(fitted.names)
     rows = [
@@ -286,7 +288,7 @@ def rank_next_flights(
         arena=(arena.x, arena.y, arena.z),
         seconds=seconds,
         targets=targets,
-        fixed_targets=[name for name in targets if name in examination.freed],
+        fixed_targets=[name for name in targets if name in examination.of_fixed],
         all_known=not free,
         flights=rows,
     )

@@ -325,7 +325,7 @@ class _Group:
 
         They follow from Gauss-Newton steps from the recorded starts, halved where they overshoot.
         """
-        assert segments.freedom is not None
+        assert segments.start_sd is not None
         names, flights = tuple(self._conditions), len(self._recordings)
         objective = Objective(
             model,
@@ -344,7 +344,7 @@ class _Group:
         point = Point(np.zeros(0), np.asarray(np.stack([*none, *rows])))
         loose = {name: np.full(flights, MISFIT_SCALE) for name in segments.measured}
         criterion = plain_criterion(objective, self._samples, loose)
-        trial = best = np.zeros(segments.freedom.shape)
+        trial = best = np.zeros(segments.start_sd.shape)
         least = np.full(trial.shape[1], np.inf)
         for _ in range(GAUSS_NEWTON_STEPS + 1):  # the last one judges the step before it
             there = replace(criterion, states=np.asarray(trial))

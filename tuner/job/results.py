@@ -148,11 +148,11 @@ def shifts_of_starts(fitted: Fitted) -> dict[str, JsonValue]:
 
     State -> shift in its unit: the part of the data explained by initial states, not coefficients.
     """
-    freedom, states = fitted.objective.segments.freedom, fitted.criterion.states
-    if freedom is None or states is None:
+    start_sd, states = fitted.objective.segments.start_sd, fitted.criterion.states
+    if start_sd is None or states is None:
         return {}
-    moved = np.zeros((ROWS["trim"].stop, freedom.shape[-1]))
-    moved[list(fitted.objective.segments.freed)] = np.asarray(states) * freedom
+    moved = np.zeros((ROWS["trim"].stop, start_sd.shape[-1]))
+    moved[list(fitted.objective.segments.free_rows)] = np.asarray(states) * start_sd
     return {name: float(np.sqrt(np.mean(moved[rows] ** 2))) for name, rows in ROWS.items()}
 
 

@@ -185,8 +185,8 @@ def _uncertainty_with(examination: Examination, name: str) -> Uncertainty:
     """Return the uncertainty of the fitted coefficients and a named one."""
     if name in examination.uncertainty.names:
         return examination.uncertainty
-    if name in examination.freed:
-        return examination.freed[name]
+    if name in examination.of_fixed:
+        return examination.of_fixed[name]
     names = tuple(examination.sensitivity.steps)
     raise InputError("--profile", f"no coefficient '{name}'", did_you_mean(name, names))
 

@@ -141,14 +141,14 @@ YAW_INTEGRAL_GAIN, CLIPPED_TICKS = 0.1, 2.0
 """PX4's default of MC_YAWRATE_I; and the uncertainty of the integrator's clipping, in ticks."""
 
 
-def freedom_of(ignored: Collection[str]) -> NDArray[np.float64]:
+def start_sd_of(ignored: Collection[str]) -> NDArray[np.float64]:
     """Return the standard deviations (L,) of a start; zero where one is ignored."""
     return np.concatenate(
         [np.full(count, 0.0 if name in ignored else sd) for name, (count, sd) in STATES.items()]
     )
 
 
-def freedom_of_spin(
+def start_sd_of_spin(
     yaw_rate: NDArray[np.float64], rate: float, position: NDArray[np.float64]
 ) -> dict[int, NDArray[np.float64]]:
     """Return row of an initial state -> its standard deviations (F,) in a spin.

@@ -386,7 +386,7 @@ def bypassed_by(names: Sequence[InletName], flights: Sequence[Flight]) -> frozen
     return frozenset.intersection(*(INLETS[name].bypassed(flight) for name, flight in pairs))
 
 
-def freed_by(names: Collection[InletName], *, terms: bool) -> frozenset[str]:
+def also_free_by(names: Collection[InletName], *, terms: bool) -> frozenset[str]:
     """Return the coefficients that all of some inlets free besides the usual ones.
 
     Parameters

@@ -21,11 +21,11 @@ from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
 from tuner.objective.battery import log_voltage_of
 from tuner.objective.initial_conditions import (
-    freedom_of,
-    freedom_of_spin,
     is_at_rest,
     recent_command,
     start_of,
+    start_sd_of,
+    start_sd_of_spin,
 )
 from tuner.objective.inlets import INLETS, inlet_of
 from tuner.objective.noise import repeat_counts
@@ -92,9 +92,9 @@ class Segments(eqx.Module):
     """Logarithm of the battery's voltage in V, one a control tick; NaN where it is unknown."""
     disturbance: Disturbance | None = None
     """Known forces and moments of disturbances."""
-    freedom: Float[Array, "L F"] | None = None
+    start_sd: Float[Array, "L F"] | None = None
     """Prior standard deviations of the free rows of a start; None if none is free."""
-    freed: tuple[int, ...] = eqx.field(static=True, default=())
+    free_rows: tuple[int, ...] = eqx.field(static=True, default=())
     """The L free rows of a start (`tuner.objective.initial_conditions`)."""
 
     @property
@@ -122,7 +122,7 @@ def segments_of(
 ) -> Segments:
     """Lay whole flights side by side for the ``reference`` inlet.
 
-    A spin has a free initial state: see `freedom_of_spin`.
+    A spin has a free initial state: see `start_sd_of_spin`.
 
     Parameters
     ----------
@@ -151,12 +151,12 @@ def segments_of(
             )
     inlet = INLETS["reference"].lay_out(flights, schedule)
     assert isinstance(inlet, ReferenceInlet)
-    freed = {}
+    start_sd = {}
     if bool(np.any(inlet.spins)):
         rate = np.where(inlet.spins, inlet.yaw_rate, 0.0)
         known = noise.get("position", 0.0)  # where no position is compared, none is corrected
         begun = [initial_position_error(flight.series, known) for flight in flights]
-        freed = freedom_of_spin(np.asarray(rate), schedule.rate_control_rate, np.array(begun))
+        start_sd = start_sd_of_spin(np.asarray(rate), schedule.rate_control_rate, np.array(begun))
     return Segments(
         inlet=inlet,
         start=start_of([flight.initial for flight in flights]),
@@ -164,8 +164,8 @@ def segments_of(
         flight=np.arange(len(flights)),
         resting=np.asarray([is_at_rest(flight.initial) for flight in flights]),
         log_voltage=log_voltage_of(flights, [Window(flight, 0.0) for flight in flights], schedule),
-        freedom=np.asarray(np.stack(list(freed.values()))) if freed else None,
-        freed=tuple(freed),
+        start_sd=np.stack(list(start_sd.values())) if start_sd else None,
+        free_rows=tuple(start_sd),
     )
 
 
@@ -252,11 +252,11 @@ def window_segments(
     cut = [piece.flight for piece in pieces]
     start = start_of([flight.initial for flight in cut], resting=False)
     recorded = [INLETS[inlets[piece.number]] for piece in pieces]
-    freedom, freed = None, np.arange(0)
+    start_sd, free_rows = None, np.arange(0)
     if free_starts:
-        of_all = np.stack([freedom_of(inlet.ignores) for inlet in recorded], axis=-1)
-        freed = np.flatnonzero(of_all.any(axis=1))
-        freedom = np.asarray(of_all[freed])
+        of_all = np.stack([start_sd_of(inlet.ignores) for inlet in recorded], axis=-1)
+        free_rows = np.flatnonzero(of_all.any(axis=1))
+        start_sd = np.asarray(of_all[free_rows])
     compared = {
         channel: sigma
         for channel, sigma in noise.items()
@@ -279,8 +279,8 @@ def window_segments(
             [piece.window for piece in pieces],
             schedule,
         ),
-        freedom=freedom,
-        freed=tuple(freed.tolist()),
+        start_sd=start_sd,
+        free_rows=tuple(free_rows.tolist()),
     )
 
 

@@ -137,17 +137,17 @@ def fly(
     logged = tuple(sorted(names if moves else {*LOGGED, *names}))
     coefficients = {**coefficients_in(model), **coefficients}
     own = not moves or any(np.ndim(value) for value in coefficients.values())
-    if segments.freedom is None and isinstance(segments.inlet, ReferenceInlet):
+    if segments.start_sd is None and isinstance(segments.inlet, ReferenceInlet):
         # as flights with a spin have it: one program serves both
         nothing = np.zeros((len(SPIN_ROWS), segments.count))
-        segments = replace(segments, freedom=nothing, freed=SPIN_ROWS)
-    if segments.freedom is not None and states is None:
-        states = np.zeros((len(segments.freed), segments.count))
+        segments = replace(segments, start_sd=nothing, free_rows=SPIN_ROWS)
+    if segments.start_sd is not None and states is None:
+        states = np.zeros((len(segments.free_rows), segments.count))
     given = _Given(
         model=model,
         coefficients={name: np.asarray(value, float) for name, value in coefficients.items()},
         segments=flown_part(segments),
-        states=None if segments.freedom is None else states,
+        states=None if segments.start_sd is None else states,
         conditions=dict(conditions),
     )
     if own:
@@ -381,10 +381,10 @@ def beginning_of(
         )
     if segments.turning is not None:
         start = with_commanded_rotors(start, model.vehicle, segments.turning, speed_factor=factor)
-    if states is not None and segments.freedom is not None:
-        change = with_all_rows(states * segments.freedom, segments.freed)
+    if states is not None and segments.start_sd is not None:
+        change = with_all_rows(states * segments.start_sd, segments.free_rows)
         start = with_change(start, change)
-        if ROWS["trim"].start in segments.freed:
+        if ROWS["trim"].start in segments.free_rows:
             inlet = trimmed(inlet, model.vehicle, change)
     return start, inlet, environment
 

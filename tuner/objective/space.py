@@ -146,7 +146,7 @@ def space_of(
     joint_prior: JointPrior | None = None,
     *,
     bypassed: Collection[str] = (),
-    freed: Collection[str] = (),
+    also_free: Collection[str] = (),
 ) -> Space:
     """Return the space of a job's free coefficients.
 
@@ -160,7 +160,7 @@ def space_of(
         Result of ground measurements.
     bypassed
         Coefficients without effect on the job's flights: they stay as they are.
-    freed
+    also_free
         Coefficients that are free besides the usual ones.
 
     Raises
@@ -169,7 +169,7 @@ def space_of(
         Nothing is free, bounds exclude or pin the start, a tie names a fixed coefficient, or a free
         coefficient belongs to something that does not fly.
     """
-    free = _free_names(job, bypassed, freed)
+    free = _free_names(job, bypassed, also_free)
     values = initial_values(vehicle, controller, free)
     for name in free:
         if name not in values:
@@ -225,8 +225,10 @@ def _with_filter_bounded(
     return job.replace(coefficients={**job.coefficients, CUTOFF: changed})
 
 
-def _free_names(job: JobFile, bypassed: Collection[str], freed: Collection[str]) -> tuple[str, ...]:
-    wanted = {n for n, row in COEFFICIENTS.items() if row.free or n in freed} - set(job.fixed)
+def _free_names(
+    job: JobFile, bypassed: Collection[str], also_free: Collection[str]
+) -> tuple[str, ...]:
+    wanted = {n for n, row in COEFFICIENTS.items() if row.free or n in also_free} - set(job.fixed)
     wanted = wanted if job.free is None else set(job.free)
     free = tuple(name for name in COEFFICIENTS if name in wanted and name not in bypassed)
     if not free:

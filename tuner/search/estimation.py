@@ -336,7 +336,7 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     free[: len(CLOCKS), known] = False
     fed = [not INLETS[inlet].closed_loop for inlet in job.inlets]
     free[CLOCKS.index("flight_controller"), fed] = False
-    if job.objective.segments.windowed and job.objective.segments.freedom is None:
+    if job.objective.segments.windowed and job.objective.segments.start_sd is None:
         free[: len(OFFSETS)] = False  # a recorded start has the recording's clock and bias
     return free
 

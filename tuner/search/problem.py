@@ -15,7 +15,7 @@ from tuner.core.errors import ConfigError, RecordingError
 from tuner.equation_error.estimate import Estimate
 from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
 from tuner.objective.initial_conditions import begins_gently
-from tuner.objective.inlets import INLETS, bypassed_by, freed_by, window_seconds
+from tuner.objective.inlets import INLETS, also_free_by, bypassed_by, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import (
@@ -150,7 +150,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         job,
         settings.bench,
         bypassed=bypassed_by(inlets, fitted),
-        freed=freed_by(inlets, terms=job.terms == "auto"),
+        also_free=also_free_by(inlets, terms=job.terms == "auto"),
     )
     if "battery_exponent" in space.free or space.fixed.get("battery_exponent"):
         require_voltage(fitted)

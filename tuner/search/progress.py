@@ -228,12 +228,12 @@ class Progress:
 def initial_progress(objective: Objective, vectors: Array) -> Progress:
     """Return the state before the first stage for S start vectors (S, K)."""
     offsets = np.zeros((len(vectors), *objective.start(vectors[0]).offsets.shape))
-    freedom = objective.segments.freedom
+    start_sd = objective.segments.start_sd
     return Progress(
         stage=0,
         points=Point(np.asarray(vectors), np.asarray(offsets)),
         scales={name: np.ones(objective.flights) for name in objective.segments.measured},
-        states=None if freedom is None else np.zeros(freedom.shape),
+        states=None if start_sd is None else np.zeros(start_sd.shape),
         losses=np.full(len(vectors), np.inf),
         iterations=(),
         evaluations=0,

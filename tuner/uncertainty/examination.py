@@ -37,12 +37,12 @@ class Examination:
 
     Attributes
     ----------
-    freed
+    of_fixed
         Fixed coefficient -> the uncertainty had it been fitted beside the others; it is the last
         parameter there.
     bias
         (L, K): percent by which each fitted coefficient is wrong for each percent by which a fixed
-        one is; the fixed ones in the order of ``freed``, the fitted in that of ``uncertainty``.
+        one is; the fixed ones in the order of ``of_fixed``, the fitted in that of ``uncertainty``.
     sensitivity
         Of the flights to all, the fitted first.
     full_problem, information
@@ -50,7 +50,7 @@ class Examination:
     """
 
     uncertainty: Uncertainty
-    freed: Mapping[str, Uncertainty]
+    of_fixed: Mapping[str, Uncertainty]
     bias: Array
     sensitivity: LocalSensitivity
     residuals: tuple[Residual, ...]
@@ -147,7 +147,7 @@ def examine(
 
     return Examination(
         uncertainty=known(),
-        freed={name: known(name) for name in full_problem.fixed},
+        of_fixed={name: known(name) for name in full_problem.fixed},
         bias=_bias(full_problem, information, reference),
         sensitivity=LocalSensitivity.joined(sensitivities),
         residuals=tuple(residuals),
@@ -200,9 +200,13 @@ def _coefficients(examination: Examination, space: Space) -> dict[str, Coefficie
         for index, parameter in enumerate(space.parameters)
         for name, ratio in parameter.ratios.items()
     }
-    for (name, freed), row in zip(examination.freed.items(), examination.bias, strict=True):
+    for (name, uncertainty_with), row in zip(
+        examination.of_fixed.items(), examination.bias, strict=True
+    ):
         bias = dict(zip(uncertainty.names, row.tolist(), strict=True))
-        known[name] = _coefficient(name, freed, len(freed.names) - 1, steps[name], bias)
+        known[name] = _coefficient(
+            name, uncertainty_with, len(uncertainty_with.names) - 1, steps[name], bias
+        )
     return known
 
 

@@ -69,7 +69,7 @@ def hold_undetermined(
 
     examination = examined(fitted)
     segments = fitted.objective.segments
-    predicts = segments.windowed and segments.freedom is None
+    predicts = segments.windowed and segments.start_sd is None
     for _ in range(MAX_ROUNDS):
         found = stand_ins_of(examination.uncertainty)
         if predicts:

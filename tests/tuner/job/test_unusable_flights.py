@@ -14,7 +14,7 @@ from tuner.core.errors import ConfigError, RecordingError
 from tuner.evaluate.validation import flights_worse
 from tuner.findings.findings import Code, Finding
 from tuner.job.check import merged_by_flight
-from tuner.objective.inlets import INLETS, bypassed_by, freed_by
+from tuner.objective.inlets import INLETS, also_free_by, bypassed_by
 from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.space import space_of
 from tuner.objective.windows import windows_of
@@ -175,8 +175,8 @@ def test_a_flight_that_a_fit_left_worse_is_named():
 
 def test_what_no_loop_takes_out_is_free_where_inputs_are_fed_in(updated):
     def names(*inlets, terms):
-        freed = freed_by(inlets, terms=terms)
-        return set(space_of(updated, ControllerFile(), JobFile(), freed=freed).names)
+        also_free = also_free_by(inlets, terms=terms)
+        return set(space_of(updated, ControllerFile(), JobFile(), also_free=also_free).names)
 
     usual = names("reference", "rotor_speed", terms=True)
     trims = {"torque_trim_x", "torque_trim_y", "torque_trim_z"}

@@ -244,7 +244,7 @@ def test_predictions_begin_at_recorded_states(asked, free, full_flight, full_bag
     own = job.settings.job.model_copy(update={"inlet": inlet, "search": search})
     settings = replace(job.settings, job=own)
     segments = job_of(settings, recordings_of(settings, [full_flight])).objective.segments
-    assert (segments.freedom is not None) == free
+    assert (segments.start_sd is not None) == free
 
 
 def test_what_no_recording_holds_predicts_nothing(full_flight, full_bag, updated):

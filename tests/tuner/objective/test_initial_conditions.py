@@ -23,8 +23,8 @@ from tuner.disturbances.predictor import unscaled
 from tuner.objective.initial_conditions import (
     ROWS,
     eliminate_states,
-    freedom_of,
-    freedom_of_spin,
+    start_sd_of,
+    start_sd_of_spin,
     with_all_rows,
     with_change,
 )
@@ -34,7 +34,7 @@ from tuner.recordings.loader import load_flight
 from tuner.vehicle.model import model_of
 
 ROOT = Path(__file__).resolve().parents[3]
-COUNT = len(freedom_of(()))
+COUNT = len(start_sd_of(()))
 
 
 def test_elimination_is_the_minimum_over_the_start():
@@ -90,7 +90,7 @@ def test_a_start_moves_by_the_given_change(still):
 
 
 def test_states_without_effect_are_not_free():
-    free = freedom_of(("rotor_speed",))
+    free = start_sd_of(("rotor_speed",))
     assert np.count_nonzero(free) == COUNT - 4
 
 
@@ -135,13 +135,13 @@ BEGUN = np.array([1e-4, 2e-4])
 
 
 def test_a_spin_leaves_a_tick_of_its_integrator_and_where_it_began_open_and_nothing_else():
-    freedom = freedom_of_spin(SPIN_ROWS, 400.0, BEGUN)
+    start_sd = start_sd_of_spin(SPIN_ROWS, 400.0, BEGUN)
     names = {row: n for n, rows in ROWS.items() for row in range(rows.start, rows.stop)}
-    assert [names[row] for row in freedom] == ["position", "position", "rate_integral"]
-    assert list(freedom)[:2] == [ROWS["position"].start, ROWS["position"].start + 1]
-    assert list(freedom)[2] == YAW
-    assert freedom[ROWS["position"].start] == pytest.approx([0.0, 2e-4])
-    assert freedom[YAW] == pytest.approx([0.0, 2 * 0.1 * 2.0 / 400.0])
+    assert [names[row] for row in start_sd] == ["position", "position", "rate_integral"]
+    assert list(start_sd)[:2] == [ROWS["position"].start, ROWS["position"].start + 1]
+    assert list(start_sd)[2] == YAW
+    assert start_sd[ROWS["position"].start] == pytest.approx([0.0, 2e-4])
+    assert start_sd[YAW] == pytest.approx([0.0, 2 * 0.1 * 2.0 / 400.0])
 
 
 def test_a_fit_without_positions_does_not_free_the_initial_position_of_a_spin():
@@ -149,11 +149,11 @@ def test_a_fit_without_positions_does_not_free_the_initial_position_of_a_spin():
     noise = {"attitude": 1e-3, "body_rate": 0.01}
     blind = segments_of([spin], noise=noise, schedule=Schedule())
     seeing = segments_of([spin], noise={"position": 5e-4, **noise}, schedule=Schedule())
-    assert blind.freed == seeing.freed
-    assert blind.freed[-1] == YAW
-    np.testing.assert_array_equal(blind.freedom[:-1], 0.0)
-    np.testing.assert_array_equal(blind.freedom[-1], seeing.freedom[-1])
-    assert (np.asarray(seeing.freedom) > 0.0).all()
+    assert blind.free_rows == seeing.free_rows
+    assert blind.free_rows[-1] == YAW
+    np.testing.assert_array_equal(blind.start_sd[:-1], 0.0)
+    np.testing.assert_array_equal(blind.start_sd[-1], seeing.start_sd[-1])
+    assert (np.asarray(seeing.start_sd) > 0.0).all()
 
 
 @pytest.mark.parametrize(
@@ -166,15 +166,17 @@ def test_a_fit_without_positions_does_not_free_the_initial_position_of_a_spin():
 def test_the_initial_state_of_a_spin_has_no_information_on_coefficients(row, free):
     """Flown with an integrator a tick off, or from beside: the truth fits as noise allows."""
     fit = problem(free)
-    freedom = freedom_of_spin(SPIN_ROWS, PHYSICS, 5.0 * BEGUN)
+    start_sd = start_sd_of_spin(SPIN_ROWS, PHYSICS, 5.0 * BEGUN)
     start = fit.segments.start
-    change = jnp.zeros((max(r.stop for r in ROWS.values()), 2)).at[row].set(0.5 * freedom[row])
+    change = jnp.zeros((max(r.stop for r in ROWS.values()), 2)).at[row].set(0.5 * start_sd[row])
     off = replace(fit, segments=replace(fit.segments, start=with_change(start, change)))
     recorded = with_data(off, truth(fit)).segments.measured
     known = replace(fit.segments, measured=recorded)
-    open_ = replace(known, freedom=jnp.asarray(np.stack([*freedom.values()])), freed=(*freedom,))
+    open_ = replace(
+        known, start_sd=jnp.asarray(np.stack([*start_sd.values()])), free_rows=(*start_sd,)
+    )
     criterion, losses, pulls = criterion_of(fit, prior=0.0), [], []
-    for segments, states in ((known, None), (open_, jnp.zeros((len(freedom), 2)))):
+    for segments, states in ((known, None), (open_, jnp.zeros((len(start_sd), 2)))):
         sums = replace(fit, segments=segments).sums(
             truth(fit), replace(criterion, states=states), derivatives=True
         )

@@ -42,8 +42,8 @@ def test_a_kernel_flies_as_jax_does_and_so_do_its_derivatives(objective):
     model = objective.model_at(objective.space.initial)
     segments, schedule = objective.segments, objective.schedule
     states = None
-    if segments.freedom is not None:
-        states = np.random.default_rng(0).normal(0.0, 0.3, segments.freedom.shape)
+    if segments.start_sd is not None:
+        states = np.random.default_rng(0).normal(0.0, 0.3, segments.start_sd.shape)
     values = {**coefficients_in(model), **objective.space.values(objective.space.initial)}
     tangents = {name: np.eye(len(MOVING))[i] for i, name in enumerate(MOVING)}
     got = simulation.fly(

@@ -109,11 +109,11 @@ def test_every_inlet_gives_segments_whose_starts_are_free(flight, inlet, known):
         lag=0.02,
         noise={"position": 1e-3, "body_rate": 0.02, "rotor_speed": 2.0, "command": 1e-3},
     )
-    assert segments.freedom is not None
-    assert np.all(np.asarray(segments.freedom) > 0.0)
+    assert segments.start_sd is not None
+    assert np.all(np.asarray(segments.start_sd) > 0.0)
     of_known = {row for name in known for row in range(100)[ROWS[name]]}
     rows = range(max(row.stop for row in ROWS.values()))
-    assert segments.freed == tuple(row for row in rows if row not in of_known)
+    assert segments.free_rows == tuple(row for row in rows if row not in of_known)
     assert ("command" in segments.measured) == (inlet == "body_rate")
     assert ("rotor_speed" in segments.measured) == (inlet not in ("rotor_speed", "attitude"))
     assert segments.begins.tolist() == pytest.approx(list(range(segments.count)), abs=0.02)

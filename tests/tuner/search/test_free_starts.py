@@ -8,7 +8,7 @@ import pytest
 
 from tests.tuner.uncertainty.making import PHYSICS, problem, truth, with_data
 from tuner.objective.criterion import Point
-from tuner.objective.initial_conditions import ROWS, freedom_of_spin
+from tuner.objective.initial_conditions import ROWS, start_sd_of_spin
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import run_stages
 from tuner.search.levenberg_marquardt import MAX_STATE_SD, estimated_states, need_relinearising
@@ -27,10 +27,10 @@ def begun_elsewhere():
     So far that what it does to the flight is no line.
     """
     fit = problem(FREE)
-    told = freedom_of_spin(np.array([0.0, 2.0]), PHYSICS, np.array([1e-4, 1e-4]))
-    freedom = {row: 10.0 * sd for row, sd in told.items()}
+    start_sd = start_sd_of_spin(np.array([0.0, 2.0]), PHYSICS, np.array([1e-4, 1e-4]))
+    start_sd = {row: 10.0 * sd for row, sd in start_sd.items()}
     start = fit.segments.start
-    turned = start.rate_integral.z + OFF * freedom[YAW]
+    turned = start.rate_integral.z + OFF * start_sd[YAW]
     there = replace(start, rate_integral=replace(start.rate_integral, z=turned))
     flown = with_data(replace(fit, segments=replace(fit.segments, start=there)), truth(fit))
     return replace(
@@ -38,8 +38,8 @@ def begun_elsewhere():
         segments=replace(
             fit.segments,
             measured=flown.segments.measured,
-            freedom=jnp.asarray(np.stack([*freedom.values()])),
-            freed=(*freedom,),
+            start_sd=jnp.asarray(np.stack([*start_sd.values()])),
+            free_rows=(*start_sd,),
         ),
     )
 

@@ -178,10 +178,10 @@ def test_an_increase_of_the_fixed_one_moves_the_fitted_as_a_refit_would(
 ) -> None:
     information = examination.information
     count = len(objective.space)
-    place = count + list(examination.freed).index("mass")
+    place = count + list(examination.of_fixed).index("mass")
     step = -np.linalg.solve(information.total[:count, :count], information.data[:count, place])
     names = list(objective.space.names)
-    row = examination.bias[list(examination.freed).index("mass")]
+    row = examination.bias[list(examination.of_fixed).index("mass")]
     motor = names.index("motor_constant")
     assert row[motor] == pytest.approx(step[motor])
 

@@ -47,7 +47,7 @@ def test_coefficients_that_trade_off_are_held_only_where_that_costs_nothing(
     monkeypatch, after, is_held
 ):
     objective = SimpleNamespace(
-        segments=SimpleNamespace(windowed=True, freedom=None),
+        segments=SimpleNamespace(windowed=True, start_sd=None),
         sums=lambda point, *_, **__: SimpleNamespace(loss=np.array([point, 0.0])),
     )
     fitted = SimpleNamespace(objective=objective, criterion=None, point=1000.0, held={})
@@ -74,7 +74,7 @@ def test_coefficients_that_trade_off_are_held_only_where_that_costs_nothing(
 IDLE = {"name": "ground_effect", "bound": "upper", "code": ReasonCode.NULL_DIRECTION}
 
 
-@pytest.mark.parametrize("freedom", [None, 1.0], ids=["recorded starts", "free starts"])
+@pytest.mark.parametrize("start_sd", [None, 1.0], ids=["recorded starts", "free starts"])
 @pytest.mark.parametrize(
     ("idle", "file", "goes"),
     [
@@ -88,11 +88,11 @@ IDLE = {"name": "ground_effect", "bound": "upper", "code": ReasonCode.NULL_DIREC
     ids=["idle", "inside", "identified", "named", "asked to be free", "of the base model"],
 )
 def test_a_term_at_its_bound_that_flights_do_not_identify_is_removed(
-    monkeypatch, freedom, idle, file, goes
+    monkeypatch, start_sd, idle, file, goes
 ):
     """Though the fitted flights lose by it, and though it is held for another one already."""
     name, objective = idle["name"], SimpleNamespace(segments=SimpleNamespace(windowed=True))
-    objective.segments.freedom = freedom
+    objective.segments.start_sd = start_sd
     traded = {name: "input_scaling", "input_scaling": "input_scaling"}
     fitted = SimpleNamespace(objective=objective, point=None, held=traded)
     estimate = SimpleNamespace(reason=Reason(code=idle["code"], bound=idle["bound"]))

@@ -84,6 +84,6 @@ def test_an_unidentifiable_coefficient_has_an_open_profile(
 
 def test_an_unknown_coefficient_is_named(uncertainty: Uncertainty) -> None:
     sensitivity = SimpleNamespace(steps=dict.fromkeys(uncertainty.names, 1.0))
-    examined: Any = SimpleNamespace(uncertainty=uncertainty, freed={}, sensitivity=sensitivity)
+    examined: Any = SimpleNamespace(uncertainty=uncertainty, of_fixed={}, sensitivity=sensitivity)
     with pytest.raises(InputError, match="did you mean 'moment_constant'"):
         _uncertainty_with(examined, "moment_constand")
