@@ -147,11 +147,11 @@ def _fit(
         job, findings, folder, explanation, listener, command=command, resume=resume
     )
     job = selected.job
-    explanation.tell(fitted.findings)
+    explanation.report(fitted.findings)
     vehicle = vehicle_fitted(job, fitted)
     if job is not found.job or fitted is not found.fitted:
         validation = _validated(job, fitted, vehicle, listener)
-    explanation.notice(
+    explanation.add(
         (
             *flights_worse(validation.initial, validation.best),
             *flights_not_followed(job, validation.best),
@@ -186,10 +186,10 @@ def _fit(
     _write_simulations(folder, validation, fitted)
     find = partial(_effective, physical, job, fitted, listener)
     stops = selected.refuted  # no other answer, and no flight to plan
-    effective = None if stops else explanation.part("effective coefficients", find, None)
+    effective = None if stops else explanation.attempt("effective coefficients", find, None)
     next_log: tuple[LogProposal, ...] = ()
     if examination is not None and not stops:
-        next_log = explanation.part(
+        next_log = explanation.attempt(
             "what to log", partial(propose_logs, job, fitted, examination.known, vehicle), next_log
         )
     result = written(effective, next_log)
@@ -197,16 +197,16 @@ def _fit(
         result = _with_refits((job, fitted), result, folder, options, listener)
     if examination is not None:
         of_fit = folder, job, examination, fitted
-        explanation.part("knowledge", partial(write_knowledge, *of_fit), None)
+        explanation.attempt("knowledge", partial(write_knowledge, *of_fit), None)
     if examination is not None and not stops:
         listener.on_message("Simulating which flight would be the most informative next.")
-        explanation.part("next flight", partial(write_next_flight, *of_fit), None)
-    explanation.part("exports", partial(_export, folder, settings, listener), None)
+        explanation.attempt("next flight", partial(write_next_flight, *of_fit), None)
+    explanation.attempt("exports", partial(_export, folder, settings, listener), None)
     if explanation.findings != result.findings[len(fitted.findings) :]:
         findings = (*fitted.findings, *explanation.findings)
         result = result.model_copy(update={"findings": findings})
         result.write(folder)
-    explanation.part("page", partial(render, folder), None)
+    explanation.attempt("page", partial(render, folder), None)
     return result
 
 
@@ -290,7 +290,7 @@ def _examination_findings(
     if examination is None:
         return {}
     uncertainty, known = examination.uncertainty, examination.known
-    explanation.notice(
+    explanation.add(
         (
             *flights_refute(uncertainty),
             *finer_than_steps(uncertainty),
@@ -299,10 +299,10 @@ def _examination_findings(
             *term_findings(fitted, uncertainty),
         )
     )
-    sources: dict[str, Sources] = explanation.part(
+    sources: dict[str, Sources] = explanation.attempt(
         "ground measurements", partial(sources_of, fitted, uncertainty, known), {}
     )
-    explanation.notice(ground_conflicts(sources, fitted.objective.space.fixed.get("mass")))
+    explanation.add(ground_conflicts(sources, fitted.objective.space.fixed.get("mass")))
     return sources
 
 
@@ -382,7 +382,7 @@ def _check(
 
     Findings that files contradict the flights go to ``on_doubt``: such a search takes long to fail.
     """
-    explanation.tell(findings)
+    explanation.report(findings)
     other = (one for one in findings if one.level == "warning" and one.code in WRONG_INPUT_CODES)
     for finding in merge_alike(other):
         listener.on_doubt(finding)

@@ -34,19 +34,19 @@ class Explanation:
         self._reported: list[Finding] = []
         self.findings: tuple[Finding, ...] = ()
 
-    def tell(self, findings: Sequence[Finding]) -> None:
+    def report(self, findings: Sequence[Finding]) -> None:
         """Report findings that were not reported yet."""
         for finding in findings:
             if finding not in self._reported:
                 self._reported.append(finding)
                 self._on_message(one_line(finding))
 
-    def notice(self, findings: Sequence[Finding]) -> None:
+    def add(self, findings: Sequence[Finding]) -> None:
         """Keep findings, and report them."""
-        self.tell(findings)
+        self.report(findings)
         self.findings = (*self.findings, *findings)
 
-    def part(self, name: str, compute: Callable[[], T], fallback: T) -> T:
+    def attempt(self, name: str, compute: Callable[[], T], fallback: T) -> T:
         """Return the result of a part, or a fallback and a finding where it fails.
 
         Parameters
@@ -71,5 +71,5 @@ class Explanation:
         except Exception as error:
             logger.error("%s failed", name, exc_info=error)
             names = (type(error).__name__, " ".join(str(error).split())[:200])
-            self.notice([Finding(Code.PART_FAILED, "warning", name, names=names)])
+            self.add([Finding(Code.PART_FAILED, "warning", name, names=names)])
             return fallback

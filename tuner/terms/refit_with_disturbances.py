@@ -60,13 +60,13 @@ def refit_and_examine(
     refit = partial(with_disturbances, on_progress=on_progress, on_message=on_message)
     found, asked = None, selected.job.settings.job.disturbances
     if not (selected.refuted or (asked == "auto" and outlying_flights(selected.fitted.scales))):
-        found = explanation.part("disturbances", partial(refit, selected), None)
+        found = explanation.attempt("disturbances", partial(refit, selected), None)
     if found is not None and (
         refuted := set(refuted_by_commands(*found[:2])).difference(selected.kept)
     ):
         on_message(GAINS_REFUTED.format(listed(sorted(refuted))))
         less = with_refuted(selected, refuted)
-        found = explanation.part("disturbances", partial(refit, less), None)
+        found = explanation.attempt("disturbances", partial(refit, less), None)
     on_message("Examining how well each coefficient is known.")
     if found is not None:
         return found
@@ -80,7 +80,7 @@ def refit_and_examine(
         selection_shifts=selected.selection_shifts,
     )
     unexamined: tuple[Fitted, Examination | None] = fitted, None
-    return selected, *explanation.part("examination", hold, unexamined)
+    return selected, *explanation.attempt("examination", hold, unexamined)
 
 
 def with_disturbances(

@@ -33,8 +33,8 @@ def fails(*_: object, **__: object) -> None:
 def test_a_part_that_fails_is_named_and_the_rest_goes_on() -> None:
     told: list[str] = []
     explanation = Explanation(told.append)
-    assert explanation.part("intervals", lambda: 1, None) == 1
-    assert explanation.part("intervals", fails, None) is None
+    assert explanation.attempt("intervals", lambda: 1, None) == 1
+    assert explanation.attempt("intervals", fails, None) is None
     (finding,) = explanation.findings
     assert (finding.code, finding.subject) == (Code.PART_FAILED, "intervals")
     assert told == [one_line(finding)]
@@ -46,15 +46,15 @@ def test_a_full_disk_is_no_part() -> None:
         raise OutputError("folder", "is full", "free some space")
 
     with pytest.raises(OutputError):
-        Explanation(lambda _: None).part("intervals", full, None)
+        Explanation(lambda _: None).attempt("intervals", full, None)
 
 
 def test_a_finding_is_reported_once() -> None:
     told: list[str] = []
     explanation = Explanation(told.append)
     finding = Finding(Code.SPINS_REVERSED, "warning", "motors")
-    explanation.tell([finding])
-    explanation.notice([finding])
+    explanation.report([finding])
+    explanation.add([finding])
     assert told == [one_line(finding)]
     assert explanation.findings == (finding,)
 
