@@ -41,11 +41,11 @@ class ExternalBody(Protocol):
     def begin(self, state: Array, rotor_speed: Array) -> None:
         """Set the state (13,) and the rotor speeds in the vehicle file's rad/s."""
 
-    def step(self, asked: Array) -> Array:
-        """Advance by a physics step with commanded rotor speeds in rad/s; return the state."""
+    def step(self, asked: Array) -> tuple[Array, Array]:
+        """Advance by a physics step with commanded rotor speeds; return state and rotor speeds.
 
-    def rotor_speed(self) -> Array:
-        """Return the rotor speeds in the vehicle file's rad/s."""
+        Rotor speeds are in the vehicle file's rad/s.
+        """
 
 
 def flier_of(make: Callable[[float], ExternalBody]) -> Callable[..., Flown]:
@@ -91,8 +91,7 @@ def flier_of(make: Callable[[float], ExternalBody]) -> Callable[..., Flown]:
         def turn(asked: Any, flies: Any) -> tuple[Array, Array]:
             wanted = np.asarray(asked)
             for number in np.flatnonzero(flies):
-                moving[:, number] = bodies[number].step(wanted[:, number])
-                turning[:, number] = bodies[number].rotor_speed()
+                moving[:, number], turning[:, number] = bodies[number].step(wanted[:, number])
             return moving, turning
 
         plant = _ExternalPlant(**vars(own), advance=turn)

@@ -103,18 +103,14 @@ class Gliding:
     """A body that keeps its velocity."""
 
     def __init__(self, step):
-        self.period, self.state, self.speeds = step, None, None
+        self.period, self.state = step, None
 
-    def begin(self, state, rotor_speed):
-        self.state, self.speeds = state.copy(), rotor_speed
+    def begin(self, state, _rotor_speed):
+        self.state = state.copy()
 
     def step(self, asked):
-        self.speeds = asked
         self.state[:3] += self.period * self.state[3:6]
-        return self.state
-
-    def rotor_speed(self):
-        return self.speeds
+        return self.state, asked
 
 
 def test_another_simulators_body_is_what_moves(updated, tmp_path):

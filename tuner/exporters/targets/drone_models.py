@@ -97,7 +97,7 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
             order = [0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]
             self.state = np.concatenate([state[order], rotor_speed / RAD_S_PER_RPM])
 
-        def step(self, asked: Array) -> Array:
+        def step(self, asked: Array) -> tuple[Array, Array]:
             def change(s: Array) -> Array:
                 found = dynamics(
                     s[:3],
@@ -123,10 +123,8 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
             state = state + period / 6 * (first + 2 * second + 2 * third + fourth)
             state[3:7] /= np.linalg.norm(state[3:7])
             self.state = state
-            return state[[0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]]
-
-        def rotor_speed(self) -> Array:
-            return self.state[13:] * RAD_S_PER_RPM
+            order = [0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]
+            return state[order], state[13:] * RAD_S_PER_RPM
 
     return flier_of(Flying)
 

@@ -156,15 +156,12 @@ def _flier(text: str, vehicle: VehicleFile) -> Callable[..., Any] | None:
             self.data.act[:count] = constant * rotor_speed
             mujoco.mj_forward(model, self.data)
 
-        def step(self, asked: Array) -> Array:
+        def step(self, asked: Array) -> tuple[Array, Array]:
             self.data.ctrl[:count] = constant * asked
             mujoco.mj_step(model, self.data)
             qpos, qvel = self.data.qpos, self.data.qvel
-            return np.concatenate([qpos[:3], qvel[:3], qpos[3:7], qvel[3:6]])
-
-        def rotor_speed(self) -> Array:
-            speeds: Array = self.data.act[:count] / constant
-            return speeds
+            state = np.concatenate([qpos[:3], qvel[:3], qpos[3:7], qvel[3:6]])
+            return state, self.data.act[:count] / constant
 
     return flier_of(Flying)
 

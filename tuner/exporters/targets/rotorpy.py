@@ -92,14 +92,11 @@ def _flier(params: dict[str, Any]) -> Callable[..., Any] | None:
             wind = np.zeros(3)
             self.state = {"x": x, "v": v, "q": q, "w": w, "wind": wind, "rotor_speeds": rotor_speed}
 
-        def step(self, asked: Array) -> Array:
+        def step(self, asked: Array) -> tuple[Array, Array]:
             control = {"cmd_motor_speeds": asked}
             self.state = self.vehicle.step(self.state, control, self.period)
             x, v, q, w = (self.state[key] for key in "xvqw")
-            return np.concatenate([x, v, q[[3, 0, 1, 2]], w])
-
-        def rotor_speed(self) -> Array:
-            return self.state["rotor_speeds"]
+            return np.concatenate([x, v, q[[3, 0, 1, 2]], w]), self.state["rotor_speeds"]
 
     return flier_of(Flying)
 
