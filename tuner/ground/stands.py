@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from sim_jax.constants import GRAVITY
@@ -31,15 +29,6 @@ THRUST_RANGE = (0.05, 20.0)
 """Largest thrust of all rotors over the weight; other values have a wrong unit or lever."""
 TORQUE_RANGE = (0.005, 20.0)
 """Largest drag torque of all rotors over the weight times an arm, likewise."""
-
-
-@dataclass(frozen=True)
-class _Level:
-    speed: float
-    speed_error: float
-    force: float
-    force_error: float
-    time: float
 
 
 THRUST = {"motor_constant": 1.0}
@@ -77,19 +66,26 @@ def measure_stand(
         else ("Torque stand", TORQUE, given.lever_arm, given.lever_arm_error)
     )
     time, speed, force = samples["time"], samples["rotor_speed"], samples["force"]
-    levels, used, dropped = _levels(time, speed, force)
-    if len(levels) < MIN_LEVELS:
-        what = f"holds {len(levels)} steady levels of rotor speed of {MIN_LEVEL_S:g} s and more"
+    step = SPEED_STEP * float(np.nanquantile(speed, 0.98))
+    parts, used, dropped = usable_plateaus(
+        speed, time, speed, np.isfinite(force), shortest=MIN_LEVEL_S, step=step
+    )
+    if len(parts) < MIN_LEVELS:
+        what = f"holds {len(parts)} steady levels of rotor speed of {MIN_LEVEL_S:g} s and more"
         raise RecordingError(path, what, f"record {MIN_LEVELS} or more, each for some seconds")
-    fastest, slowest = max(v.speed for v in levels), min(v.speed for v in levels)
+    levels, level_error, measured, force_error = np.array(
+        [(*mean_and_error(speed[at]), *mean_and_error(force[at])) for _, at in parts]
+    ).T
+    middle = np.array([0.5 * (plateau.begin + plateau.end) for plateau, _ in parts])
+    fastest, slowest = levels.max(), levels.min()
     if fastest < MIN_SPEED_RATIO * slowest:
         what = f"has levels from {slowest:.0f} to {fastest:.0f} rad/s, too alike for a slope"
         raise RecordingError(path, what, "step from slow to fast")
-    design = np.array([[v.speed**2, 1.0, v.time - levels[0].time] for v in levels])
+    design = np.column_stack([levels**2, np.ones(len(levels)), middle - middle[0]])
     if len(levels) < MIN_LEVELS + 2:
         design = design[:, :2]
-    measured = np.array([v.force for v in levels])
-    solution, covariance = _weighted(design, measured, levels)
+    errors = levels, level_error, force_error
+    solution, covariance = _weighted(design, measured, *errors)
     slope = float(solution[0])
     if slope <= 0:
         raise RecordingError(
@@ -101,7 +97,7 @@ def measure_stand(
         Remark("offset", {"force": float(solution[1])}),
     ]
     relative = design[:, 0] / design[:, 0].max()
-    curved = _weighted(np.column_stack([design, relative**2]), measured, levels)
+    curved = _weighted(np.column_stack([design, relative**2]), measured, *errors)
     bend, bend_error = float(curved[0][-1]), math.sqrt(curved[1][-1, -1])  # of Ω⁴ beside Ω²
     if abs(bend) > 3 * bend_error and len(levels) >= MIN_LEVELS + 2:
         remarks.append(Remark("not_quadratic", {"deviation": bend / bend_error}))
@@ -111,7 +107,7 @@ def measure_stand(
         Curve.of(
             ("Rotor speed", "time, s", "rotor speed, rad/s"),
             (time, speed),
-            (np.array([v.time for v in levels]), np.array([v.speed for v in levels])),
+            (middle, levels),
             used=used,
             law=False,
         ),
@@ -141,31 +137,15 @@ def measure_stand(
     )
 
 
-def _levels(time: Array, speed: Array, force: Array) -> tuple[list[_Level], NDArray[np.bool_], int]:
-    step = SPEED_STEP * float(np.nanquantile(speed, 0.98))
-    parts, used, dropped = usable_plateaus(
-        speed, time, speed, np.isfinite(force), shortest=MIN_LEVEL_S, step=step
-    )
-    levels = [
-        _Level(
-            *mean_and_error(speed[inside]),
-            *mean_and_error(force[inside]),
-            0.5 * (plateau.begin + plateau.end),
-        )
-        for plateau, inside in parts
-    ]
-    return levels, used, dropped
-
-
-def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Array, Array]:
+def _weighted(
+    design: Array, measured: Array, speed: Array, speed_error: Array, force_error: Array
+) -> tuple[Array, Array]:
     """Return the weighted least squares solution and covariance, with Student's t for few levels.
 
     A speed's error becomes a force's by the slope; the residuals' scatter scales both.
     """
     slope = float(np.linalg.lstsq(design, measured, rcond=None)[0][0])
-    variance = np.array(
-        [v.force_error**2 + (2 * slope * v.speed * v.speed_error) ** 2 for v in levels]
-    )
+    variance = force_error**2 + (2 * slope * speed * speed_error) ** 2
     variance = np.maximum(variance, 0.25 * np.median(variance))
     weight = 1.0 / np.maximum(variance, 1e-30)
     normal = design.T @ (design * weight[:, None])
@@ -173,7 +153,7 @@ def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Arr
     solution = inverse @ (design.T @ (weight * measured))
     residual = measured - design @ solution
     chi_square = float(residual @ (weight * residual))
-    return solution, widen(inverse, chi_square, len(levels) - design.shape[1])
+    return solution, widen(inverse, chi_square, len(measured) - design.shape[1])
 
 
 MIN_COMMAND_S = 0.8
