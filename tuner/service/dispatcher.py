@@ -16,7 +16,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
@@ -43,14 +42,8 @@ from tuner.service.settings import Limits, ServiceSettings
 from tuner.service.tables import State
 from tuner.service.worker import RESULT_FOLDER
 
-
-@dataclass(frozen=True)
-class RemoteTask:
-    """The task of a machine of the cluster: the claim on a job, and the store's URL."""
-
-    claim: Claim
-    store: str
-    limits: Limits
+RemoteTask = tuple[Claim, str, Limits]
+"""The task of a machine of the cluster: the claim on a job, the store's URL, and its limits."""
 
 
 def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
@@ -61,7 +54,8 @@ def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
     DiedError
         Its process died.
     """
-    store, claim = ContentStore(task.store), task.claim
+    claim, url, limits = task
+    store = ContentStore(url)
     kept = dict(claim.checkpoint)
     with tempfile.TemporaryDirectory(prefix="tune-job-") as name:
         folder = Path(name)
@@ -75,7 +69,7 @@ def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
             report({"events": list(events), "progress": dict(progress), "checkpoint": dict(kept)})
             return True
 
-        return attempt(folder, claim, store, limits=task.limits, report=relay)
+        return attempt(folder, claim, store, limits=limits, report=relay)
 
 
 def run_remotely(
@@ -239,7 +233,7 @@ class Dispatcher:
         report = Reporter(self._jobs, claim, lease)
         is_unwanted = self._stopping.is_set
         if self._engine is not None:
-            task = RemoteTask(claim, self._settings.store_url, limits)
+            task = claim, self._settings.store_url, limits
             return run_remotely(task, self._engine, report, is_unwanted)
         return attempt(
             folder,

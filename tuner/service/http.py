@@ -328,9 +328,13 @@ def _after(service: Service, row: JobRow) -> FullJobAnswer:
         **NOT_FOUND,
     },
 )
-def get_file(service: ServiceOfApp, job: str, name: str) -> StreamingResponse:
+def get_file(service: ServiceOfApp, row: JobOfPath, name: str) -> StreamingResponse:
     """Return a file of a job's result."""
-    return file_response(service.store, jobs.file(service.database, job, name))
+    file = next((file for file in row.files if file.name == name), None)
+    if file is None:
+        remedy = "wait until the job is done, and see its list of files"
+        raise NotKnownError(f"job {row.id}", "has no such file", remedy)
+    return file_response(service.store, file)
 
 
 @api.get(

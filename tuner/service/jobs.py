@@ -24,7 +24,6 @@ from tuner.service.shapes import CoefficientHistory, History, Point, iso
 from tuner.service.tables import (
     UNFINISHED,
     EventRow,
-    FileRow,
     FlightRow,
     JobRow,
     PointRow,
@@ -219,23 +218,6 @@ def events(
         if kind is not None:
             statement = statement.where(EventRow.kind == kind)
         return list(session.scalars(statement))
-
-
-def file(database: Database, name: str, path: str) -> FileRow:
-    """Return a file of a job's result.
-
-    Raises
-    ------
-    NotKnownError
-        There is no such job, or no such file of it.
-    """
-    with database.reading() as session:
-        row = _row(session, name)
-        found = next((file for file in row.files if file.name == path), None)
-        if found is None:
-            remedy = "wait until the job is done, and see its list of files"
-            raise NotKnownError(f"job {row.id}", "has no such file", remedy)
-        return found
 
 
 def cancel(database: Database, name: str) -> JobRow:
