@@ -185,7 +185,7 @@ def sensitivity(
         Propose next flights that fit into X,Y,Z in m: from wall to wall, and up. Default: what the
         recorded flights took, and a little more.
     """
-    from tuner.cli.options import lengths
+    from tuner.cli.options import arena_lengths
     from tuner.cli.progress import progress_on_terminal
     from tuner.cli.results import print_sensitivity
     from tuner.core.runtime import configure
@@ -200,7 +200,7 @@ def sensitivity(
     ):
         result = examine_vehicle(
             asked,
-            None if arena is None else lengths("--arena", arena),
+            None if arena is None else arena_lengths(arena),
             command=TYPED_WORDS.get(),
             on_message=listener.on_message,
         )

@@ -30,8 +30,8 @@ Quiet = Annotated[bool, Parameter(help="Print nothing but errors.")]
 Verbose = Annotated[bool, Parameter(help="Print all that the report says, and each message.")]
 
 
-def lengths(option: str, word: str) -> tuple[float, ...]:
-    """Return the numbers of a word such as ``8,6,3``.
+def arena_lengths(word: str) -> tuple[float, ...]:
+    """Return the numbers of ``--arena``, such as ``8,6,3``.
 
     Raises
     ------
@@ -43,5 +43,5 @@ def lengths(option: str, word: str) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if not numbers or not all(math.isfinite(n) and n > 0 for n in numbers):
-        raise InputError(option, f"'{word}' is not a list of lengths in m", "write it as 8,6,3")
+        raise InputError("--arena", f"'{word}' is not a list of lengths in m", "write it as 8,6,3")
     return numbers

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from tuner.config import Settings
-    from tuner.findings.findings import Finding
     from tuner.job.listener import Listener
     from tuner.search.iteration import Iteration, PointEstimate
 
@@ -65,31 +64,26 @@ def progress_on_terminal(*, quiet: bool, verbose: bool = False) -> Iterator[List
     screen = console()
     search = _LiveLine(screen) if screen.is_terminal else _StageLines(screen)
 
-    def say(text: str) -> None:
-        search.line(text)
-
     def show_estimates(estimates: Sequence[PointEstimate]) -> None:
         search.table(estimates_table(estimates))
-        say(SEARCH_ENDED)
+        search.line(SEARCH_ENDED)
 
     def show_settings(settings: Settings) -> None:
         for name, origin in settings.origin.items():
-            say(f"{name}: {origin}")
+            search.line(f"{name}: {origin}")
 
-    def on_iteration(iteration: Iteration, _left: float) -> None:
-        search.show(iteration)
-
-    def show_doubt(finding: Finding) -> None:
-        say(f"! {shorten_finding(finding, WIDTH - 2)}")
-
-    shown = Listener(on_iteration=on_iteration, on_doubt=show_doubt, on_stop=say)
+    shown = Listener(
+        on_iteration=lambda iteration, _: search.show(iteration),
+        on_doubt=lambda finding: search.line(f"! {shorten_finding(finding, WIDTH - 2)}"),
+        on_stop=search.line,
+    )
     if verbose:
         shown = replace(
             shown,
             on_settings=show_settings,
             on_doubt=lambda _: None,  # which all messages hold
             on_estimates=show_estimates,
-            on_message=say,
+            on_message=search.line,
             on_folds=lambda folds: search.table(folds_table(folds)),
         )
     try:

@@ -198,12 +198,12 @@ def _legend(axes: Sequence[Any]) -> tuple[list[str], list[Any]]:
 
 
 def _draw(panel: Panel, place: Axes) -> None:
-    base: dict[str, Any] = {}
+    left: Any = 0.0
     for mark in panel.marks:
         if isinstance(mark, Line):
             _line(mark, place)
         elif isinstance(mark, Bars):
-            _bars(mark, place, base)
+            left = _bars(mark, place, left)
         else:
             _heat(mark, place)
     place.set_ylabel(panel.y_title)
@@ -249,13 +249,13 @@ def _line(line: Line, place: Axes) -> None:
     )
 
 
-def _bars(bars: Bars, place: Axes, base: dict[str, Any]) -> None:
+def _bars(bars: Bars, place: Axes, left: Any) -> Any:
+    """Draw bars that begin at some numbers, and return where they end."""
     values = np.array([0.0 if value is None else value for value in bars.values])
-    left = base.get("left", np.zeros(len(values)))
     place.barh(list(bars.labels), values, left=left, color=bars.colour, label=bars.name)
-    base["left"] = left + values
     if not place.yaxis_inverted():
         place.invert_yaxis()
+    return left + values
 
 
 def _heat(heat: Heat, place: Axes) -> None:
