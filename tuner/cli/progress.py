@@ -48,7 +48,7 @@ STAGE_PHRASES = {
     "exports": "Exporting",
     "page": "Drawing the page",
 }
-"""Stage of a run, as `tuner.core.spans` has it -> what is done in it."""
+"""Stage of a run, as `tuner.core.spans` has it -> its description."""
 
 
 @contextmanager

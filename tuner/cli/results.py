@@ -33,7 +33,7 @@ DEFAULT_ORIGIN = "default"
 def print_run(
     folder: Path, result: RunResult, *, seconds: float | None = None, verbose: bool = False
 ) -> None:
-    """Print what a run came to, in no more than `LINES` lines; all of it where that is asked.
+    """Print the outcome of a run, in no more than `LINES` lines unless verbose.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def print_run(
     seconds
         That it took in all, where that is known.
     verbose
-        Also print what the page's sections say.
+        Also print the page's sections.
     """
     from tuner.report.contents import read_contents
 
@@ -140,7 +140,7 @@ def _coefficients(result: RunResult, room: int) -> list[Text | Table]:
 
 
 def _unlisted(result: RunResult) -> list[str]:
-    """Return a line on what was fixed and one on the terms."""
+    """Return a line on fixed coefficients and one on the terms."""
     from tuner.report.result_texts import nearly_kept
 
     fixed = [
@@ -168,7 +168,7 @@ def _print_files(folder: Path, exports: Sequence[ExportRecord], seconds: float |
 
 
 def print_sections(folder: Path) -> None:
-    """Print what a result folder's page says, its figures left out."""
+    """Print the page of a result folder, without its figures."""
     from tuner.report.contents import read_contents
     from tuner.report.page import sections_of
 
@@ -191,7 +191,7 @@ def _print_section(screen: Console, section: Section) -> None:
 
 
 def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
-    """Print what each experiment and all together say, and where everything lies."""
+    """Print the results of each experiment and of all together, and the folder."""
     from tuner.ground.bench_json import agreement_in_words, bench_record, numbers_in_words
 
     screen = console()
@@ -203,7 +203,7 @@ def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
 
 
 def print_sensitivity(result: SensitivityResult, *, verbose: bool = False) -> None:
-    """Print what is known of each coefficient, what to fly next, and where everything lies."""
+    """Print each coefficient's interval, the next flight, and the folder."""
     from tuner.findings.findings import one_line
     from tuner.report.contents import read_contents
     from tuner.report.page import sections_of
@@ -223,7 +223,7 @@ def print_sensitivity(result: SensitivityResult, *, verbose: bool = False) -> No
 
 
 def estimates_table(estimates: Sequence[PointEstimate]) -> object:
-    """Return where a search ended, of which nothing is known yet but the values."""
+    """Return the table of values at the end of a search, before their intervals are known."""
     rows = [(row.name, f"{row.initial:.5g}", f"{row.estimate:.5g}", row.unit) for row in estimates]
     columns = ("coefficient", "initial", "estimate", "unit")
     return rich_table(Table(columns, rows, words=("coefficient", "unit")))

@@ -92,7 +92,7 @@ def print_flights(summaries: Sequence[Summary], path: Path) -> None:
 
 
 def print_export(done: Exported) -> None:
-    """Print which conditions were met, what was done, and where the file is."""
+    """Print the gates of an export, its notes, and its file."""
     screen = console()
     for gate in done.gates:
         met = "yes" if gate.passed else "NO "

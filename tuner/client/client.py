@@ -35,7 +35,7 @@ MAX_SILENCE_S = 60.0
 
 
 class Client:
-    """A tuning service; what its server refuses becomes an `InputError`.
+    """A tuning service; a refusal of its server becomes an `InputError`.
 
     Parameters
     ----------
@@ -195,9 +195,9 @@ class Client:
                             self._check(answer)
                         raise self._errors("the server is ending")
                     if not answer.headers.get("content-type", "").startswith(EVENT_STREAM):
-                        raise self._stranger()
+                        raise self._not_a_service()
                     for number, kind, data in _events(answer.iter_lines()):
-                        content = self._said_in(data)
+                        content = self._content_of_answer(data)
                         last, since = number or last, time.monotonic()
                         yield kind, content
                         if kind == "job" and content["ended"] is not None:
@@ -279,27 +279,29 @@ class Client:
         if may_lack and answer.status_code == 404:
             return {}
         self._check(answer)
-        return self._said_in(answer.content)
+        return self._content_of_answer(answer.content)
 
-    def _said_in(self, text: str | bytes) -> dict[str, Any]:
+    def _content_of_answer(self, text: str | bytes) -> dict[str, Any]:
         """Return the JSON content of a server's answer."""
         try:
-            found = json.loads(text, object_hook=lambda said: _AnswerFields(said, self._stranger()))
+            found = json.loads(
+                text, object_hook=lambda said: _AnswerFields(said, self._not_a_service())
+            )
         except ValueError:
             found = None
         if not isinstance(found, dict):
-            raise self._stranger()
+            raise self._not_a_service()
         return found
 
     def _check(self, answer: Any) -> None:
-        """Raise what a server refuses as if it were refused here."""
+        """Raise a refusal of the server as if it were refused here."""
         if not answer.is_error:
             return
         try:
             problem = answer.json()
             where, what, remedy = (str(problem[key]) for key in ("where", "what", "remedy"))
         except (ValueError, KeyError, TypeError):
-            raise self._stranger() from None
+            raise self._not_a_service() from None
         if answer.status_code == 401:
             raise self._no_token()
         if answer.status_code == 500:
@@ -317,7 +319,7 @@ class Client:
         remedy = "ask who runs it, and set TUNE_TOKEN"
         return InputError("--token", f"is none of {self.url}", remedy)
 
-    def _stranger(self) -> InputError:
+    def _not_a_service(self) -> InputError:
         return InputError("--server", f"{self.url} is no tuning service", "check the address")
 
 

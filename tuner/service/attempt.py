@@ -72,7 +72,7 @@ def attempt(
     cores: Sequence[int] = (),
     is_unwanted: Callable[[], bool] = lambda: False,
 ) -> Outcome:
-    """Run the worker's process to its end, and return what it came to, its files in the store.
+    """Run the worker's process to its end, store its files, and return the outcome.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def _follow(
     is_unwanted: Callable[[], bool],
     deadline: float,
 ) -> dict[str, Any] | None:
-    """Report what a worker says until it ends, and return how it says that it did."""
+    """Report a worker's events until it ends, and return its last message."""
     while True:
         events: list[tuple[str, dict[str, Any]]] = []
         last, ended = None, False

@@ -75,7 +75,7 @@ def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
 def run_remotely(
     task: RemoteTask, engine: Engine, report: Report, is_unwanted: Callable[[], bool]
 ) -> Outcome:
-    """Have a job worked on by a machine of a cluster, and return what came of it.
+    """Fit a job on a machine of a cluster, and return its outcome.
 
     Raises
     ------
@@ -117,7 +117,7 @@ logger = logging.getLogger(__name__)
 
 
 class Dispatcher:
-    """Claims jobs, has each fitted by a process of its own, and commits what comes of it.
+    """Claims jobs, fits each in a process of its own, and commits the outcome.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ class Dispatcher:
         self.deaths = 0
 
     def start(self) -> None:
-        """Begin to work off the table, what an earlier life of this server left there first."""
+        """Begin to work off the table; jobs that this server held before a restart come first."""
         self._jobs.recover(own=True)
         self._loop.start()
 
@@ -192,7 +192,7 @@ class Dispatcher:
             self._called.clear()
 
     def _keep(self) -> None:
-        """Renew the leases of what is worked on: a result may take long to be stored."""
+        """Renew the leases of jobs under way: a result may take long to be stored."""
         for claim in tuple(self._held.values()):
             self._jobs.report(claim, (), {})
 
@@ -283,10 +283,10 @@ class Dispatcher:
 
 
 class Reporter:
-    """Passes on what a worker says, and renews the lease now and then when it says nothing.
+    """Enters the messages of a worker, and renews the lease now and then without any.
 
-    What cannot be entered because the database does not answer is kept for the next time. What
-    earlier attempts said before their search began is not said again before this one's.
+    Events are kept for the next time while the database does not answer. Messages of earlier
+    attempts before their search began are not repeated before this one's.
     """
 
     def __init__(self, jobs: Queue, claim: Claim, lease: float) -> None:

@@ -1,4 +1,4 @@
-"""A recording inspected in a process of its own, with limits on memory, time and what it writes.
+"""A recording inspected in a process of its own, with limits on memory, time and written bytes.
 
 ``python -m tuner.service.inspection FILE MEMORY BYTES SECONDS`` prints what `tune inspect --json`
 prints.

@@ -1,4 +1,4 @@
-"""Operations on jobs: submit, list, read, cancel, retry; what those of a vehicle found."""
+"""Operations on jobs: submit, list, read, cancel, retry; the history of a vehicle."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class Claim:
     flights
         Name of each recording in the job -> its digest.
     checkpoint
-        Name -> digest of what a search elsewhere has put into the store.
+        Name -> digest of a file in the store from which the search goes on.
     preamble
         What earlier attempts said before their search began, which this one may say again.
     """
@@ -119,7 +119,7 @@ class Queue:
         events: Sequence[tuple[str, Mapping[str, Any]]],
         progress: Mapping[str, Any],
     ) -> bool:
-        """Note what an attempt does, and renew its lease; False if it holds the job no more."""
+        """Enter an attempt's events, and renew its lease; False if it holds the job no more."""
         with self._database.writing() as session:
             lease = time.time() + self._lease
             if not _update(session, claim, {**progress, "lease": lease}):

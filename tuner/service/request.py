@@ -205,7 +205,7 @@ def _shipped(kind: Kind) -> list[str]:
 def _parameter_file(
     key: str, given: Any, model: type[M], earlier: Mapping[str, object] | None = None
 ) -> str | M | None:
-    """Return a shipped file's name, or what is given as the content of such a file."""
+    """Return a shipped file's name, or the given content of such a file."""
     if given is None:
         return None
     if isinstance(given, Mapping):

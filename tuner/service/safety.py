@@ -162,7 +162,7 @@ def _host_name(headers: Headers) -> str:
 
 
 def _check_origin(headers: Headers) -> None:
-    """Refuse what a page of another site sends."""
+    """Refuse a request from a page of another site."""
     origin = headers.get("origin")
     elsewhere = origin is not None and origin.partition("://")[2] != headers.get("host")
     if elsewhere or headers.get("sec-fetch-site") in ("cross-site", "same-site"):

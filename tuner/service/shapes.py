@@ -164,7 +164,7 @@ class Health(BaseModel):
 
 
 def links(row: JobRow, files: Sequence[str] = ()) -> Links:
-    """Return where more of a job is found."""
+    """Return the addresses of a job."""
     at = f"{API}/jobs/{row.id}"
     return Links(
         self=at,
@@ -182,7 +182,7 @@ def accepted(row: JobRow) -> Accepted:
 
 
 def full_job(row: JobRow, events: Sequence[EventRow]) -> FullJobAnswer:
-    """Return a job with what it said."""
+    """Return a job with its messages."""
     answer = JobAnswer.model_validate(row)
     return FullJobAnswer(
         **dict(answer),

@@ -71,13 +71,13 @@ class JobRow(Base):
     stage, iteration, rmse, seconds_left
         Of the search; m, s.
     error, exit_status
-        Why it failed, and what the local command would have returned; 0 where it is done.
+        Why it failed, and the exit status of the local command; 0 where it is done.
     usability
         Of its result, a word of `tuner.report.outcome.Usability`; None before it is done.
     deaths
         Attempts whose process died.
     checkpoint
-        Name -> digest of what a worker elsewhere has put into the store to go on from.
+        Name -> digest of a file in the store from which a worker elsewhere goes on.
     claim, owner, lease
         Who works on it: the attempt, its server, and until when that holds.
     submission

@@ -103,7 +103,7 @@ class _Receiver:
         self._is_ours = False
 
     def flush(self) -> None:
-        """Hash and write what was gathered."""
+        """Hash and write the buffer."""
         with full_disk():
             if self._file is None:
                 self._file = self.path.open("xb")
@@ -112,7 +112,7 @@ class _Receiver:
         self.buffer.clear()
 
     def close(self) -> None:
-        """Close the file; what it holds is on the disk then."""
+        """Close the file, which is on the disk then."""
         if self._file is not None:
             with full_disk():
                 self._file.close()

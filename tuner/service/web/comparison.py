@@ -146,14 +146,14 @@ MAX_POINTS = 600
 
 @dataclass(frozen=True)
 class Canvas:
-    """Where numbers stand in a chart, and what its axes say.
+    """The axes of a chart.
 
     Attributes
     ----------
     across, up
-        The numbers at both ends of the axes.
+        Values at both ends of the axes.
     x_ticks, y_ticks
-        Numbers that are marked, and what is said of them.
+        Value -> label of each tick.
     points
         Of a curve.
     """
@@ -165,12 +165,12 @@ class Canvas:
     points: Sequence[tuple[float, float]] = ()
 
     def x(self, value: float) -> float:
-        """Return where a number stands along the chart."""
+        """Return the horizontal position of a value."""
         (first, last), width = self.across, WIDTH - LEFT - RIGHT
         return round(LEFT + width * (value - first) / (last - first), 1)
 
     def y(self, value: float) -> float:
-        """Return where a number stands below the top of the chart."""
+        """Return the vertical position of a value, from the top."""
         (low, high), height = self.up, HEIGHT - TOP - BOTTOM
         return round(HEIGHT - BOTTOM - height * (value - low) / (high - low), 1)
 

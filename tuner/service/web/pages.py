@@ -1,4 +1,4 @@
-"""The pages and what their forms do; each form answers with a page, so that none needs a script."""
+"""The pages and their forms; each form answers with a page, so that none needs a script."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def _start(
     problem: str = "",
     status: int = 200,
 ) -> Response:
-    """Return the start page, with what was filled in before."""
+    """Return the start page, with the values of its form."""
     ids = {row.sha256 for row, _ in chosen}
     given = given or {}
     blank = dict.fromkeys(("name", "vehicle", "mass", "settings", "holdout"), "")
@@ -203,7 +203,7 @@ def show_card(service: ServiceOfApp, recording: str) -> Response:
 
 @web.post("/jobs")
 async def start_job(request: Request) -> Response:
-    """Submit what the form of the start page says, and show the job."""
+    """Submit the job of the start page's form, and show it."""
     async with request.form(max_files=0, max_fields=1000, max_part_size=2**20) as form:
         service = service_of(request)
         return await anyio.to_thread.run_sync(_submit, service, form)
