@@ -451,8 +451,8 @@ class Lowering:
             self._write_number(storage, index, value)
             if storage.moves is not None:
                 differs = self.b.fcmp_unordered("!=", value, self.e.number(value, 0.0))
-                told = self.b.zext(self.e.any_lane(differs), ir.IntType(8))
-                self.b.store(told, self.b.gep(storage.moves, [self._column]))
+                moves = self.b.zext(self.e.any_lane(differs), ir.IntType(8))
+                self.b.store(moves, self.b.gep(storage.moves, [self._column]))
 
         return write
 
@@ -467,8 +467,8 @@ class Lowering:
         def of(element: Element, *, flags_columns: bool) -> Element:
             if not isinstance(element, Tangent):
                 return element
-            told = element.is_read and element.operands[0].moves is not None
-            if element.is_read and not element.operands[0].writable and told >= flags_columns:
+            has_flags = element.is_read and element.operands[0].moves is not None
+            if element.is_read and not element.operands[0].writable and has_flags >= flags_columns:
                 return element
             if element.number not in known:
                 known[element.number] = self.slot(element.kind, flags_columns=flags_columns)

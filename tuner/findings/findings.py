@@ -572,8 +572,8 @@ def merge_alike(findings: Iterable[Finding]) -> list[Finding]:
     """Return findings, with those that differ only in subject and numbers merged into the first."""
     alike: dict[tuple[object, ...], list[Finding]] = {}
     for finding in findings:
-        said = NUMBER.sub("", CLAUSE_END.split(sentence(finding))[0])
-        alike.setdefault((finding.code, finding.level, said), []).append(finding)
+        text = NUMBER.sub("", CLAUSE_END.split(sentence(finding))[0])
+        alike.setdefault((finding.code, finding.level, text), []).append(finding)
     return [
         replace(same[0], subject=", ".join(dict.fromkeys(one.subject for one in same)))
         for same in alike.values()

@@ -259,10 +259,10 @@ def controller_gains_differ(finding: Finding) -> str:
     else:
         parts = [f"{axis} reacts as if its {part} were {_excess(numbers, axis)}" for axis in axes]
         than = "than in the controller file"
-    said = f"{listed(parts)} {than}, by the recorded commands"
+    difference = f"{listed(parts)} {than}, by the recorded commands"
     if finding.subject != CONTROLLER_FILE:
-        return as_sentence(f"{said}, and the other flights do not")
-    return as_sentence(f"{said}; intervals hold what that moves")
+        return as_sentence(f"{difference}, and the other flights do not")
+    return as_sentence(f"{difference}; intervals hold what that moves")
 
 
 def controller_remedy(finding: Finding) -> str:

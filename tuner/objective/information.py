@@ -30,7 +30,7 @@ MIN_REMAINING_SHARE = 0.25
 """Least share left of the coefficient that a new one acts as, at the new one's start value."""
 BLOCK_S = 2.0
 """Length of a block of time, the unit of stretches: beyond most correlation of residuals."""
-ASTRAY_RATIO = 2.0
+DIVERGED_RATIO = 2.0
 """Mean square of residuals over the variance of the recorded signal from which a flight refutes the
 fit. Disturbances are in the recording, too, so that the right model leaves at most 1; two unrelated
 flights leave 2."""
@@ -92,8 +92,8 @@ class FisherInformation:
         Source of error -> change of the residuals.
     selection_shifts
         (K,) shifts of the estimates by omitted terms; None if none was tried.
-    astray
-        (F,) which segments of a closed loop crashed, or exceed `ASTRAY_RATIO`; None in open loop.
+    diverged
+        (F,) which segments of a closed loop crashed, or exceed `DIVERGED_RATIO`; None in open loop.
     pull, nuisance_pull
         (K,) slopes of the priors' losses at the point, of the coefficients' own and of the
         nuisances'; None where the whole slope is zero.
@@ -113,7 +113,7 @@ class FisherInformation:
     lost: Array | None = None
     changes: Mapping[str, Change] = field(default_factory=dict)
     selection_shifts: Array | None = None
-    astray: NDArray[np.bool_] | None = None
+    diverged: NDArray[np.bool_] | None = None
     pull: Array | None = None
     nuisance_pull: Array | None = None
 
@@ -165,9 +165,9 @@ class FisherInformation:
                 )
                 for name in first.changes
             },
-            astray=None
-            if first.astray is None
-            else np.concatenate([part.astray for part in parts if part.astray is not None]),
+            diverged=None
+            if first.diverged is None
+            else np.concatenate([part.diverged for part in parts if part.diverged is not None]),
             pull=first.pull,
             nuisance_pull=_summed([part.nuisance_pull for part in parts]),
         )
@@ -239,9 +239,9 @@ class FisherInformation:
         It crashes where the recorded vehicle flew, or most simulated flights have little to do with
         the recorded ones. Derivatives along them are not those along the recorded ones.
         """
-        if self.astray is None:
+        if self.diverged is None:
             return False
-        return bool(np.any(self.astray & self.crashed) or np.mean(self.astray) > 0.5)
+        return bool(np.any(self.diverged & self.crashed) or np.mean(self.diverged) > 0.5)
 
     @property
     def slope(self) -> Array:
@@ -418,16 +418,16 @@ def information_at(
         ground=None
         if space.joint_prior is None
         else criterion.prior**2 * space.joint_rows.T @ space.joint_rows,
-        astray=_astray(objective, jacobian, crashed),
+        diverged=_diverged(objective, jacobian, crashed),
         pull=criterion.prior**2 * (space.prior_rows.T @ space.prior_residuals(point.coefficients)),
         nuisance_pull=pull,
     )
 
 
-def _astray(
+def _diverged(
     objective: Objective, jacobian: Jacobian, crashed: NDArray[np.bool_]
 ) -> NDArray[np.bool_] | None:
-    """Return which segments (F,) of a closed loop crashed or exceed `ASTRAY_RATIO` in a channel.
+    """Return which segments (F,) of a closed loop crashed or exceed `DIVERGED_RATIO` in a channel.
 
     An attitude has no mean.
     """
@@ -446,7 +446,7 @@ def _astray(
         of_recorded = np.square(np.where(used, values - mean, 0.0) * weight).sum() / own.sum()
         of_residuals = np.square(np.asarray(jacobian.residuals[channel])).sum(axis=(0, 1)) / own
         furthest = np.maximum(furthest, of_residuals / max(of_recorded, 1.0))
-    return np.asarray(crashed | (furthest > ASTRAY_RATIO))
+    return np.asarray(crashed | (furthest > DIVERGED_RATIO))
 
 
 def _nuisance_directions(

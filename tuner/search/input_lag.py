@@ -76,13 +76,13 @@ def with_input_lags(recordings: Sequence[Recording], vehicle: VehicleFile) -> tu
         ]
         if not lags:
             continue
-        told = {
+        accepted = {
             flight.name: lag.seconds if not is_measured or _is_late(flight, vehicle, lag) else 0.0
             for flight, lag in lags
         }
-        mean = float(np.mean(list(told.values())))
+        mean = float(np.mean(list(accepted.values())))
         own = 0.0 if is_measured else mean
-        late |= {r.flight.name: told.get(r.flight.name, mean) - own for r in same}
+        late |= {r.flight.name: accepted.get(r.flight.name, mean) - own for r in same}
     return tuple(
         replace(r, input_late=late.get(r.flight.name, r.input_late)) if r.time_offset is None else r
         for r in recordings

@@ -199,8 +199,8 @@ def refuted_by_commands(selected: Selected, fitted: Fitted) -> tuple[str, ...]:
     numbers = fitted.objective.space.numbers(fitted.point.coefficients)
 
     def matches_file(name: str) -> bool:
-        told = gain_by_commands(name, model_errors.controller)
-        return told is not None and abs(numbers[name] * told[0] - 1.0) < GAIN_TOLERANCE
+        gain = gain_by_commands(name, model_errors.controller)
+        return gain is not None and abs(numbers[name] * gain[0] - 1.0) < GAIN_TOLERANCE
 
     return tuple(group for group, names in kept.items() if any(map(matches_file, names)))
 

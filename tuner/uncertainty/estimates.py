@@ -463,10 +463,10 @@ def left_out(information: FisherInformation) -> Array | None:
         rest = Inverse.of(others + information.given, information.given)
         without = rest.matrix
         expected = np.maximum(np.diag(without) - known, 0.0)
-        tells = (expected > MIN_VARIANCE_GROWTH * known) & rest.known
+        informative = (expected > MIN_VARIANCE_GROWTH * known) & rest.known
         moved = (without @ parts.score[number]) ** 2
-        weights[number] = np.where(tells, expected / (expected + known), 0.0)
-        squares[number] = np.where(tells, moved / np.where(tells, expected, 1.0), 0.0)
+        weights[number] = np.where(informative, expected / (expected + known), 0.0)
+        squares[number] = np.where(informative, moved / np.where(informative, expected, 1.0), 0.0)
     of_all = np.maximum(weights.sum(axis=0), 1e-300)
     beyond = np.where(weights.any(axis=0), (weights * squares).sum(axis=0) / of_all, 1.0)
     alike = of_all**2 / np.maximum((weights**2).sum(axis=0), 1e-300)

@@ -119,7 +119,7 @@ def examine(
         )
         residuals.extend(whiteness(batch[0], jacobian, batch[2], flight_names))
     information = FisherInformation.joined(informations)
-    astray = information.astray if at_minimum else None
+    diverged = information.diverged if at_minimum else None
     if predictor is not None and slopes is not None:
         information = with_hidden_coefficients(
             with_strengths(
@@ -136,7 +136,7 @@ def examine(
         information = replace(information, selection_shifts=np.hypot(moves, apart))
     searched = set(full_problem.fitted) - set(fitted.held.values())
     information = information.with_resting(resting_parameters(objective.space, point, searched))
-    information = replace(information, astray=astray)
+    information = replace(information, diverged=diverged)
 
     def known(*others: str) -> Uncertainty:
         space, indices = full_problem.subspace((*full_problem.fitted, *others))

@@ -98,7 +98,7 @@ def test_flights_that_agree_on_another_vehicle_do_not_disagree(
 
 
 @pytest.mark.parametrize(
-    ("astray", "crashed", "refuted"),
+    ("diverged", "crashed", "refuted"),
     [
         ([True, False, False], [True, False, False], True),
         ([True, False, False], [False, False, True], False),
@@ -106,10 +106,10 @@ def test_flights_that_agree_on_another_vehicle_do_not_disagree(
     ],
 )
 def test_a_crash_or_most_flights_refute_a_fit(
-    objective: Objective, astray: list[bool], crashed: list[bool], refuted: bool
+    objective: Objective, diverged: list[bool], crashed: list[bool], refuted: bool
 ) -> None:
     information = examine(making.fitted_of(objective, making.truth(objective))).information
-    seen = replace(information, astray=np.array(astray), crashed=np.array(crashed))
+    seen = replace(information, diverged=np.array(diverged), crashed=np.array(crashed))
     assert seen.refuted is refuted
 
 
@@ -123,8 +123,8 @@ def test_flights_that_are_disturbed_as_much_as_they_move_still_tell(objective: O
     segments = replace(objective.segments, measured=shaken)
     disturbed = replace(objective, segments=segments)
     information = examine(making.fitted_of(disturbed, making.truth(disturbed))).information
-    assert information.astray is not None
-    assert not information.astray.any()
+    assert information.diverged is not None
+    assert not information.diverged.any()
 
 
 def flown(objective: Objective, name: str, factor: float) -> dict[str, np.ndarray]:
