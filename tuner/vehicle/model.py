@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 
 from sim_jax.control.gains import (
@@ -69,12 +70,12 @@ def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
     replaced = [row for row in rows if not row.is_effect]
     changed = model
     if replaced:
-        changed = eqx.tree_at(
-            lambda tree: [_leaf(tree, row) for row in replaced],
-            model,
-            [values[row.name] for row in replaced],
-            is_leaf=lambda leaf: leaf is None,
-        )
+        leaves, structure = jax.tree.flatten(model, is_leaf=lambda leaf: leaf is None)
+        places = jax.tree.unflatten(structure, range(len(leaves)))
+        for row in replaced:
+            place: Any = _leaf(places, row)
+            leaves[place] = values[row.name]
+        changed = jax.tree.unflatten(structure, leaves)
     effects = {row.name: values[row.name] for row in rows if row.is_effect}
     if not effects:
         return changed
