@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -53,12 +53,12 @@ def outlying_flights(scales: Scales) -> frozenset[str]:
     return frozenset(lost if len(lost) < len(others) and max(others) < COLOURED_RATIO else ())
 
 
-END_CODES = frozenset(
+UNMATCHED_CODES = frozenset({Code.FLIGHT_UNMATCHED, Code.MODEL_UNMATCHED})
+"""Codes of `unmatched_findings`."""
+END_CODES = UNMATCHED_CODES | frozenset(
     {
         Code.SATURATION_FEEDBACK,
         Code.SEES_MARKERS,
-        Code.FLIGHT_UNMATCHED,
-        Code.MODEL_UNMATCHED,
         Code.CLOCK_OFFSET,
         Code.GYRO_OFFSET,
     }
@@ -94,11 +94,24 @@ def end_findings(job: Job, loop: Loop, scales: Scales) -> tuple[Finding, ...]:
     scales
         As of `unmatched`.
     """
-    findings = list(loop_findings(job, loop, "warning"))
-    lost = unmatched(scales)
+    return (*loop_findings(job, loop, "warning"), *unmatched_findings(scales))
+
+
+def unmatched_findings(scales: Scales, matched: Collection[str] = ()) -> tuple[Finding, ...]:
+    """Return the warnings of flights that are not matched, and of a model that misses several.
+
+    Parameters
+    ----------
+    scales
+        As of `unmatched`.
+    matched
+        Flights that estimated disturbances explain: a simulated yaw spin in gusts, whose position
+        nothing holds, may be far from the recorded one.
+    """
+    lost = {name: bad for name, bad in unmatched(scales).items() if name not in matched}
     typical = float(np.median([_size(channels) for channels in scales.values()]))
     alone = {name for name in lost if _size(scales[name]) > OUTLIER_RATIO * typical}
-    findings += [
+    findings = [
         Finding(Code.FLIGHT_UNMATCHED, "warning", name, lost[name]) for name in sorted(alone)
     ]
     shared = len(set(lost) - alone)

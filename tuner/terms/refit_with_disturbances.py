@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuner.core.phrases import listed
 from tuner.disturbances.maximum_likelihood import MAX_STEPS, maximise_likelihood
@@ -16,10 +15,9 @@ from tuner.disturbances.predictor import Predictor, hidden_by_setpoints
 from tuner.disturbances.ticks import FLIGHT_CONTROLLER
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
-from tuner.recordings.flight import Flight
 from tuner.search.estimation import LAST_POLISH, free_offsets, polished
 from tuner.search.explanation import Explanation
-from tuner.search.findings import outlying_flights
+from tuner.search.findings import UNMATCHED_CODES, outlying_flights, unmatched_findings
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
 from tuner.terms.candidates import Selected, names_of
@@ -144,10 +142,7 @@ def with_disturbances(
     again = replace(
         again,
         wall_time=fitted.wall_time + time.perf_counter() - clock,
-        findings=(
-            *without_matched_flights(again.findings, job.fitted, predictor.matched),
-            _disturbance_finding(predictor),
-        ),
+        findings=_findings_with_disturbances(job, again, predictor),
     )
     alternatives = alternatives_of(again.objective, again.point, job.fitted)
     model_errors = _without_contradicted_lag(model_errors_of(again, job.fitted), seen)
@@ -182,21 +177,6 @@ def with_disturbances(
             on_message("It contradicts the fit of the simulated flights, which is kept.")
         better = agree and _is_sharper(examination.uncertainty, before.uncertainty)
     return (seen.selected, again, examination) if better else None
-
-
-def without_matched_flights(
-    findings: Sequence[Finding], flights: Sequence[Flight], matched: NDArray[np.bool_]
-) -> tuple[Finding, ...]:
-    """Return the findings without those on flights that are matched with their disturbances.
-
-    Without them a simulated flight, as of a spin whose position nothing holds, may be far off.
-    """
-    names = {flight.name for flight, one in zip(flights, matched, strict=True) if one}
-    return tuple(
-        finding
-        for finding in findings
-        if finding.code is not Code.FLIGHT_UNMATCHED or finding.subject not in names
-    )
 
 
 def _without_contradicted_lag(
@@ -302,8 +282,16 @@ def _changed_terms(before: Selected, after: Selected) -> str:
     return f"Samples are predicted better so: fitting again {' and '.join(changed)}."
 
 
-def _disturbance_finding(predictor: Predictor) -> Finding:
-    """Return the finding with the strengths of the disturbances."""
+def _findings_with_disturbances(
+    job: Job, fitted: Fitted, predictor: Predictor
+) -> tuple[Finding, ...]:
+    """Return a fit's findings, with the strengths of the disturbances.
+
+    Flights that are matched with their disturbances are not reported as unmatched.
+    """
+    flights = zip(job.fitted, predictor.matched, strict=True)
+    matched = [flight.name for flight, one in flights if one]
+    others = [finding for finding in fitted.findings if finding.code not in UNMATCHED_CODES]
     gust, _, _, thrust, gust_seconds, thrust_seconds, _ = np.exp(predictor.strengths).tolist()
     numbers = {
         "gust": gust,
@@ -311,4 +299,5 @@ def _disturbance_finding(predictor: Predictor) -> Finding:
         "thrust": thrust,
         "thrust_seconds": thrust_seconds,
     }
-    return Finding(Code.DISTURBANCES_FOLLOWED, "info", "flights", numbers)
+    followed = Finding(Code.DISTURBANCES_FOLLOWED, "info", "flights", numbers)
+    return (*others, *unmatched_findings(fitted.scales, matched), followed)

@@ -16,12 +16,14 @@ from tuner.disturbances.disturbances import INITIAL_STRENGTHS
 from tuner.disturbances.maximum_likelihood import MAX_STEPS
 from tuner.equation_error.omitted_laws import Law
 from tuner.findings.findings import Code, Finding
+from tuner.search.findings import unmatched_findings
 from tuner.search.problem import Job
 from tuner.search.progress import COLOURED_RATIO, Fitted
 from tuner.terms import refit_with_disturbances as disturbances
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import (
     ROUGH_STEPS,
+    _findings_with_disturbances,
     _without_contradicted_lag,
     with_disturbances,
 )
@@ -244,24 +246,29 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     assert read[0] == (job.fitted,)  # whose voltmeters are read again
 
 
-def test_a_flight_that_disturbances_explain_is_not_reported_as_unmatched():
+@pytest.mark.parametrize("size", [20.0, 90.0], ids=["like others", "alone"])
+def test_a_flight_that_disturbances_explain_is_not_reported_as_unmatched(size: float) -> None:
     """White innovations match a flight; one channel that is too large does not."""
     random = np.random.default_rng(0)
-    white = random.normal(size=(500, 6, 3))
+    white = random.normal(size=(500, 6, 4))
     white[:, 4, 1] *= 1.5
     white[::2, :, 2] = 0.0  # ticks without samples
-    inputs = SimpleNamespace(widths={"position": 3, "attitude": 3})
-    names = ("spin", "odd", "sparse")
-    found = [Finding(Code.FLIGHT_UNMATCHED, "warning", name, {"position": 20.0}) for name in names]
-    other = Finding(Code.MODEL_UNMATCHED, "warning", "spin", {})
-    matched = disturbances.Predictor.matched.fget(
-        SimpleNamespace(found=SimpleNamespace(white=white), inputs=inputs)
+    names = ("spin", "odd", "sparse", "calm")
+    scales = {name: {"position": 12.0} for name in names} | {"spin": {"position": size}}
+    fit = replace(fitted(1.0), scales=scales)
+    fit = replace(fit, findings=unmatched_findings(scales))
+    assert len(fit.findings) == (1 if size == 20.0 else 2)
+    predictor = SimpleNamespace(
+        found=SimpleNamespace(white=white),
+        inputs=SimpleNamespace(widths={"position": 3, "attitude": 3}),
+        strengths=INITIAL_STRENGTHS,
     )
-    flights = [SimpleNamespace(name=name) for name in names]
-    assert disturbances.without_matched_flights([*found, other], flights, matched) == (
-        found[1],
-        other,
-    )
+    predictor.matched = disturbances.Predictor.matched.fget(predictor)
+    job = SimpleNamespace(fitted=[SimpleNamespace(name=name) for name in names])
+    left, followed = _findings_with_disturbances(*cast(Any, (job, fit, predictor)))
+    numbers = {"unmatched": 1, "flights": 4, "noise_multiple": 12.0}
+    assert left == Finding(Code.MODEL_UNMATCHED, "warning", "model", numbers)
+    assert followed.code is Code.DISTURBANCES_FOLLOWED
 
 
 def test_a_lateness_that_samples_contradict_is_not_believed():
