@@ -231,7 +231,6 @@ class _Group:
             )
             crashed = not self.windowed and crash <= flight.duration
             errors[flight.name] = FlightErrors(
-                flight.name,
                 position,
                 attitude,
                 laps_of(flight),

@@ -64,7 +64,6 @@ class FlightErrors:
         Force and moment of each term along the simulation, until a crash.
     """
 
-    name: str
     position: SignalErrors
     attitude: SignalErrors
     laps: Array
@@ -74,7 +73,7 @@ class FlightErrors:
     def between(self, start: float, end: float) -> FlightErrors:
         """Return the errors from ``start`` in s to before ``end``."""
         position, attitude = self.position.between(start, end), self.attitude.between(start, end)
-        return FlightErrors(self.name, position, attitude, self.laps, self.crash_time)
+        return FlightErrors(position, attitude, self.laps, self.crash_time)
 
     @property
     def rmse(self) -> AxesRmse:

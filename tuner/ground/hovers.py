@@ -84,9 +84,9 @@ def measure_hover_weights(
         if point.rotor_speed is not None:
             speeds.append(point.rotor_speed)
             continue
-        flight = steady_flight(recording_path(folder, point.recording))
-        speeds.append(float(np.sqrt(np.mean(flight.rotor_speed**2))))  # thrust goes with the square
-        curves.append(flight.curve)
+        rotor_speed, _, curve = steady_flight(recording_path(folder, point.recording))
+        speeds.append(float(np.sqrt(np.mean(rotor_speed**2))))  # thrust goes with the square
+        curves.append(curve)
     mass, speed = np.array([point.mass for point in given.points]), np.array(speeds)
     values = np.log(hover_motor_constant(mass, speed, rotors))
     variance = (given.mass_error / mass) ** 2 + (2 * given.rotor_speed_error / speed) ** 2
@@ -138,12 +138,12 @@ def measure_yaw_spin(name: str, given: YawSpin, vehicle: VehicleFile, folder: Pa
             points.append((point.yaw_rate, point.rotor_speed_slow, point.rotor_speed_fast))
             continue
         path = recording_path(folder, point.recording)
-        flight = steady_flight(path)
-        if not MIN_SPIN_RATE <= abs(flight.yaw_rate) <= MAX_SPIN_RATE:
+        rotor_speed, yaw_rate, curve = steady_flight(path)
+        if not MIN_SPIN_RATE <= abs(yaw_rate) <= MAX_SPIN_RATE:
             raise RecordingError(path, "does not yaw, or has no body rate", "spin it steadily")
-        pairs = sorted((flight.rotor_speed[:2].mean(), flight.rotor_speed[2:].mean()))
-        points.append((flight.yaw_rate, float(pairs[0]), float(pairs[1])))
-        curves.append(flight.curve)
+        pairs = sorted((rotor_speed[:2].mean(), rotor_speed[2:].mean()))
+        points.append((yaw_rate, float(pairs[0]), float(pairs[1])))
+        curves.append(curve)
     mass, radius = vehicle.mass, rotor_radius(vehicle)
     motor_constant = vehicle.aerodynamics.motor_constant
     rows, values, variances = [], [], []

@@ -234,7 +234,7 @@ def read_columns(
     wanted, optional
         Quantities of `COLUMNS`; those that are optional may lack.
     arm
-        m from the vehicle's centre to a rotor, which bounds its measure_propeller.
+        m from the vehicle's centre to a rotor, which bounds its propeller.
 
     Returns
     -------
@@ -307,23 +307,6 @@ def _check_unit(path: Path, quantity: str, column: str, values: Array, arm: floa
             raise RecordingError(path, f"column {column} {what}", remedy)
 
 
-@dataclass(frozen=True)
-class SteadyFlight:
-    """Means over the longest steady part of a flight.
-
-    Attributes
-    ----------
-    rotor_speed
-        (4,) rad/s in PX4's motor order.
-    yaw_rate
-        rad/s; NaN if not recorded.
-    """
-
-    rotor_speed: Array
-    yaw_rate: float
-    curve: Curve
-
-
 def read_swing(path: Path, axis: str) -> dict[str, Array]:
     """Return ``time`` s and ``angle`` rad about the vertical from a table or any recording.
 
@@ -348,8 +331,14 @@ def read_swing(path: Path, axis: str) -> dict[str, Array]:
     return samples | {"angle": angle_of_attitude(str(path), quaternion, axis)}
 
 
-def steady_flight(path: Path) -> SteadyFlight:
+def steady_flight(path: Path) -> tuple[Array, float, Curve]:
     """Return the means over the longest steady part of a flight.
+
+    Returns
+    -------
+    tuple
+        Rotor speeds (4,) in rad/s, PX4's motor order; yaw rate in rad/s, NaN if not recorded; and
+        the curve.
 
     Raises
     ------
@@ -390,7 +379,7 @@ def steady_flight(path: Path) -> SteadyFlight:
     titles = (f"Steady part of {path.name}", "time, s", "mean rotor speed, rad/s")
     middle = np.array([0.5 * (longest.begin + longest.end)])
     curve = Curve.of(titles, (time, mean), (middle, level), used=used, law=False)
-    return SteadyFlight(np.array(rotors), yaw_rate, curve)
+    return np.array(rotors), yaw_rate, curve
 
 
 def _content(path: Path) -> Content:

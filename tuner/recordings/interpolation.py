@@ -12,8 +12,6 @@ from tuner.recordings.flight import SIGNALS, Series
 
 #: A signal is unknown in gaps longer than this, or than three periods of a slower signal.
 GAP_S = 0.25
-#: Counters hold for good after their last sample.
-COUNTER_GAP_S = np.inf
 #: A gap of more periods of a regular publisher lacks a sample.
 MIN_GAP_PERIODS = 1.5
 #: The rate and length of the stretch whose frames and clocks are checked.
@@ -38,7 +36,7 @@ def resample(signal: str, series: Series, clock: Array) -> Array:
             result[:, column] = np.interp(clock, time, values)
             result[np.logical_not(_covered(time, clock)), column] = np.nan
         else:
-            gap = COUNTER_GAP_S if signal == "lap" else max_gap(time)
+            gap = np.inf if signal == "lap" else max_gap(time)  # a counter holds for good
             # A nanosecond of tolerance: stamps that were moved onto ticks carry rounding errors.
             index = np.searchsorted(time, clock + 1e-9, side="right") - 1
             last = np.maximum(index, 0)

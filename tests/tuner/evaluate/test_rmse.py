@@ -21,7 +21,7 @@ def errors(position, attitude, **options):
     for name, values in (("position", position), ("attitude", attitude)):
         error = np.asarray(values, float)
         signals[name] = SignalErrors(np.arange(len(error)) * 1.0, np.zeros_like(error), error)
-    return FlightErrors("f", **signals, **{"laps": np.zeros(0), "crash_time": None} | options)
+    return FlightErrors(**signals, **{"laps": np.zeros(0), "crash_time": None} | options)
 
 
 def test_the_root_mean_square_of_known_errors():

@@ -51,8 +51,8 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
     vehicle = read_vehicle(find_config("vehicles", "hovergames", Path()))
     write_vehicle(vehicle, folder / "best_fit.yaml", header="A test's.")
     write_vehicle(vehicle, folder / "effective.yaml", header="A test's.")
-    initial = {name: _errors(name, 0.2) for name in FLIGHTS}
-    best = {name: _errors(name, 0.002) for name in FLIGHTS}
+    initial = {name: _errors(0.2) for name in FLIGHTS}
+    best = {name: _errors(0.002) for name in FLIGHTS}
     simulations = {"initial": initial, "best": best}
     table_of(simulations).write(folder)
     write_traces(folder, simulations)
@@ -81,7 +81,7 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
     _result(vehicle, knowledge, initial, best).write(folder)
 
 
-def _errors(name: str, size: float) -> FlightErrors:
+def _errors(size: float) -> FlightErrors:
     time = np.linspace(0.0, SECONDS, 300)
     recorded = np.column_stack([np.sin(2.2 * time), np.sin(3.1 * time), 1.0 + 0.1 * time])
     error = size * np.column_stack([np.sin(time), np.cos(time), 0.1 * time])
@@ -90,7 +90,7 @@ def _errors(name: str, size: float) -> FlightErrors:
     thrust, drag = np.zeros((300, 6)), np.zeros((300, 6))
     thrust[:, 2], drag[:, 0], drag[:, 4] = 22.0, np.sin(time), 0.06 * np.sin(time)
     forces = Forces(time, {"thrust": thrust, "rotor_drag": drag, "gravity": -thrust})
-    return FlightErrors(name, position, attitude, np.array([2.0, 4.0]), None, forces)
+    return FlightErrors(position, attitude, np.array([2.0, 4.0]), None, forces)
 
 
 def _knowledge(vehicle: VehicleFile, free: Sequence[str], undetermined: Direction) -> Knowledge:
