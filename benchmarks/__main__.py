@@ -27,7 +27,6 @@ PARTS = (
     "derivatives",
     "one_vehicle",
     "compilation",
-    "scaling",
     "job",
     "reading",
     "service",
