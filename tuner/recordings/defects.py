@@ -59,6 +59,16 @@ MIN_TURN_RATE = 0.2
 """or its gyro shows so much, root mean square in rad/s."""
 MIN_TILT_RAD = 0.05
 """A vehicle with a larger tilt, root mean square, must move."""
+MIN_HELD_SHARE = 0.4
+"""A signal whose rows repeat the one before in so large a share was measured less often,"""
+MIN_HELD_CHANGES = 20
+"""if it has so many changes,"""
+MIN_HELD_REGULAR = 0.8
+"""and so large a share of them are about equally far apart."""
+MEASURED_SIGNALS = (
+    "position", "velocity", "attitude", "body_rate", "acceleration", "rotor_speed",
+)  # fmt: skip
+"""Signals that change from one measurement to the next; a command may stay."""
 MOTION_SIGNALS = ("attitude", "body_rate")
 """Signals that change whenever a vehicle moves."""
 
@@ -132,6 +142,11 @@ def clean(
         time, values, odd = _unit_quaternions(time, values)
         note(odd, NoteCode.NO_UNIT_QUATERNION)
 
+    if signal in MEASURED_SIGNALS:
+        held = is_held(time, values)
+        rate = 1.0 / float(np.median(np.diff(time[~held]))) if held.any() else 0.0
+        note(int(held.sum()), NoteCode.HELD, rate=rate)
+        time, values = time[~held], values[~held]
     if signal in LIMITS:
         time, values = _without_outliers(signal, time, values, note)
     return time, values, tuple(notes)
@@ -282,6 +297,26 @@ def is_outlier(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
 def _median_of_three(a: Array, b: Array, c: Array) -> Array:
     """Return the median of three, element by element."""
     return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))
+
+
+def is_held(time: Array, values: Array) -> NDArray[np.bool_]:
+    """Return which samples of (n, k) values fill a table of a higher rate than the signal's.
+
+    Joined tables repeat a slower signal until its next sample. Read as measured, it would be late
+    by half its period, and leap. Repeats that last longer than two periods are a vehicle at rest.
+    """
+    if len(values) < 2 * MIN_HELD_CHANGES:
+        return np.zeros(len(values), dtype=np.bool_)
+    same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+    fresh = np.flatnonzero(~same)
+    if same.mean() < MIN_HELD_SHARE or len(fresh) < MIN_HELD_CHANGES:
+        return np.zeros(len(values), dtype=np.bool_)
+    between, step = np.diff(time[fresh]), float(np.median(np.diff(time)))
+    period = float(np.median(between))
+    if period < 1.5 * step or np.mean(np.abs(between - period) < 1.1 * step) < MIN_HELD_REGULAR:
+        return np.zeros(len(values), dtype=np.bool_)
+    since = time - time[np.maximum.accumulate(np.where(same, 0, np.arange(len(time))))]
+    return np.asarray(same & (since < 2.0 * period), dtype=np.bool_)
 
 
 def is_repeated(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:

@@ -40,6 +40,7 @@ from tuner.recordings.unit_detection import (
 
 DOUBTS = (
     NoteCode.ATTITUDE_DOUBTED,
+    NoteCode.WEIGHT_NOT_FELT,
     NoteCode.BODY_RATE_DOUBTED,
     NoteCode.VELOCITY_DOUBTED,
     NoteCode.AXIS_DOUBTED,
@@ -50,11 +51,17 @@ MIN_ACCELERATION = 0.3
 MIN_TURN_RATE = 0.1
 MIN_SPEED = 0.2
 """Less motion, in m/s^2, rad/s and m/s, contradicts nothing."""
+MAX_UNMATCHED_SPEED = 1.0
+"""m/s. Position and velocity both show faster motion, or one of them is wrong."""
 MAX_MARKER_OFFSET_M = 0.1
 """Markers may sit so far off the centre of mass: turning accelerates them without a tilt."""
 MIN_AGREEMENT = 0.6
+UPRIGHT_SHARE = 0.9
+"""An attitude along which thrust carries a larger share of the weight is right."""
 MIN_SCORE_GAIN = 0.3
 """A larger correlation is accepted as it is; an alternative must score better by so much."""
+INVERSE = np.array([1.0, -1.0, -1.0, -1.0])
+"""Turns a quaternion (w, x, y, z) into its inverse."""
 READING_PENALTY = 0.05
 """Each further misreading must improve the score by more."""
 
@@ -168,6 +175,9 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     better = _score(best_fit, best_upright) > _score(fit, upright) + MIN_SCORE_GAIN
     if better and best_fit > MIN_AGREEMENT and best_upright > 0.5:
         return best, None
+    by_motion = (upward(q) * pull).sum(axis=1) / np.linalg.norm(pull, axis=1)
+    if fit > MIN_AGREEMENT and np.nanmean(by_motion) > UPRIGHT_SHARE:
+        return None, Note(NoteCode.WEIGHT_NOT_FELT, numbers={"share": upright})
     if fit < 0.2 or upright < 0.5:
         numbers = {"agreement": fit, "upright": upright}
         return None, Note(NoteCode.ATTITUDE_DOUBTED, numbers=numbers)
@@ -193,7 +203,8 @@ def _velocities(series: Mapping[str, Series], clock: Array) -> tuple[Array, Arra
 def _residual_share(motion: Array, recorded: Array) -> float:
     """Return the share of a motion (n, 3) that is left after subtraction of the recorded one."""
     known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
-    return rms((motion - recorded)[known]) / rms(motion[known])
+    size = rms(motion[known])
+    return rms((motion - recorded)[known]) / size if size > 0.0 else np.inf
 
 
 def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
@@ -201,10 +212,17 @@ def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
     if min(rms(turning), rms(gyro)) < MIN_TURN_RATE:
         return None, None
     here = _residual_share(turning, gyro)
-    best = min(_RATES, key=lambda r: _residual_share(turning, r.read(gyro)))
-    there = _residual_share(turning, best.read(gyro))
-    alike = correlation(turning, best.read(gyro))
-    slope = alike * rms(best.read(gyro)) / rms(turning)  # whatever the gyro's noise
+    own = on_clock(series, "attitude", clock) * INVERSE
+    measured = series["body_rate"]
+    at_samples = on_clock(series, "attitude", measured.time) * INVERSE
+    readings = {reading: reading.read(gyro) for reading in _RATES}
+    if _angle_between(turning, gyro) == 0.0:  # a marker body of another heading looks alike
+        in_world = Reading("in world axes", lambda _: rotate(at_samples, measured.values))
+        readings[in_world] = smooth(rotate(own, on_clock(series, "body_rate", clock)))
+    best = min(readings, key=lambda r: _residual_share(turning, readings[r]))
+    there = _residual_share(turning, readings[best])
+    alike = correlation(turning, readings[best])
+    slope = alike * rms(readings[best]) / rms(turning)  # whatever the gyro's noise
     of_another_unit = there < here / 20 and alike > MIN_AGREEMENT and slope < MAX_SIZE_RATIO
     if (there < 0.7 and there < here / 2) or of_another_unit:
         return best, None
@@ -242,7 +260,7 @@ def _force_doubts(series: Mapping[str, Series], clock: Array) -> Iterator[Note]:
     names = ("acceleration", "position")
     doubts = tuple(_axis_doubts(pull, _smooth_thrice(rotate(q, force)), names, MIN_ACCELERATION))
     if not doubts:
-        own = rotate(q * np.array([1.0, -1.0, -1.0, -1.0]), pull)
+        own = rotate(q * INVERSE, pull)
         doubts = tuple(_axis_doubts(own, _smooth_thrice(force), names, MIN_ACCELERATION))
     yield from doubts
 
@@ -323,7 +341,7 @@ _AXIS_CHECKS: Mapping[str, Callable[[Mapping[str, Series], Array], Iterable[Note
 _GENERAL_DOUBTS = {
     "body_rate": (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED),
     "velocity": (NoteCode.VELOCITY_DOUBTED, NoteCode.UNIT_DOUBTED),
-    "acceleration": (NoteCode.ATTITUDE_DOUBTED, NoteCode.UNIT_DOUBTED),
+    "acceleration": (NoteCode.ATTITUDE_DOUBTED, NoteCode.WEIGHT_NOT_FELT, NoteCode.UNIT_DOUBTED),
 }
 """Signal -> notes that cover its single axes too."""
 
@@ -341,8 +359,10 @@ def _judge_setpoint(series: Mapping[str, Series], clock: Array) -> Reading | Non
 
 def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
     moving, velocity = _velocities(series, clock)
-    if min(rms(moving), rms(velocity)) < MIN_SPEED:
-        return None, None
+    slower, faster = sorted((rms(moving), rms(velocity)))
+    if slower < MIN_SPEED:
+        doubt = Note(NoteCode.VELOCITY_DOUBTED, numbers={"agreement": 0.0})
+        return None, doubt if faster > MAX_UNMATCHED_SPEED else None
     measured = series["velocity"]
     at_samples = on_clock(series, "attitude", measured.time)
     readings = {

@@ -93,6 +93,10 @@ class NoteCode(Worded):
         "{samples} that are no unit quaternion dropped or normalised",
     )
     REPEATED = "repeated", "{samples} repeat the one before while the vehicle moves: dropped"
+    HELD = (
+        "held",
+        "{samples} repeat the one before, as joined tables do: dropped, its rate is {rate:.3g} Hz",
+    )
     STALE = (
         "stale",
         "{samples} repeat one value in the last {seconds:.1f} s, while the vehicle moves",
@@ -146,6 +150,13 @@ class NoteCode(Worded):
         (
             "the attitude does not tilt as the vehicle accelerates (agreement {agreement:.2f}, "
             "upright {upright:.2f}): check its frame and order"
+        ),
+    )
+    WEIGHT_NOT_FELT = (
+        "weight_not_felt",
+        (
+            "the accelerometer feels {share:.2f} of the weight, though the attitude fits the "
+            "motion: is gravity taken away from it, or are its axes other?"
         ),
     )
     BODY_RATE_DOUBTED = (

@@ -7,6 +7,7 @@ The unit of a table's times follows from their step: for sample rates from `MIN_
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterable, Mapping
 from decimal import Decimal
 from pathlib import Path
@@ -47,6 +48,15 @@ MAX_COLUMNS = 10_000
 MAX_CELLS = 500_000_000
 #: Nor are files with more cells per byte, unless they have few cells: true numbers differ.
 MAX_CELLS_PER_BYTE, MIN_CELL_LIMIT = 20, 20_000_000
+_VEHICLE_COLUMN = re.compile(
+    r"(^|[ _./])(id|name|drone|uav|vehicle|agent|robot|body|object|quad|cf)s?([ _]?(id|name))?$",
+    re.I,
+)
+MAX_VEHICLES = 100
+#: A column in which more cells hold digits and are no numbers is not read as it was written.
+MAX_UNREAD_SHARE = 0.1
+#: Rows are of several vehicles in turn if the next row is so often another's.
+MIN_TURNS_SHARE = 0.3
 
 
 class Table(TabularRecording):
@@ -90,7 +100,10 @@ class Table(TabularRecording):
         clock = self.clock(clocks)
         names = list(dict.fromkeys([clock.field, *wanted[TABLE_TOPIC]]))
         table = self._read(names)
+        self._require_one_vehicle(names)
         fields = {name: numbers_of(table.column(name)) for name in wanted[TABLE_TOPIC]}
+        for name, numbers in fields.items():
+            self._require_numbers(name, table.column(name), numbers)
         time, noted = read_times(self.path, table.column(clock.field), clock, fields.values())
         notes = list(noted)
         damage = [Damage(Cause.ROWS_MALFORMED, lost=self._skipped)] if self._skipped else []
@@ -101,6 +114,41 @@ class Table(TabularRecording):
         fields = {name: values[kept] for name, values in fields.items()}
         samples = Samples(time[kept], time[kept], fields)
         return ReadResult({TABLE_TOPIC: samples}, tuple(notes), tuple(damage))
+
+    def _require_numbers(self, name: str, cells: pyarrow.ChunkedArray, numbers: Array) -> None:
+        """Refuse a column of text whose numbers are often written with other signs."""
+        unread = np.isnan(numbers)
+        if not is_text(cells) or not unread.any():
+            return
+        with_digits = compute.match_substring_regex(cells, r"^[^#]*\d[^#]*$")  # 1.#QNAN is none
+        unread &= with_digits.to_numpy(zero_copy_only=False)
+        if unread.mean() > MAX_UNREAD_SHARE:
+            first = cells.take([int(np.argmax(unread))]).to_pylist()
+            raise RecordingError(
+                self.path,
+                f"its '{name}' holds {first[0][:40]!r}, which is no number",
+                "write numbers with a point for decimals, and their unit in the column's name",
+            )
+
+    def _require_one_vehicle(self, read: list[str]) -> None:
+        """Refuse rows of several vehicles in turn."""
+        for name in self.columns:
+            if name in read or not _VEHICLE_COLUMN.search(name):
+                continue
+            cells = self._read([name]).column(name)
+            if not (is_text(cells) or types.is_integer(cells.type)):
+                continue
+            vehicles = cells.unique().to_pylist()
+            if not 2 <= len(vehicles) <= MAX_VEHICLES:
+                continue
+            rows = cells.combine_chunks().dictionary_encode().indices.to_numpy(zero_copy_only=False)
+            if np.mean(rows[1:] != rows[:-1]) > MIN_TURNS_SHARE:
+                shown = ", ".join(str(vehicle)[:20] for vehicle in vehicles[:3])
+                raise RecordingError(
+                    self.path,
+                    f"its rows are of {len(vehicles)} vehicles in turn, by its '{name}': {shown}",
+                    "write a table for each vehicle",
+                )
 
     def _parquet_columns(self) -> list[str]:
         from pyarrow import parquet  # noqa: PLC0415 (a third of a second)
@@ -207,7 +255,8 @@ def read_times(
     Raises
     ------
     RecordingError
-        It holds neither numbers nor dates, its unit is uncertain, or its stamps are too coarse.
+        It holds neither numbers nor dates, its unit is uncertain, its stamps are too coarse, or its
+        times start again.
     """
     if types.is_timestamp(column.type):
         whole = compute.cast(compute.cast(column, "timestamp[ns]"), int64())
@@ -220,6 +269,7 @@ def read_times(
         unit = None if clock.unit else _unit_by_step(path, clock.field, numbers, sampled)
         times = _whole_nanoseconds(column, numbers, NS_PER_UNIT[clock.unit or unit or "s"])
     _require_fine_stamps(path, column, times, sampled)
+    _require_one_start(path, clock.field, times)
     if unit is None or unit == "s":
         return times, ()
     names = (clock.field, UNIT_NAMES[unit])
@@ -344,3 +394,27 @@ def _require_fine_stamps(
             f"its {len(there)} rows have {different} different times: '{first}' has too few digits",
             "write the time with its fraction of a second, or count from the recording's start",
         )
+
+
+RESTART_ROWS = 50
+RESTART_NS = NS_PER_SECOND
+"""Times that go back by more, for so many rows, start again."""
+
+
+def _require_one_start(path: Path, field: str, times: Nanoseconds) -> None:
+    """Refuse times that start again: rows of two flights would be sorted into one.
+
+    A clock that is set back to before the first row mixes nothing.
+    """
+    known = times[times != NO_TIME]
+    for row in np.flatnonzero(np.diff(known) < -RESTART_NS)[:100] + 1:
+        before, after = known[max(row - RESTART_ROWS, 0) : row], known[row : row + RESTART_ROWS]
+        if len(before) == len(after) == RESTART_ROWS and (
+            known[:row].min() < np.median(after) < np.median(before) - RESTART_NS
+        ):
+            raise RecordingError(
+                path,
+                f"its '{field}' goes back by {(known[row - 1] - known[row]) / 1e9:.3g} s at row "
+                f"{row + 1} and starts again there",
+                "write a table for each flight or vehicle",
+            )

@@ -21,6 +21,7 @@ from tuner.recordings.content import ReadOptions, read_content
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.frames import _axis_doubts
 from tuner.recordings.inspector import suggested_map
+from tuner.recordings.interpolation import rotate
 from tuner.recordings.loader import load_flight, read_inertial
 from tuner.recordings.matlab import MAGIC
 from tuner.recordings.notes import NoteCode, note_in_words
@@ -548,3 +549,86 @@ def test_commands_of_a_rotor_that_never_change_are_not_believed(tmp_path: Path) 
     assert (note.kind, note.names) == ("warning", ("2",))
     hover = read(tmp_path, ways.changed({"command": lambda u: 0 * u + 0.5}))
     assert hover.has("command")
+
+
+def _held(*columns: str, rows: int) -> str:
+    """Return the flight as a table that repeats some columns until their next sample."""
+    table = dict(ways.flown())
+    at = np.arange(len(table["time"])) // rows * rows
+    return ways.text(table | {name: table[name][at] for name in columns})
+
+
+@pytest.mark.parametrize("rows", [2, 4])
+@pytest.mark.parametrize("signal_", ["position", "body_rate", "rotor_speed"])
+def test_a_slower_signal_of_a_joined_table_is_read_at_its_rate(
+    signal_: str, rows: int, tmp_path: Path
+) -> None:
+    columns = {
+        "position": ways.XYZ,
+        "body_rate": ("wx", "wy", "wz"),
+        "rotor_speed": tuple(f"rotor_speed_{i}" for i in range(1, 5)),
+    }[signal_]
+    flight = read(tmp_path, _held(*columns, rows=rows))
+    assert np.median(np.diff(flight.series[signal_].time)) == pytest.approx(rows / ways.RATE)
+    (note,) = (n for n in flight.notes if n.code is NoteCode.HELD)
+    assert note.names == (signal_,)
+    assert note.numbers["rate"] == pytest.approx(ways.RATE / rows)
+    assert not {NoteCode.POSE_MOVED, NoteCode.AWAY_FOR_GOOD} & {n.code for n in flight.notes}
+
+
+def test_a_body_rate_in_world_axes_is_turned(tmp_path: Path) -> None:
+    table = dict(ways.flown())
+    q = np.column_stack([table[f"q{axis}"] for axis in ("w", *ways.XYZ)])
+    w = np.column_stack([table[f"w{axis}"] for axis in ways.XYZ])
+    turned = dict(zip(("wx", "wy", "wz"), rotate(q, w).T, strict=True))
+    flight = read(tmp_path, ways.text(table | turned))
+    assert np.abs(flight.series["body_rate"].values - w).max() < 1e-6
+    notes = [n.names for n in flight.notes if n.code is NoteCode.FRAME_TURNED]
+    assert notes == [("body_rate", "in world axes")]
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({axis: lambda p: 1e-3 * p for axis in ways.XYZ}, NoteCode.UNIT_DOUBTED),
+        ({"v": lambda v: 0.0 * v}, NoteCode.VELOCITY_DOUBTED),
+        ({"az": lambda a: a - 9.80665}, NoteCode.WEIGHT_NOT_FELT),
+    ],
+)
+def test_signals_without_size_or_weight_are_doubted(changes, code, tmp_path: Path) -> None:
+    doubts = [n.code for n in read(tmp_path, ways.changed(changes)).notes if n.kind == "warning"]
+    assert code in doubts
+    assert NoteCode.ATTITUDE_DOUBTED not in doubts
+
+
+def _both(change: float, names: bool) -> str:
+    """Return two flights in one table: one after the other, or row by row with their names."""
+    lines = ways.text(dict(ways.flown())).splitlines()
+    second = ways.changed({"time": lambda t: t + change}).splitlines()[1:]
+    if not names:
+        return "\n".join([*lines, *second])
+    rows = [
+        f"{row},cf{i + 1}"
+        for pair in zip(lines[1:], second, strict=True)
+        for i, row in enumerate(pair)
+    ]
+    return "\n".join([f"{lines[0]},drone", *rows])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (lambda: _both(0.003, names=False), "at row 1402 and starts again there"),
+        (lambda: _both(0.0, names=True), "2 vehicles in turn, by its 'drone': cf1, cf2"),
+        (
+            lambda: ways.text(
+                dict(ways.flown()) | {"x": [f"{x:.4f} m" for x in ways.flown()["x"]]}
+            ),
+            "its 'x' holds '2.0000 m', which is no number",
+        ),
+        (lambda: ways.changed({}).replace("-", "\u2212"), "which is no number"),
+    ],
+)
+def test_tables_that_would_be_read_otherwise_are_refused(content, message, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=message):
+        read(tmp_path, content())
