@@ -27,6 +27,8 @@ LOGGED = "logged"
 """Key of the problem with rotor speeds filtered sample by sample."""
 READINGS = "readings"
 """Key of the problems with the battery's voltmeter read again, `VOLTMETER_DRAWS` times."""
+INPUT = "input"
+"""Key of the problem fed with recorded rotor speeds instead of commands."""
 MODEL_ERRORS = "lack"
 """Key of the problem with model errors applied."""
 LIMIT = "limit"
@@ -404,13 +406,15 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
         flew = plausible_share(information, information.changes[MODEL_ERRORS])
         moved[MODEL_ERRORS] = moved[MODEL_ERRORS] * flew
     drawn = [moves for name, moves in moved.items() if name.startswith(READINGS)]
+    read = STUDENT_FACTOR * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None
+    read = moved.get(INPUT, read)  # voltmeters are read again where the whole loop is simulated
     parts = {
         "noise": noise_alone(information),
         "residuals": residuals,
         "left_out": left_out(information),
         "terms": information.selection_shifts,
         "step": moved.get(STEP),
-        "readings": STUDENT_FACTOR * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None,
+        "readings": read,
         "lack": moved.get(MODEL_ERRORS),
         "limit": moved[LIMIT] * LIMIT_SD / LIMIT_STEP if LIMIT in moved else None,
         "search": np.abs(inverse.matrix @ information.slope),

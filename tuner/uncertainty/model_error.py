@@ -22,7 +22,7 @@ from sim_jax.control.mixer import torque_of
 from sim_jax.environment import Disturbance, Environment
 from sim_jax.frames import markers_of
 from sim_jax.geometry import Quaternion, Vec3
-from sim_jax.inlet import ReferenceInlet, RotorSpeedInlet
+from sim_jax.inlet import ActuatorInlet, Inlet, MixedInlet, ReferenceInlet, RotorSpeedInlet
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
@@ -42,7 +42,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.findings.sentences import CONTROLLER_FILE
 from tuner.objective.battery import log_voltage_of, with_readings_redrawn
 from tuner.objective.criterion import Point
-from tuner.objective.inlets import zero_order_hold
+from tuner.objective.inlets import linear_interpolation, zero_order_hold
 from tuner.objective.normal_equations import Objective
 from tuner.objective.simulation import (
     BODY_ATTITUDE,
@@ -55,9 +55,11 @@ from tuner.objective.simulation import (
 )
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
+from tuner.recordings.interpolation import with_gaps_filled
 from tuner.search.findings import outlying_flights
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import (
+    INPUT,
     LIMIT,
     LIMIT_STEP,
     LOGGED,
@@ -251,7 +253,7 @@ def alternatives_of(
     """
     limited = _with_lower_limit(objective)
     if not isinstance(objective.segments.inlet, ReferenceInlet):
-        return limited
+        return limited | _with_recorded_rotors(objective, flights)
     schedule = objective.schedule
     finer = replace(schedule, physics_rate=2 * schedule.physics_rate)
     return {
@@ -273,6 +275,34 @@ def _with_lower_limit(objective: Objective) -> dict[str, Objective]:
     lower = (1.0 - LIMIT_STEP) * model.vehicle.motor.max_rotor_velocity
     limited = eqx.tree_at(lambda m: m.vehicle.motor.max_rotor_velocity, model, lower)
     return {LIMIT: replace(objective, model=limited)}
+
+
+def _with_recorded_rotors(objective: Objective, flights: Sequence[Flight]) -> dict[str, Objective]:
+    """Return the problem fed with recorded rotor speeds instead of commands, if it has both.
+
+    Between samples commands are not known; rotors move less there.
+    """
+    segments, inlet = objective.segments, objective.segments.inlet
+    parts = inlet.parts if isinstance(inlet, MixedInlet) else (inlet,)
+    kind = np.broadcast_to(getattr(inlet, "kind", 0), segments.count)
+    by_command = np.array([isinstance(part, ActuatorInlet) for part in parts])
+    whose = np.asarray(segments.flight)[by_command[kind]]
+    if not (len(flights) and len(whose) and all(flights[n].has("rotor_speed") for n in whose)):
+        return {}
+
+    def with_rotors(part: Inlet) -> Inlet:
+        if not isinstance(part, ActuatorInlet):
+            return part
+        clock = np.arange(len(part.command[0])) / objective.schedule.physics_rate
+        speeds = np.zeros((len(part.command), len(clock), segments.count))
+        for number in np.flatnonzero(by_command[kind]):
+            read = with_gaps_filled(flights[int(segments.flight[number])].series["rotor_speed"])
+            speeds[..., number] = linear_interpolation(read, clock + segments.begins[number]).T
+        return RotorSpeedInlet(tuple(speeds))
+
+    swapped = tuple(map(with_rotors, parts))
+    fed = eqx.tree_at(lambda i: i.parts, inlet, swapped) if len(parts) > 1 else swapped[0]
+    return {INPUT: replace(objective, segments=replace(segments, inlet=fed))}
 
 
 def _with_sampled_filter(objective: Objective) -> dict[str, Objective]:

@@ -41,7 +41,8 @@ class ErrorParts(Part):
         the log's; None where that was not asked.
     readings
         How it scatters when the battery's voltmeter is read again, with errors like those that it
-        made; None where the fit has no battery, or estimates disturbances.
+        made; with commands fed in, how far it would move with recorded rotor speeds instead. None
+        where there is neither, or disturbances are estimated.
     lack
         How far it would move with the laws that recorded accelerations follow beside the model's;
         None where none was found.

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 
@@ -22,6 +23,7 @@ from tuner.search.problem import job_of
 from tuner.search.progress import criterion_of, initial_progress
 from tuner.search.stages import WHOLE_LENGTH, plan
 from tuner.uncertainty.identifiability import hold_undetermined
+from tuner.uncertainty.model_error import alternatives_of
 from tuner.vehicle import values_of, with_values
 
 WRONG = {"inertia_xx": 1.3, "inertia_yy": 0.8, "motor_constant": 1.1, "moment_constant": 0.8}
@@ -78,6 +80,37 @@ def test_flights_may_enter_through_different_inlets(full_flight, full_bag, updat
     count = single.objective.segments.count
     np.testing.assert_allclose(both.loss[:count], alone.loss, rtol=1e-8)
     np.testing.assert_allclose(both.gradient[..., :count], alone.gradient, rtol=1e-6, atol=1e-6)
+
+
+def test_commands_are_compared_with_recorded_rotor_speeds(full_flight, full_bag, updated):
+    flights = [full_flight, replace(full_flight, name="second")]
+    series = {name: one for name, one in full_flight.series.items() if name != "rotor_speed"}
+    bare = replace(full_flight, series=series, signals={})
+
+    def of_both(inlet):
+        settings = job_through(inlet, full_flight, full_bag, updated).settings
+        second = {"second": FlightSettings(inlet="body_rate")}
+        settings = replace(settings, job=settings.job.model_copy(update={"flights": second}))
+        return job_of(settings, recordings_of(settings, flights))
+
+    def fed(job, *flights):
+        point = job.objective.start(job.space.initial)
+        return alternatives_of(job.objective, point, flights).get("input")
+
+    for by_command, by_speed in (
+        [
+            job_through(inlet, full_flight, full_bag, updated)
+            for inlet in ("actuator", "rotor_speed")
+        ],
+        [of_both(inlet) for inlet in ("actuator", "rotor_speed")],
+    ):
+        other = fed(by_command, full_flight, bare)
+        jax.tree.map(
+            np.testing.assert_allclose, other.segments.inlet, by_speed.objective.segments.inlet
+        )
+        assert fed(by_command, bare, full_flight) is None
+        assert fed(by_speed, full_flight, bare) is None
+        assert fed(by_command) is None
 
 
 def stage_for(job):

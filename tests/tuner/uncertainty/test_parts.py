@@ -11,6 +11,7 @@ from scipy import stats
 from tuner.objective.information import Change, FisherInformation
 from tuner.uncertainty.covariance import overdispersion_factors
 from tuner.uncertainty.estimates import (
+    INPUT,
     READINGS,
     VOLTMETER_DRAWS,
     left_out,
@@ -115,6 +116,15 @@ def test_flights_do_not_disagree_because_the_search_stopped_short(one_tells):
     where = np.array([True, False, False])
     assert made[1].with_resting(where).slope[0] == pytest.approx(0.0, abs=1e-9)
     assert made[1].with_resting(where).slope[1:] == pytest.approx(made[1].slope[1:])
+
+
+def test_a_move_with_another_input_is_a_part_of_the_error():
+    information, _ = regression(np.random.default_rng(4), apart=0.0)
+    other = replace(information, changes={INPUT: change(np.array([30.0, 0.0, -10.0]))})
+    parts = parts_of(other, np.zeros(COUNT), np.zeros(COUNT))
+    moved = np.abs(information.inverse.matrix @ np.array([30.0, 0.0, -10.0]))
+    assert parts["readings"] == pytest.approx(moved)
+    assert np.all(total_error(parts) >= moved)
 
 
 def test_one_flight_is_left_out_in_parts_if_it_is_long():
