@@ -14,6 +14,8 @@ NUMBERS = dict.fromkeys(
         "upper",
         "agreement",
         "upright",
+        "rate",
+        "share",
         "left",
         "number",
         "drift",
