@@ -154,7 +154,7 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
     """Fly every flight with the initial and with the fitted vehicle."""
     comparison, controller = comparison_of(job, fitted), controller_flown(job, fitted)
     validation = Validation(
-        initial=comparison.fly(job.given.vehicle),
+        initial=comparison.fly(job.user_settings.vehicle),
         best=comparison.fly(vehicle),
         fitted_starts=comparison.fly(vehicle, fitted_starts=True),
     )
@@ -173,7 +173,7 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
                 input_late=recording.input_late,
             ),
         )
-        initial = predictor.predict(job.given.vehicle, controller)
+        initial = predictor.predict(job.user_settings.vehicle, controller)
         best = predictor.predict(vehicle, controller)
         held = hold_state(predictor.flight, predictor.begins, predictor.ahead, predictor.recorded)
         held = replace(held, errors={quantity: held.errors[quantity] for quantity in best.errors})

@@ -80,7 +80,7 @@ def _regressed_job(job: Job, found: Estimate) -> Job | None:
         search = search.model_copy(update={"window": found.horizon})
     changed = settings.job.model_copy(update={"free": moving, "fixed": (), "search": search})
     regressed = job_of(replace(settings, vehicle=vehicle, job=changed), job.recordings)
-    return replace(regressed, given=job.settings, accelerations=found)
+    return replace(regressed, user_settings=job.settings, accelerations=found)
 
 
 def of_rigid_body(found: Estimate) -> Estimate:

@@ -296,7 +296,7 @@ def _spread(flight: Flight, axis: str) -> float:
 
 def _unused_settings(job: Job) -> Iterator[Finding]:
     """Warn of settings of coefficients that are neither free nor candidate terms."""
-    asked = job.given.job
+    asked = job.user_settings.job
     unused = [
         name
         for name in asked.coefficients

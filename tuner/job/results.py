@@ -166,7 +166,7 @@ def _coefficients(
         for name, ratio in parameter.ratios.items()
     }
     coefficients = {}
-    began = initial_values(job.given.vehicle, job.given.controller, job.space.free)
+    began = initial_values(job.user_settings.vehicle, job.user_settings.controller, job.space.free)
     errors = {} if job.accelerations is None else job.accelerations.errors
     for name, value in initial_of(job).items():
         initial, regressed = began.get(name, value), None

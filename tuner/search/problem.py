@@ -64,7 +64,7 @@ class Job:
         all do.
     first_terms
         Groups of terms that are free from the beginning of the search.
-    given
+    user_settings
         The user's settings: ``settings`` may start from a regression.
     accelerations
         Estimates by regression of the flights' accelerations, if physical coefficients are taken
@@ -76,7 +76,7 @@ class Job:
     noise: Mapping[str, float]
     space: Space
     objective: Objective
-    given: Settings
+    user_settings: Settings
     windows: Objective | None = None
     first_terms: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     accelerations: Estimate | None = None

@@ -127,7 +127,7 @@ def test_every_stage_of_a_run_has_its_words():
         name
         for folder in ("job", "recordings")
         for path in Path("tuner", folder).glob("*.py")
-        for name in re.findall(r'(?:span|explanation\.part)\(\s*"([^"]+)"', path.read_text())
+        for name in re.findall(r'(?:span|explanation\.attempt)\(\s*"([^"]+)"', path.read_text())
     }
     assert len(named) > 10
     assert named <= set(STAGE_PHRASES)

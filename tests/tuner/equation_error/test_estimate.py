@@ -372,7 +372,7 @@ def test_a_plain_regression_takes_the_answer_for_inertia(flown):
 def test_the_search_begins_there_and_leaves_inertia_alone(flown, begun):
     _, settings, _ = flown
     _, job, (finding,) = begun
-    assert job.given.vehicle == settings.vehicle
+    assert job.user_settings.vehicle == settings.vehicle
     assert job.settings.vehicle.inertia.xx == job.accelerations.values["inertia_xx"]
     assert "rotor_inertia" in job.accelerations.values
     assert set(TORQUE_GAINS) <= set(job.space.names)

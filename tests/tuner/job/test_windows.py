@@ -170,7 +170,7 @@ def test_settings_of_coefficients_that_are_not_fitted_are_named(full_flight, ful
     for terms, unused in (("auto", "mass"), ("none", "mass, fuselage_drag")):
         asked = job.settings.job.replace(coefficients=given, terms=terms)
         changed = replace(job.settings, job=asked)
-        findings = check_recordings(replace(job, settings=changed, given=changed))
+        findings = check_recordings(replace(job, settings=changed, user_settings=changed))
         (finding,) = (one for one in findings if one.code is Code.SETTINGS_UNUSED)
         assert finding.subject == unused
 

@@ -27,18 +27,17 @@ class StructuredArray(TabularRecording):
         self._rows = np.load(path)
         super().__init__(path, "numpy", self._rows.dtype.names)
 
-    def read(self, wanted):
-        request = wanted[TABLE_TOPIC]
-        clock = self.clock(request)
+    def read(self, wanted, clocks=()):
+        clock = self.clock(clocks)
         time = (self._rows[clock.field] * clock.nanoseconds).astype(np.int64)
-        fields = {name: self._rows[name].astype(float) for name in request.fields}
+        fields = {name: self._rows[name].astype(float) for name in wanted[TABLE_TOPIC]}
         return ReadResult({TABLE_TOPIC: Samples(time, time, fields)})
 
 
 READER = Reader(
     "numpy",
     ".npy",
-    lambda head: head.start.startswith(b"\\x93NUMPY"),
+    lambda path, start: start.startswith(b"\\x93NUMPY"),
     lambda path, _: StructuredArray(path),
     tabular=True,
 )

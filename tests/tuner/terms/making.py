@@ -88,7 +88,7 @@ def unfitted_with(
     settings = SimpleNamespace(
         job=job or JobFile(), vehicle=vehicle_file(), controller=controller_file()
     )
-    made = Job(settings, recordings, NOISE, space, objective)
+    made = Job(settings, recordings, NOISE, space, objective, settings)
     return made, fitted_of(objective, objective.start(space.initial))
 
 
