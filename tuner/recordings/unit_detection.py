@@ -145,8 +145,6 @@ SCALE_RANGE = (0.45, 1.6)
 """The range of a unit's apparent scale: drag and noise shrink it."""
 MIN_OTHER_UNIT_SCALE = 2.0
 """No flight in metres has a larger apparent scale."""
-MAX_TOO_SMALL_SCALE = 0.1
-"""No flight in metres has a smaller one: a map may say mm of metres."""
 MAX_SPEED_RATIO = 3.0
 """The largest ratio of recorded speed to the position's derivative in the same unit."""
 UNIT_PHRASES = {
@@ -249,7 +247,7 @@ def fits_gravity(
 
 def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
     """Return the unit of `UNITS` of recorded lengths, metres (``si``) if unsure, and a note."""
-    if not scale.sure or MAX_TOO_SMALL_SCALE < scale.per_metre < MIN_OTHER_UNIT_SCALE:
+    if not scale.sure or scale.per_metre < MIN_OTHER_UNIT_SCALE:
         return "si", None
     low, high = SCALE_RANGE
     for unit, name in LENGTH_UNITS.items():

@@ -590,7 +590,6 @@ def test_a_body_rate_in_world_axes_is_turned(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "code"),
     [
-        ({axis: lambda p: 1e-3 * p for axis in ways.XYZ}, NoteCode.UNIT_DOUBTED),
         ({"v": lambda v: 0.0 * v}, NoteCode.VELOCITY_DOUBTED),
         ({"az": lambda a: a - 9.80665}, NoteCode.WEIGHT_NOT_FELT),
     ],
