@@ -187,12 +187,12 @@ def minimised(
     point = np.array(begin, float)
     for _ in range(MAX_ROUNDS):
         sums = _sums_at(made, point, filters, mean=mean, free=free, delays=delays)
-        loss = None if any(delays) else _loss_from(made, point, filters, mean)
+        gain = None if any(delays) else _gain_from(made, point, filters, mean)
         for damping in DAMPINGS:
             change = sums.solved(free, slice(None), damping=damping * unit**-2.0)
             there = np.clip(point + change, low, high)
             in_range = np.abs(change / unit).max() <= MAX_STEP
-            if in_range and (loss is None or loss(there) <= loss(point)):
+            if in_range and (gain is None or gain(there) >= 0.0):
                 break
         else:
             break
@@ -202,29 +202,32 @@ def minimised(
     return point
 
 
-def _loss_from(
+def _gain_from(
     made: ModelAccelerations, point: Array, filters: Filter, mean: Array
 ) -> Callable[[Array], float]:
-    """Return the loss of coordinates (K,), with the filters and spreads of errors at a point."""
+    """Return by how much coordinates (K,) lower the loss, by a point's filters and spreads."""
     column = np.zeros(1, np.intp)  # the kernel with derivatives takes one at least
-    kernels = [filters(one) for one in made.at(point, column)]
     prior = np.array([p.prior_sd for p in made.parameters]) ** -2.0
+    here = made.at(point, column)
+    kernels = [filters(one) for one in here]
 
-    def errors_at(at: Array) -> list[Array]:
+    def errors_of(flights: Sequence[LinearisedAccelerations]) -> list[Array]:
         return [
             convolved(one.errors[:, axis, None], one.steps.known, kernel)[:, 0]
-            for one, of_flight in zip(made.at(at, column), kernels, strict=True)
+            for one, of_flight in zip(flights, kernels, strict=True)
             for axis, kernel in enumerate(of_flight)
         ]
 
-    spreads = [spread(errors) for errors in errors_at(point)]
+    before = errors_of(here)
+    spreads = [spread(errors) for errors in before]
 
-    def loss(at: Array) -> float:
-        pairs = zip(errors_at(at), spreads, strict=True)
-        of_errors = sum(float(huber(HUBER_LIMIT, errors / unit).sum()) for errors, unit in pairs)
+    def loss(errors: Sequence[Array], at: Array) -> float:
+        pairs = zip(errors, spreads, strict=True)
+        of_errors = sum(float(huber(HUBER_LIMIT, own / unit).sum()) for own, unit in pairs)
         return of_errors + 0.5 * float(prior @ (at - mean) ** 2)
 
-    return loss
+    start = loss(before, point)
+    return lambda at: start - loss(errors_of(made.at(at, column)), at)
 
 
 def _sums_at(

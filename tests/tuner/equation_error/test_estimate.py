@@ -436,10 +436,13 @@ def test_rotor_speeds_in_bursts_say_too_little(flown):
     assert with_accelerations(job) == (job, ())
 
 
-def test_flights_that_determine_few_coefficients_do_not_mislead(tmp_path):
+@pytest.mark.parametrize(
+    ("shape", "speed", "seconds"), [("circle", 3.0, 10.0), ("lemniscate", 4.0, 20.0)]
+)
+def test_flights_that_determine_few_coefficients_do_not_mislead(shape, speed, seconds, tmp_path):
     """Commands and poses without noise; many laws are free that it does not determine."""
-    path = tmp_path / "circle.csv"
-    write_csv(tuner.simulate("lemniscate", speed=4.0, duration=10.0), path)
+    path = tmp_path / "flight.csv"
+    write_csv(tuner.simulate(shape, speed=speed, duration=seconds), path)
     columns = pd.read_csv(path)
     fed = [name for name in columns if name.startswith(("ref_", "thrust_"))]
     columns.drop(columns=fed).to_csv(path, index=False)
