@@ -15,26 +15,15 @@ from tests.docs.recorded import write_lab
 
 pytestmark = pytest.mark.slow
 
-FOR_HOURS = "it measures for minutes or hours; `tests/benchmarks` holds its parts"
+FOR_HOURS = re.compile(r"make bench$|(TUNE_LAB_\S+=(\$\(.*\)|\S+) )*python -m benchmarks( |$)")
+"""What measures for minutes or hours, on whichever flights; `tests/benchmarks` holds its parts."""
 NO_NETWORK = "a package index; that the extra exists is tested here"
 NOT_RUN = {
     "make lint": "a minute of mypy; `.ci/run` runs it before the tests",
-    "make bench": FOR_HOURS,
     "make docs": "`test_site.py` runs it",
     "python -m docs.generate": "`make docs` runs it",
     "python -m tests.golden_check FOLDER": "`tests/sim_jax/test_golden.py` runs it",
     "python -m build": "the package index; `test_release.py` calls the backend that it calls",
-    "python -m benchmarks": FOR_HOURS,
-    "python -m benchmarks calibration": FOR_HOURS,
-    "python -m benchmarks prediction": FOR_HOURS,
-    "python -m benchmarks throughput": FOR_HOURS,
-    "TUNE_LAB_EFFECT=none TUNE_LAB_SEEDS=0,1,2,3,4,5,6,7 python -m benchmarks lab --update": (
-        FOR_HOURS
-    ),
-    "TUNE_LAB_KEPT=lab.jsonl TUNE_LAB_SEEDS=$(seq -s, 300 319) python -m benchmarks lab --update": (
-        FOR_HOURS
-    ),
-    "TUNE_LAB_SEEDS=0 TUNE_LAB_EFFECT=thrust_exponent python -m benchmarks lab": FOR_HOURS,
     "python examples/published_experiments.py": "`tests/examples` runs it",
     "pytest tests/tuner/ground/test_coverage.py": "one of these tests",
     "pytest tests/tuner/uncertainty/test_monte_carlo.py": "one of these tests",
@@ -68,7 +57,14 @@ INSTALL = commands(DOCS / "tutorials" / "install.md", Family.SET_UP)
 """`tests.test_release` follows this page, in an environment of its own."""
 AT_LENGTH = "python -m benchmarks.targets RUN"
 """What fits effective coefficients for each simulator, as `tests/tuner/exporters` does for some."""
-RUN = ["make demo", *(line for line in SHOWN if line not in (*NOT_RUN, *INSTALL, AT_LENGTH))]
+RUN = [
+    "make demo",
+    *(
+        line
+        for line in SHOWN
+        if line not in (*NOT_RUN, *INSTALL, AT_LENGTH) and not FOR_HOURS.match(line)
+    ),
+]
 
 
 @pytest.fixture(scope="module")
