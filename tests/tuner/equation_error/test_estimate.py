@@ -28,8 +28,10 @@ from tuner.equation_error.regression import (
     NO_DELAYS,
     NormalEquations,
     Regression,
+    _plain,
     feedback_bias,
     filtered_sums,
+    minimised,
     regress,
     whitening,
 )
@@ -204,6 +206,32 @@ def test_moments_count_only_beside_earlier_errors():
         np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9)
     own = plain[3].sum(axis=0)
     np.testing.assert_allclose(own, own.T, rtol=1e-12)
+
+
+def test_each_step_of_a_regression_lowers_its_loss():
+    """Of a saturated response, a full step from its flat part leads farther and farther away."""
+    random, size = np.random.default_rng(0), 600
+    parameter = SimpleNamespace(
+        prior_sd=1e4, prior_mean=0.0, usual=100.0, lower=-99.0, upper=99.0, scaled=lambda x: x
+    )
+    inputs = np.repeat(random.normal(size=(size, 1)), 6, axis=1)
+    seen = []
+
+    def at(point, *_):
+        seen.append(float(point[0]))
+        return (
+            LinearisedAccelerations(
+                SimpleNamespace(step=0.01, known=np.ones(size, bool)),
+                inputs * (np.arctan(0.5) - np.arctan(point[0])),
+                inputs[:, :, None] / (1.0 + point[0] ** 2),
+            ),
+        )
+
+    made = SimpleNamespace(at=at, parameters=(parameter,), flights=(None,))
+    mean, free = np.zeros(1), np.ones(1, bool)
+    (reached,) = minimised(made, np.array([2.5]), _plain, mean=mean, free=free)
+    assert max(np.abs(seen)) > 2.5  # a full step goes beyond, and is not taken
+    assert reached == pytest.approx(0.5, abs=0.2)
 
 
 @pytest.fixture
