@@ -14,6 +14,7 @@ from itertools import permutations
 from typing import Literal
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
@@ -131,8 +132,9 @@ def levers(vehicle: VehicleFile) -> Array:
 
 
 def _smoothed(values: Array) -> Array:
-    kernel = np.ones(SMOOTHING_SAMPLES) / SMOOTHING_SAMPLES
-    return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
+    """Return the moving average (n, k) of (n, k), whose first and last values go on at the ends."""
+    around = np.pad(values, ((SMOOTHING_SAMPLES // 2,) * 2, (0, 0)), mode="edge")
+    return np.asarray(np.mean(sliding_window_view(around, SMOOTHING_SAMPLES, axis=0), axis=-1))
 
 
 def _correlations(turning: Array, torque: Array) -> Array:

@@ -12,7 +12,7 @@ from benchmarks import fast_flights
 from tuner.config import Options, resolve_settings
 from tuner.findings.findings import Code
 from tuner.job.check import _motor_orders
-from tuner.objective.rotor_signals import order_findings
+from tuner.objective.rotor_signals import motor_order, order_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
 from tuner.search.input_lag import Lag, _is_late, input_lag, with_input_lags
@@ -133,6 +133,16 @@ def test_a_signal_that_is_stamped_late_is_named(source, late, broadband, updated
     assert [(one.code, one.names) for one in found] == [(Code.STAMPED_LATE, (source,))] * bool(late)
     for one in found:
         assert one.numbers["seconds"] == pytest.approx(late, abs=0.03)
+
+
+def test_the_order_is_seen_where_a_recording_begins_and_ends_during_a_turn(broadband, updated):
+    rate = broadband.series["body_rate"]
+    turning = Series(rate.time, rate.values + np.array([2.0, 1.0, 0.5]))
+    series, span = {**broadband.series, "body_rate": turning}, (0.0, broadband.duration)
+    for source in ("command", "rotor_speed"):
+        order = motor_order(series, updated, source, span)
+        assert order is not None
+        assert order.is_right
 
 
 def test_the_order_of_measured_speeds_is_seen_in_how_they_turn_the_vehicle(broadband, updated):
