@@ -161,7 +161,7 @@ def ranked_set(kind: Kind, seed: int) -> RankedSet:
     while flown is None:
         truth = draw_truth(objective.space, random)
         flown = simulate_like(objective, truth, random, gusts=kind.gusts)
-    found = fitted(flown.objective)
+    found = fitted(flown)
     error = uncertainty_of(found).covariance.error
     space = objective.space
     true, best = (np.asarray(space.scaled(jnp.asarray(v))) for v in (truth, _vector(found)))

@@ -51,10 +51,8 @@ def oracle_error(
         flown = simulate_like(fitted.objective, truth, random, gusts=gusts, log_voltage=volts)
         if flown is None:
             continue
-        at_truth = flown.objective.start(truth)
-        found = information_at(flown.objective, at_truth, criterion, offsets_fitted=moved).about(
-            free
-        )
+        at_truth = flown.start(truth)
+        found = information_at(flown, at_truth, criterion, offsets_fitted=moved).about(free)
         score = found.score.sum(axis=(0, 1, 2))
         steps.append(Inverse.of(found.total, found.given).matrix @ score)
     errors = np.sqrt(np.mean(np.square(steps), axis=0))

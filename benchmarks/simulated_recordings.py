@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -14,45 +13,12 @@ from benchmarks.air import air
 from sim_jax.environment import Disturbance
 from sim_jax.numeric import Array as JaxArray
 from sim_jax.rollout import rollout
-from sim_jax.state import Setpoints
 from tuner.core.numerics import Array
-from tuner.disturbances.ticks import SETPOINTS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import CLOCKS, OFFSETS, Measured
 from tuner.objective.simulation import beginning_of, recorded_of
-from tuner.recordings.flight import Flight, Series
 from tuner.vehicle.model import Model
-
-
-@dataclass(frozen=True)
-class SimulatedFlights:
-    """Flights of a problem.
-
-    Attributes
-    ----------
-    setpoints
-        What asked for their body rates (3, samples, F) and thrust.
-    """
-
-    objective: Objective
-    setpoints: Setpoints
-
-    def with_setpoints(self, flights: Sequence[Flight]) -> list[Flight]:
-        """Return flights, in the order of the segments, whose recorded set-points are these."""
-        schedule = self.objective.schedule
-        every = schedule.log_rate // schedule.position_control_rate
-        stamps = np.arange(0, self.objective.samples, every) / schedule.log_rate
-        table = np.asarray(
-            jnp.concatenate([self.setpoints.rate.stacked(), self.setpoints.thrust[None]])
-        )
-        again = []
-        for number, flight in enumerate(flights):
-            rows = table[:, ::every, number].T
-            parts = zip(SETPOINTS, (rows[:, :3], rows[:, 3:]), strict=True)
-            series = {name: Series(stamps, values) for name, values in parts}
-            again.append(replace(flight, series={**flight.series, **series}))
-        return again
 
 
 def simulate_like(
@@ -62,7 +28,7 @@ def simulate_like(
     *,
     gusts: bool,
     log_voltage: Array | None = None,
-) -> SimulatedFlights | None:
+) -> Objective | None:
     """Return a problem with recordings of its flights at a truth, stamped and noisy as its own.
 
     Parameters
@@ -76,7 +42,7 @@ def simulate_like(
 
     Returns
     -------
-    Flown or None
+    Objective or None
         None where a flight crashed.
     """
     model = objective.model_at(vector)
@@ -85,7 +51,7 @@ def simulate_like(
     if log_voltage is not None:
         segments = replace(objective.segments, log_voltage=jnp.asarray(log_voltage))
         flown = replace(objective, segments=segments)
-    channels, crash_time, setpoints = _flown(model, flown, pushing)
+    channels, crash_time = _flown(model, flown, pushing)
     if bool(jnp.isfinite(crash_time).any()):
         return None
     still = np.zeros((len(OFFSETS), objective.segments.count))
@@ -100,7 +66,7 @@ def simulate_like(
         noisy = _rotate(clean, noise) if channel == "attitude" else clean + noise
         measured[channel] = Measured(old.time, jnp.asarray(noisy), old.weight)
     segments = replace(objective.segments, measured=measured)
-    return SimulatedFlights(replace(objective, segments=segments), setpoints)
+    return replace(objective, segments=segments)
 
 
 def _air(objective: Objective, model: Model, random: np.random.Generator) -> Disturbance:
@@ -121,8 +87,8 @@ def _air(objective: Objective, model: Model, random: np.random.Generator) -> Dis
 @eqx.filter_jit
 def _flown(
     model: Model, objective: Objective, pushing: Disturbance | None
-) -> tuple[dict[str, JaxArray], JaxArray, Setpoints]:
-    """Return channel -> (samples, columns, F), the times (F,) of crashes, and the set-points."""
+) -> tuple[dict[str, JaxArray], JaxArray]:
+    """Return channel -> (samples, columns, F) and the times (F,) of crashes."""
     segments = objective.segments
     start, inlet, around = beginning_of(model, segments, objective.schedule)
     flown = rollout(
@@ -136,7 +102,7 @@ def _flown(
         limits=objective.limits,
     )
     channels = recorded_of(flown.log, model, around, {}, segments.measured)
-    return channels, flown.crash_time, flown.log.setpoints
+    return channels, flown.crash_time
 
 
 def _rotate(attitude: Array, by: Array) -> Array:

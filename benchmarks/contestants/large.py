@@ -44,7 +44,7 @@ def flights(count: int) -> Objective:
     flown = simulate_like(many, many.space.initial, np.random.default_rng(0), gusts=False)
     if flown is None:
         raise SystemExit("a flight at the initial coefficients crashed")
-    return flown.objective
+    return flown
 
 
 def main(count: int) -> None:
