@@ -17,7 +17,7 @@ from fastapi import APIRouter, Form, Query, Request
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from pydantic import TypeAdapter, ValidationError
 from starlette.datastructures import FormData
-from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
@@ -238,16 +238,6 @@ def _submit(service: Service, form: FormData) -> Response:
         return _start(service, chosen, given=text, problem=str(error), status=status)
     service.dispatcher.call()
     return RedirectResponse(f"/jobs/{row.id}", status_code=303)
-
-
-@web.post("/settings")
-def read_settings(settings: Annotated[str, Form()] = "") -> Response:
-    """Return the held-out flights of typed or dropped settings, or the error in them."""
-    try:
-        held = _form_values(typed_settings(settings))
-    except InputError as error:
-        return JSONResponse({"holdout": [], "problem": on_the_web(str(error))})
-    return JSONResponse({"holdout": held, "problem": ""})
 
 
 def _form_values(settings: Mapping[str, Any]) -> list[str]:

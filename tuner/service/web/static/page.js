@@ -38,42 +38,15 @@
   const start = document.getElementById("start");
   input.multiple = true;
 
-  // flights that the settings hold out: marked on their cards as soon as they are known
-  const area = document.querySelector("textarea[name=settings]");
-  const told = document.getElementById("held");
-  const shown = document.querySelector("input[name=holdout]");
-  let held = shown.value.split(" ").filter(Boolean);
-  const mark = (card) => {
-    if (held.includes(card.dataset.flight)) card.querySelector("input[value=holdout]").checked = true;
-  };
-  const readSettings = async () => {
-    const data = new FormData();
-    data.append("settings", area.value);
-    let found;
-    try {
-      const answer = await fetch("/settings", { method: "POST", body: data, headers: { "X-Requested-With": "script" } });
-      if (!answer.ok) return;
-      found = await answer.json();
-    } catch { return; /* Start reads them, too */ }
-    for (const card of chosen.querySelectorAll("[data-flight]")) {
-      if (held.includes(card.dataset.flight) && !found.holdout.includes(card.dataset.flight)) {
-        card.querySelector("input[value=fit]").checked = true;
-      }
-    }
-    held = found.holdout;
-    chosen.querySelectorAll("[data-flight]").forEach(mark);
-    shown.value = held.join(" ");
-    told.className = found.problem ? "problem" : "";
-    told.textContent = found.problem || (held.length ? `The settings hold out ${held.join(", ")}: to check the fit.` : "");
-  };
-  area.addEventListener("change", readSettings);
+  // flights that the settings hold out, as the server has answered: later cards are marked, too
+  const held = document.querySelector("input[name=holdout]").value.split(" ").filter(Boolean);
 
   const show = (html) => {
     const made = document.createRange().createContextualFragment(html).querySelector("[data-recording]");
     if (!made) return;
     const before = chosen.querySelector(`[data-recording="${CSS.escape(made.dataset.recording)}"]`);
     if (before) before.replaceWith(made); else chosen.append(made);
-    mark(made);
+    if (held.includes(made.dataset.flight)) made.querySelector("input[value=holdout]").checked = true;
     delete start.dataset.waits;
   };
   const send = (file) => new Promise((done) => {
@@ -121,9 +94,9 @@
     for (const file of files) {
       if (/\.ya?ml$/i.test(file.name)) {
         file.text().then((text) => {
+          const area = document.querySelector("textarea[name=settings]");
           area.value = text;
           area.closest("details").open = true;
-          return readSettings();
         });
       } else queue = queue.then(() => send(file));
     }
