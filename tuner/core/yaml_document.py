@@ -99,7 +99,7 @@ def document_of(raw: bytes, path: Path) -> Document:
     Raises
     ------
     ConfigError
-        It is not YAML, has a key twice, or expands without bound.
+        It is not YAML, has a key twice, or is too long once its aliases are written out.
     """
     try:
         loader = _Loader(raw.decode("utf-8-sig"))
@@ -108,6 +108,8 @@ def document_of(raw: bytes, path: Path) -> Document:
             return Document(path, {}, {})
         lines: dict[Place, int] = {}
         _check(path, node, (), lines, ())
+        if _length(node) > MAX_BYTES:  # aliases repeat a long word
+            raise ConfigError(path, "holds more than 1 MB of text", "write short values out")
         return Document(path, loader.construct_document(node), lines)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -149,6 +151,11 @@ def _children(node: yaml.Node) -> list[yaml.Node]:
     if isinstance(node, yaml.MappingNode):
         return [child for pair in node.value for child in pair]
     return list(node.value) if isinstance(node, yaml.SequenceNode) else []
+
+
+def _length(node: yaml.Node) -> int:
+    """Return the number of characters of all keys and values, aliases written out."""
+    return sum(map(_length, _children(node))) or len(node.value)
 
 
 def _check(

@@ -94,6 +94,8 @@ def test_aliases_that_multiply_are_refused_before_they_do(tmp_path):
     levels = ["a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]"]
     levels += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12)]
     assert re.search("holds more than 100000 values", refusal(tmp_path, "\n".join(levels)))
+    text = f"a: &a {'x' * 100_000}\nholdout: [{'*a, ' * 20_000}]\n"  # two gigabytes
+    assert "holds more than 1 MB of text" in refusal(tmp_path, text)
 
 
 def test_a_missing_file_and_a_folder_are_named(tmp_path):
