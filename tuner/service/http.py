@@ -199,7 +199,7 @@ async def _received(request: Request) -> Upload:
     settings = service_of(request).settings
     kind = request.headers.get("content-type", "")
     try:
-        return await receive(request.stream(), kind, settings.incoming, settings.limits)
+        return await receive(request.stream(), kind, settings.incoming, settings.limits.free_bytes)
     except ClientDisconnect:
         raise InputError("upload", "was cut off", "upload the recording again") from None
 

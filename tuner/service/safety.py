@@ -12,8 +12,10 @@ import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
+from http import HTTPStatus
 from urllib.parse import urlsplit
 
+import anyio
 import anyio.to_thread
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
@@ -36,6 +38,8 @@ PROXY_HEADERS = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip"
 """Headers by which a request shows that it came through a proxy."""
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
 UPLOAD_PATHS = ("/api/v1/recordings", "/recordings")
+FORM_BYTES = 2**16
+"""Bytes around the recording of an upload."""
 CURRENT_VISITOR: ContextVar[str | None] = ContextVar("VISITOR", default=None)
 """The owner of the current request's session."""
 MAX_VISITORS = 10_000
@@ -95,7 +99,8 @@ class Guard:
             await answer(scope, receive, send_with_headers)
         finally:
             route = getattr(scope.get("route"), "path", "none")
-            labels = (scope["method"] if route != "none" else "any", route, str(status))
+            is_known = route != "none" and status != HTTPStatus.METHOD_NOT_ALLOWED
+            labels = (scope["method"] if is_known else "any", route, str(status))
             self._metrics.seconds.labels(*labels).observe(time.perf_counter() - began)
 
     async def _check(self, request: Request) -> None:
@@ -134,21 +139,41 @@ class Guard:
         return tokens.logged_in(database, session) if session and is_ours else None
 
     async def _body(self, request: Request, receive: Receive) -> Receive:
-        """Return a function that passes on a body of limited size once it is complete."""
-        if request.url.path in UPLOAD_PATHS or request.method in SAFE_METHODS:
-            return receive  # a file is counted as it is taken apart
-        most, body, more = self._service.settings.limits.body_bytes, b"", True
+        """Return a function that passes on a body of limited size that does not come too slowly.
+
+        Any but a recording's is complete before.
+        """
+        if request.method in SAFE_METHODS:
+            return receive
+        limits, is_upload = self._service.settings.limits, request.url.path in UPLOAD_PATHS
+        most = limits.upload_bytes if is_upload else limits.body_bytes
+        began, size, more = time.monotonic(), 0, True
+
+        async def part() -> Message:
+            nonlocal size, more
+            if not more:
+                return await receive()
+            credit = began + size / limits.bytes_per_second - time.monotonic()
+            try:
+                with anyio.fail_after(limits.stall_seconds + min(0.0, credit)):
+                    message = await receive()
+            except TimeoutError:
+                raise ServiceError("the request", "came too slowly", "send it again") from None
+            size, more = size + len(message.get("body", b"")), message.get("more_body", False)
+            if size > most + is_upload * FORM_BYTES:
+                what = f"is larger than the {size_in_words(most)} that this server takes"
+                remedy = "split recordings, or leave out topics such as images"
+                raise TooLargeError("the request", what, remedy)
+            return message
+
+        if is_upload:
+            return part
+        parts = [await part()]
         while more:
-            message = await receive()
-            body += message.get("body", b"")
-            more = message.get("more_body", False)
-            if len(body) > most:
-                what = f"is larger than {size_in_words(most)}"
-                raise TooLargeError("the request", what, "send recordings as uploads")
-        parts: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+            parts.append(await part())
 
         async def replay() -> Message:
-            return parts.pop() if parts else await receive()
+            return parts.pop(0) if parts else await receive()
 
         return replay
 

@@ -23,8 +23,8 @@ class Limits:
         Of any other request.
     uploads_at_once
         Recordings that are received at the same time, of all visitors together.
-    stall_seconds
-        After which an upload of which nothing arrives is cut off, and its place is free.
+    stall_seconds, bytes_per_second
+        After which a request of which nothing arrives is cut off, and how fast it must arrive.
     recordings
         Stored recordings, of all visitors together.
     recordings_of_job
@@ -51,6 +51,7 @@ class Limits:
     body_bytes: int = 1 * MIB
     uploads_at_once: int = 16
     stall_seconds: float = 60.0
+    bytes_per_second: float = 16e3
     recordings: int = 100_000
     recordings_of_job: int = 64
     unfinished_jobs: int = 20_000

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import secrets
+import shutil
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-import anyio
 import anyio.to_thread
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from tuner.core.errors import InputError
-from tuner.service.errors import TooLargeError, full_disk
+from tuner.service.errors import full_disk
 from tuner.service.names import shown_name
-from tuner.service.settings import Limits, size_in_words
 
 BUFFER_BYTES = 2**20
 """bytes that are gathered before they are hashed and written"""
@@ -46,14 +46,14 @@ class Upload:
 class _Receiver:
     """Callbacks of a request's parser, which write the first file of the field."""
 
-    def __init__(self, path: Path, most: int) -> None:
+    def __init__(self, path: Path, free_bytes: int) -> None:
         self.name: str | None = None
         self.complete = False
         self.size = 0
         self.hash = hashlib.sha256()
         self.buffer = bytearray()
         self.path = path
-        self._most = most
+        self._free_bytes = free_bytes
         self._file: IO[bytes] | None = None
         self._header = bytearray()
         self._value = bytearray()
@@ -92,10 +92,6 @@ class _Receiver:
         if not self._is_ours:
             return
         self.size += end - start
-        if self.size > self._most:
-            what = f"is larger than the {size_in_words(self._most)} that this server takes"
-            remedy = "split it, or leave out topics such as images"
-            raise TooLargeError("the recording", what, remedy)
         self.buffer += data[start:end]
 
     def _on_part_end(self) -> None:
@@ -103,8 +99,10 @@ class _Receiver:
         self._is_ours = False
 
     def flush(self) -> None:
-        """Hash and write the buffer."""
+        """Hash and write the buffer, unless others need what is free on the disk."""
         with full_disk():
+            if shutil.disk_usage(self.path.parent).free < self._free_bytes:
+                raise OSError(errno.ENOSPC, "")
             if self._file is None:
                 self._file = self.path.open("xb")
             self.hash.update(self.buffer)
@@ -119,7 +117,7 @@ class _Receiver:
 
 
 async def receive(
-    stream: AsyncIterator[bytes], content_type: str, folder: Path, limits: Limits
+    stream: AsyncIterator[bytes], content_type: str, folder: Path, free_bytes: int
 ) -> Upload:
     """Write the file of a request to the disk, and return where it lies.
 
@@ -127,38 +125,32 @@ async def receive(
     ----------
     folder
         For files that are not complete; nothing is left there if anything fails.
+    free_bytes
+        Left on its disk, below which nothing more is taken.
 
     Raises
     ------
     InputError
         The request holds no file, or not all of one.
-    TooLargeError, NoSpaceError
-        The file is too large, or the disk is full.
+    NoSpaceError
+        The disk is full.
     """
     kind, options = parse_options_header(content_type)
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data" or not boundary:
         raise InputError("upload", "is no form", REMEDY)
-    receiver = _Receiver(folder / secrets.token_hex(16), limits.upload_bytes)
+    receiver = _Receiver(folder / secrets.token_hex(16), free_bytes)
     path = receiver.path
     try:
         try:
             parser = MultipartParser(boundary, receiver.callbacks())  # type: ignore[arg-type]
-            chunks = aiter(stream)
-            while True:
-                with anyio.fail_after(limits.stall_seconds):
-                    chunk = await anext(chunks, None)
-                if chunk is None:
-                    break
+            async for chunk in stream:
                 parser.write(chunk)
                 if len(receiver.buffer) >= BUFFER_BYTES:
                     await anyio.to_thread.run_sync(receiver.flush)
             await anyio.to_thread.run_sync(receiver.flush)
         except FormParserError:
             raise InputError("upload", "is no form that can be read", REMEDY) from None
-        except TimeoutError:
-            what = f"stopped: nothing arrived for {limits.stall_seconds:g} s"
-            raise InputError("upload", what, "upload the recording again") from None
         finally:
             receiver.close()
         if receiver.name is None:

@@ -300,7 +300,9 @@ def test_an_earlier_job_s_vehicle_is_known_by_its_name(client, recording, update
 def test_health_and_counters(client, recording):
     ended(client, submit(client, recording))
     assert client.get("/healthz").json()["status"] == "ok"
+    assert client.request("INVENTED", "/healthz").status_code == 405
     text = client.get("/metrics").text
+    assert "INVENTED" not in text  # each would be counted on its own
     assert 'tune_jobs{state="done"} 1.0' in text
     assert 'route="/api/v1/jobs/{job}"' in text
     assert "tune_uploaded_bytes_total" in text

@@ -2,11 +2,15 @@
 
 import hashlib
 import re
+import shutil
 import socket
 import sys
 import threading
+import time
+from contextlib import suppress
 from dataclasses import replace
 from http.client import HTTPResponse
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import httpx
@@ -131,9 +135,10 @@ def test_a_recording_that_needs_too_much_memory_is_stopped(tmp_path, monkeypatch
 def test_a_file_beyond_the_limit_is_refused_before_it_is_all_there(settings, table):
     service = Service.open(replace(settings, limits=replace(LIMITS, upload_bytes=MIB)))
     with listening(service) as client:
-        answer = send(client, bytes(3 * MIB))
-        assert answer.status_code == 413
-        assert "is larger than the 1 MiB that this server takes" in answer.text
+        for field in ("file", "other"):
+            answer = client.post("/api/v1/recordings", files={field: ("x", bytes(3 * MIB))})
+            assert answer.status_code == 413
+            assert "is larger than the 1 MiB that this server takes" in answer.text
         assert left(service) == []
         upload(client, table.read_bytes())
     service.close()
@@ -143,7 +148,7 @@ def test_another_request_beyond_the_limit_is_refused(client):
     body = b'{"recordings": ["' + b"0" * (2 * MIB) + b'"]}'
     answer = client.post("/api/v1/jobs", content=body, headers={"content-type": "application/json"})
     assert answer.status_code == 413
-    assert answer.json()["detail"].startswith("the request: is larger than 1 MiB")
+    assert answer.json()["detail"].startswith("the request: is larger than the 1 MiB")
 
 
 @pytest.mark.parametrize(
@@ -184,16 +189,24 @@ BEGINNING = (
 )
 
 
-def test_an_upload_that_stalls_is_cut_off_and_makes_room(settings, table):
-    limits = replace(LIMITS, uploads_at_once=1, stall_seconds=0.2)
+@pytest.mark.parametrize(("drops", "path"), [(0, "recordings"), (90, "recordings"), (90, "jobs")])
+def test_a_request_that_stalls_or_drips_is_cut_off_and_makes_room(settings, table, drops, path):
+    limits = replace(LIMITS, uploads_at_once=1, stall_seconds=0.3, bytes_per_second=1e9)
     service = Service.open(replace(settings, limits=limits, workers=0))
     with listening(service) as client:
         url = urlsplit(str(client.base_url))
         with socket.create_connection((url.hostname, url.port), timeout=20.0) as connection:
-            connection.sendall(BEGINNING + bytes(4_000_000))
+            connection.sendall(BEGINNING.replace(b"recordings", path.encode(), 1) + bytes(900_000))
+            with suppress(BrokenPipeError, ConnectionResetError):
+                for _ in range(drops):
+                    connection.sendall(b"x")
+                    time.sleep(0.01)
             answer = HTTPResponse(connection)
             answer.begin()
-            assert (answer.status, b"nothing arrived for 0.2 s" in answer.read()) == (422, True)
+            assert (answer.status, b"came too slowly; send it again" in answer.read()) == (
+                422,
+                True,
+            )
         assert left(service) == []
         upload(client, table.read_bytes())
 
@@ -236,6 +249,21 @@ def test_a_disk_that_is_nearly_full_takes_nothing_more(settings, table):
         assert health.status_code == 503
         assert health.json()["status"] == "failing"
         assert health.json()["uploads"] == "has no space left"
+    service.close()
+
+
+def test_an_upload_leaves_free_what_jobs_need(settings, table, monkeypatch):
+    service = Service.open(replace(settings, limits=replace(LIMITS, free_bytes=5 * MIB), workers=0))
+
+    def of_ten_mib(_: object) -> SimpleNamespace:
+        taken = sum(file.stat().st_size for file in settings.incoming.iterdir())
+        return SimpleNamespace(free=10 * MIB - taken)
+
+    monkeypatch.setattr(shutil, "disk_usage", of_ten_mib)
+    with listening(service) as client:
+        assert send(client, bytes(9 * MIB)).status_code == 507
+        assert left(service) == []
+        upload(client, table.read_bytes())
     service.close()
 
 
