@@ -115,7 +115,7 @@ async def _http(request: Request, error: Exception) -> Response:
 
 
 async def _fault(request: Request, error: Exception) -> Response:
-    logger.error("%s %s", request.method, request.url.path, exc_info=error)
+    logger.error("%s %r", request.method, request.url.path, exc_info=error)
     what = f"internal error ({type(error).__name__})"
     return _problem(request, 500, "the server", what, "please report it, with its log")
 
@@ -220,6 +220,7 @@ def _serve(service: Service, *, host: str, port: int, say: Callable[[str], None]
         create_app(service),
         host=host,
         port=port,
+        http="h11",  # whose headers are bounded
         log_level="warning",
         access_log=False,
         server_header=False,

@@ -16,8 +16,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
+from pydantic import ValidationError
+
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import digest_of, inside
+from tuner.core.errors import InputError
 from tuner.report.outcome import outcome
 from tuner.result import CHECKPOINTS, ExportRecords, RunResult
 from tuner.service.errors import full_disk
@@ -49,10 +52,14 @@ def prepare(folder: Path, claim: Claim, store: ContentStore) -> CheckedRequest:
 
     Raises
     ------
-    NoSpaceError
-        The disk is full.
+    InputError
+        The request is of another version of tune, or the disk is full.
     """
-    asked = CheckedRequest.model_validate(claim.request)
+    try:
+        asked = CheckedRequest.model_validate(claim.request)
+    except ValidationError:
+        what = "was submitted to another version of tune"
+        raise InputError("the job", what, "submit it again") from None
     with full_disk():
         shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
         (folder / FLIGHTS).mkdir(parents=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 from alembic import command
 from alembic.config import Config
+from alembic.util.exc import CommandError
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -48,14 +49,18 @@ class Database:
 
         Raises
         ------
-        UnavailableError
-            The database cannot be reached.
+        InputError
+            The database cannot be reached, or is of a newer version.
         """
         config = Config()
         config.set_main_option("script_location", "tuner.service:migrations")
-        with _outages(), self._writer.begin() as connection:
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+        try:
+            with _outages(), self._writer.begin() as connection:
+                config.attributes["connection"] = connection
+                command.upgrade(config, "head")
+        except CommandError:
+            what = "was made by a newer version of tune"
+            raise InputError("the database", what, "use that version, or another --data") from None
 
     @contextmanager
     def reading(self) -> Iterator[Session]:
@@ -116,6 +121,8 @@ def _outages() -> Iterator[None]:
             what, remedy = "is locked by another program", "close that, or try again in a minute"
         elif "disk is full" in words or "No space left" in words:
             what, remedy = "cannot be written: the disk is full", "free some space and try again"
+        elif "not a database" in words or "malformed" in words:
+            what, remedy = "is damaged, or no database", "restore it from a copy"
         elif error.connection_invalidated or type(error).__name__ in _OUTAGES:
             what, remedy = "cannot be reached", "check that it runs, and try again"
         else:

@@ -230,7 +230,7 @@ def post_job(
     response: Response,
     idempotency_key: Annotated[str | None, Header(max_length=200, pattern="^[!-~]+$")] = None,
 ) -> Accepted:
-    """Submit a job; a second request with the same ``Idempotency-Key`` is the same job."""
+    """Submit a job; the same request with the same ``Idempotency-Key`` is the same job."""
     row, is_new = jobs.submit(
         service.database, request, service.settings.limits, submission=idempotency_key
     )
@@ -248,8 +248,6 @@ def get_jobs(
     after: Annotated[str | None, Query(max_length=64)] = None,
 ) -> JobPage:
     """Return a page of jobs, the newest first."""
-    if vehicle is not None and not vehicle.isprintable():
-        return JobPage(jobs=[], next=None)
     rows, following = jobs.page(service.database, vehicle=vehicle, state=state, after=after)
     return JobPage(jobs=[JobAnswer.model_validate(row) for row in rows], next=following)
 
@@ -354,7 +352,7 @@ def get_files(service: ServiceOfApp, row: JobOfPath) -> StreamingResponse:
     return StreamingResponse(blocks, media_type="application/zip", headers=headers)
 
 
-@api.get("/vehicles/{name}/history", responses=NOT_FOUND)
+@api.get("/vehicles/{name:path}/history", responses=NOT_FOUND)
 def get_history(service: ServiceOfApp, name: str) -> History:
     """Return each coefficient over a vehicle's jobs, with intervals."""
     return history(service.database, name)

@@ -18,8 +18,8 @@ from tuner.core.runtime import THREAD_VARIABLES
 from tuner.service.settings import Limits, limit_process, size_in_words
 
 SPLIT_REMEDY = "split the recording, or leave topics out that are not needed (images, point clouds)"
-MAX_JSON_BYTES = 20_000_000
-"""bytes of an inspection"""
+MAX_JSON_LETTERS = 1_000_000
+"""letters of an inspection, which pages show"""
 
 
 def inspect(file: Path, limits: Limits) -> dict[str, Any]:
@@ -52,7 +52,7 @@ def inspect(file: Path, limits: Limits) -> dict[str, Any]:
     if done.returncode == 3:
         what = f"needs more than {size_in_words(limits.inspection_memory_bytes)} of memory to read"
         raise RecordingError(file.name, what, SPLIT_REMEDY)
-    if done.returncode != 0 or len(done.stdout) > MAX_JSON_BYTES:
+    if done.returncode != 0:
         raise RecordingError(
             file.name, "cannot be read: its reader was stopped", "is it a recording of a flight?"
         )
@@ -73,11 +73,12 @@ def main() -> None:
         inspections, errors = inspect_recordings([Path(file)], cache=False)
     except MemoryError:
         sys.exit(3)
+    text = as_json(inspections)
+    if len(text) > MAX_JSON_LETTERS:
+        errors = (RecordingError(file, "holds too many topics to list", SPLIT_REMEDY),)
     if errors:
-        refused = {"what": errors[0].what, "remedy": errors[0].remedy}
-        sys.stdout.write(json.dumps({"refused": refused}))
-    else:
-        sys.stdout.write(as_json(inspections))
+        text = json.dumps({"refused": {"what": errors[0].what, "remedy": errors[0].remedy}})
+    sys.stdout.write(text)
 
 
 if __name__ == "__main__":

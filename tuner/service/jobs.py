@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import hashlib
 import re
 import secrets
 import time
@@ -47,15 +48,19 @@ def submit(
     limits
         On recordings of one job and on unfinished jobs.
     submission
-        A key of this request; a second one with the same key is answered with the same job.
+        A key of this request; the same one with the same key is answered with the same job.
 
     Raises
     ------
     InputError
         The request cannot be met; one line says what to do.
     """
-    if submission is not None and (before := _submitted(database, submission)) is not None:
-        return before, False
+    if submission is not None:
+        submission = hashlib.sha256(
+            f"{submission}\n{request.model_dump_json()}".encode()
+        ).hexdigest()
+        if (before := _submitted(database, submission)) is not None:
+            return before, False
     with database.reading() as session:
         recordings = _recordings(session, request.recordings, limits)
         unfinished = session.scalar(
@@ -179,6 +184,8 @@ def page(
         There is no job ``after``.
     """
     statement = select(JobRow).order_by(JobRow.number.desc()).limit(limit + 1)
+    if vehicle is not None and not vehicle.isprintable():
+        return [], None
     if vehicle is not None:
         statement = statement.where(JobRow.vehicle == vehicle)
     if state is not None:

@@ -12,6 +12,7 @@ from typing import Any
 
 from sqlalchemy import func, select
 from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import defer
 
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import inside
@@ -102,10 +103,13 @@ def flight_name(name: str) -> str:
 
 
 def latest(database: Database, most: int) -> Sequence[RecordingRow]:
-    """Return the recordings that were uploaded last."""
+    """Return the recordings that were uploaded last, without their inspections."""
     with database.reading() as session:
         return session.scalars(
-            select(RecordingRow).order_by(RecordingRow.uploaded.desc()).limit(most)
+            select(RecordingRow)
+            .options(defer(RecordingRow.inspection))
+            .order_by(RecordingRow.uploaded.desc())
+            .limit(most)
         ).all()
 
 

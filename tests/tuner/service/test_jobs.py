@@ -208,7 +208,9 @@ def test_the_same_submission_twice_is_one_job(client, recording):
     assert len({answer.json()["id"] for answer in answers}) == 1
     assert sum("idempotent-replayed" in answer.headers for answer in answers) == 7
     other = client.post("/api/v1/jobs", json=body)
-    assert other.json()["id"] != answers[0].json()["id"]
+    changed = body | {"mass": 2.5}  # as on a page that the browser went back to
+    heavier = client.post("/api/v1/jobs", json=changed, headers={"Idempotency-Key": "abc"})
+    assert len({answer.json()["id"] for answer in (answers[0], other, heavier)}) == 3
 
 
 def test_a_list_is_narrowed_by_vehicle_and_state(client, recording):
@@ -291,10 +293,12 @@ def test_what_happens_again_after_the_preamble_is_said_again(idle):
 
 
 def test_an_earlier_job_s_vehicle_is_known_by_its_name(client, recording, updated):
-    own = updated.model_dump(mode="json", exclude_none=True) | {"name": "quad 7"}
+    own = updated.model_dump(mode="json", exclude_none=True) | {"name": "quad 7/8"}
     submit(client, recording, vehicle=own)
-    ended(client, submit(client, recording, vehicle="quad 7"))
-    assert len(client.get("/api/v1/jobs", params={"vehicle": "quad 7"}).json()["jobs"]) == 2
+    ended(client, submit(client, recording, vehicle="quad 7/8"))
+    assert len(client.get("/api/v1/jobs", params={"vehicle": "quad 7/8"}).json()["jobs"]) == 2
+    assert client.get("/api/v1/vehicles/quad%207%2F8/history").status_code == 200
+    assert client.get("/vehicles/quad%207/8").status_code == 200
 
 
 def test_health_and_counters(client, recording):

@@ -24,7 +24,7 @@ from tuner.core.errors import InputError
 from tuner.service import attempt, jobs
 from tuner.service import database as database_module
 from tuner.service.database import Database
-from tuner.service.queue import Outcome, Queue
+from tuner.service.queue import Claim, Outcome, Queue
 from tuner.service.request import JobRequest
 from tuner.service.service import Service
 from tuner.service.tables import Base, RecordingRow, State
@@ -219,6 +219,32 @@ def test_the_migrations_make_the_tables_of_this_program(idle):
     with idle.database.reading() as session:
         context = MigrationContext.configure(session.connection())
         assert compare_metadata(context, Base.metadata) == []
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (
+            lambda file: sqlite3.connect(file, isolation_level=None).execute(
+                "UPDATE alembic_version SET version_num = '9999'"
+            ),
+            "the database: was made by a newer version of tune; use that version",
+        ),
+        (lambda file: file.write_bytes(b"no table" * 999), "the database: is damaged, or no data"),
+    ],
+)
+def test_a_database_that_cannot_be_migrated_is_told(settings, spoil, said):
+    Service.open(settings).close()
+    file = settings.data / "tune.sqlite"
+    spoil(file)
+    with pytest.raises(InputError, match=said):
+        Database(f"sqlite:///{file}").migrate()
+
+
+def test_a_job_of_another_version_ends_in_words(idle, tmp_path):
+    claim = Claim(1, "a", "b", 0, {"gone": 1}, {}, {})
+    with pytest.raises(InputError, match="was submitted to another version of tune; submit it"):
+        attempt.prepare(tmp_path, claim, idle.store)
 
 
 def test_a_locked_database_is_told_and_nothing_is_lost(client, service, table, monkeypatch):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
 from tuner.core.errors import InputError
-from tuner.service import tokens
+from tuner.service import app, tokens
 from tuner.service.app import is_loopback, serve
 from tuner.service.names import recording_name
 from tuner.service.safety import COOKIE, RateLimit
@@ -191,6 +191,18 @@ def test_a_token_has_one_owner(idle):
 )
 def test_only_loopback_addresses_go_without_tokens(host, inside):
     assert is_loopback(host) is inside
+
+
+def test_the_server_bounds_headers_whatever_else_is_installed(settings, monkeypatch):
+    served = []
+
+    def run(server: app._Server) -> None:
+        served.append(server.config.http)
+        server._service.close()
+
+    monkeypatch.setattr(app._Server, "run", run)
+    serve(replace(settings, workers=0), host="127.0.0.1", port=0, say=lambda _: None)
+    assert served == ["h11"]  # httptools, which uvicorn prefers, takes headers of any length
 
 
 def test_an_address_for_others_demands_a_token_before_it_is_served(settings):

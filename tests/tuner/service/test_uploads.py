@@ -1,6 +1,7 @@
 """Recordings on their way in: whole or not at all, inspected apart, bounded in every way."""
 
 import hashlib
+import json
 import re
 import shutil
 import socket
@@ -107,6 +108,14 @@ def test_what_is_no_recording_is_refused_by_its_name_and_not_kept(client, servic
     assert answer.json()["detail"].startswith("holiday.jpg: is of no known format; known formats")
     assert [path for path in (service.settings.data / "store").rglob("*") if path.is_file()] == []
     assert left(service) == []
+
+
+def test_a_recording_of_more_topics_than_pages_list_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr(inspection, "MAX_JSON_LETTERS", 500)
+    monkeypatch.setattr(inspection, "limit_process", lambda **_: None)
+    monkeypatch.setattr(sys, "argv", ["inspection", str(BAG), "1", "1", "1"])
+    inspection.main()
+    assert json.loads(capsys.readouterr().out)["refused"]["what"] == "holds too many topics to list"
 
 
 def test_a_recording_that_takes_too_long_is_stopped(tmp_path, monkeypatch):

@@ -366,7 +366,7 @@ def list_vehicles(service: ServiceOfApp) -> Response:
     return render("vehicles.html.jinja", vehicles=vehicles(service.database))
 
 
-@web.get("/vehicles/{name}")
+@web.get("/vehicles/{name:path}")
 def show_vehicle(service: ServiceOfApp, name: str) -> Response:
     """Show every coefficient of a vehicle over time."""
     found = history(service.database, name)
