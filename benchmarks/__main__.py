@@ -1,7 +1,8 @@
 """``python -m benchmarks [throughput ...] [--out FILE | --update]``: measure, and write a page.
 
 Without names everything is measured that speaks of speed, and benchmarks/RESULTS.md written; with
-names the parts are printed, and with ``--update`` they take their place on that page. Two
+names the parts are printed, and with ``--update`` they take their place on that page. Either way
+the page's history gets a line. Two
 environment variables bring others into the comparison: TUNE_YARDSTICK, the folder of the C++
 program, and TUNE_PEERS, a Python that has drone-models, crazyflow and mujoco installed
 (``pip install -e '.[bench]'`` puts them beside this project).
@@ -13,10 +14,12 @@ import argparse
 import datetime
 import importlib
 import time
+import tomllib
 from pathlib import Path
 
+from benchmarks.history import updated_history
 from benchmarks.table import Section, sections_of, table, update_bars, update_section
-from benchmarks.timing import machine
+from benchmarks.timing import ROOT, machine
 from tuner.core import runtime
 
 PARTS = (
@@ -49,6 +52,12 @@ def page(sections: list[Section], where: str, minutes: float, before: str = "") 
     return "\n\n".join([*parts, *measured.values(), *kept.values()])
 
 
+def version() -> str:
+    """Return the version of what is measured: of this source, whatever is installed."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    return str(tomllib.loads(text)["project"]["version"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS, *BY_NAME])
@@ -68,10 +77,17 @@ def main() -> None:
         print(section.markdown(), *bars, sep="\n", flush=True)
         if target is None:
             continue
+        past = updated_history(
+            before,
+            [bar for section in sections for bar in section.bars],
+            when=datetime.datetime.now(datetime.UTC),
+            version=version(),
+            whole=not arguments.parts,
+        )
         if arguments.update:
-            text = update_bars(update_section(text, section), section.bars)
+            text = update_section(update_bars(update_section(text, section), section.bars), past)
         else:
-            text = page(sections, where, (time.perf_counter() - began) / 60, before)
+            text = page([past, *sections], where, (time.perf_counter() - began) / 60, before)
         target.write_text(text, encoding="utf-8")
 
 

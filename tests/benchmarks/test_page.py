@@ -4,18 +4,8 @@ import sys
 
 import pytest
 
-from benchmarks import __main__ as command
-from benchmarks import derivatives, reading
 from benchmarks.__main__ import page
-from benchmarks.table import (
-    Bar,
-    Section,
-    figure,
-    millions,
-    sections_of,
-    update_bars,
-    update_section,
-)
+from benchmarks.table import Bar, Section, figure, millions, update_section
 from benchmarks.timing import Contestant, Spread, compete
 
 ANSWERS = """
@@ -80,41 +70,3 @@ def test_figures_have_three_digits():
         "12.3",
         "1234",
     ]
-
-
-def rate(measured):
-    return Bar("rate", measured, 1.0, "at least", " M")
-
-
-def test_bars_of_a_part_take_their_rows_in_the_first_table_and_new_ones_follow():
-    other = "\n## One\n\n| rate | 7 |\n"
-    before = f"# Page\n\n| bar |\n| --- |\n| rate | 1 M | at least 1 M | met |\n{other}"
-    new = update_bars(before, [rate(0.5), Bar("wait, warm", 30.0, 100.0, "at most", " s")])
-    assert "| rate | 0.5 M | at least 1 M | missed |\n| wait, warm | 30 s |" in new
-    assert new.endswith(f"\n{other}")
-
-
-def test_the_command_writes_parts_and_keeps_what_it_does_not_measure(tmp_path, monkeypatch):
-    results = tmp_path / "RESULTS.md"
-    kept = Section("Calibration", "Of another day.", ["a"], [["1"]])
-    results.write_text(update_section("# Page\n", kept), encoding="utf-8")
-    monkeypatch.setattr(command, "RESULTS", results)
-    monkeypatch.setattr(command, "PARTS", ("derivatives", "reading"))
-    speed = Section("Derivatives", "Now.", ["a"], [["2"]], [rate(1.0)])
-    monkeypatch.setattr(derivatives, "measure", lambda: speed)
-    monkeypatch.setattr(reading, "measure", lambda: Section("Reading", "Now.", ["a"], [["3"]]))
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["benchmarks", *words])
-        command.main()
-        return results.read_text(encoding="utf-8")
-
-    whole = run()
-    assert list(sections_of(whole)) == ["Derivatives", "Reading", "Calibration"]
-    speed = Section("Derivatives", "Later.", ["a"], [["2"]], [rate(3.0)])
-    part = run("derivatives", "--update")
-    assert "| rate | 3 M | at least 1 M | met |" in part.partition("\n## ")[0]
-    assert "Later." in sections_of(part)["Derivatives"]
-    assert sections_of(part)["Calibration"] == sections_of(whole)["Calibration"]
-    unchanged = run("derivatives")
-    assert unchanged == part
