@@ -322,12 +322,6 @@ def model_in(root: Element) -> Element:
     return model
 
 
-def sources(root: Element) -> list[Source]:
-    """Return the files that a model was read from."""
-    merged = (include.children[0].source for include in root.all(MERGED))
-    return list(dict.fromkeys((root.source, *merged)))
-
-
 def _included_file(include: Element) -> Path | None:
     """Return the file that an element merges; None if it is not followed."""
     if include.tag != "include" or include.attributes.get("merge") not in ("true", "1"):

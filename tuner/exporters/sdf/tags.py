@@ -1,22 +1,17 @@
-"""SDF tags of coefficients, from the registry: their values, written and read back.
-
-A written model is read back by another parser.
-"""
+"""SDF tags of coefficients, from the registry: their values, written and read back."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Literal
-from xml.etree import ElementTree
 
 import numpy as np
 
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
 from tuner.exporters.sdf.model import Model, composite, read_model
-from tuner.exporters.sdf.spans import Element, sources, without_comments
+from tuner.exporters.sdf.spans import Element
 from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of, with_values
 
 Parent = Literal["inertial", "inertia", "motor", "channel"]
@@ -148,29 +143,16 @@ def read_values(root: Element, vehicle: VehicleFile) -> dict[str, float]:
     ExportError
         Its rotors have different values.
     """
-    rotors, motor_tags, path = len(vehicle.rotors), tags_in("motor"), root.source.path
-    trees = [ElementTree.fromstring(without_comments(file.text)) for file in sources(root)]
-    ours = {str(number) for number in range(rotors)}
-    plugins = [
-        e for tree in trees for e in tree.iter("plugin") if _child_text(e, "motorNumber") in ours
-    ]
-    channels = [
-        e
-        for tree in trees
-        for e in tree.iter("channel")
-        if _child_text(e, "input_index") in ours
-        and (_child_text(e, "joint_control_type") or "velocity").startswith("velocity")
-    ]
+    model, motor_tags = read_model(root, len(vehicle.rotors)), tags_in("motor")
     read: dict[str, float] = {}
     if motor_constants(vehicle) is not None:
         del motor_tags[MOTOR_CONSTANT]
-        for plugin in plugins:
-            index = int(_child_text(plugin, "motorNumber"))
-            read |= _shared_values([plugin], {MOTOR_CONSTANT: rotor_constant_name(index)}, path)
-    read |= _shared_values(plugins, motor_tags, path) | _shared_values(
-        channels, tags_in("channel"), path
-    )
-    model = read_model(root, rotors)
+        for motor in model.motors():
+            index = model.motor_number(motor)
+            if index is not None:
+                read |= _shared_values([motor], {MOTOR_CONSTANT: rotor_constant_name(index)})
+    read |= _shared_values(model.motors(), motor_tags)
+    read |= _shared_values(model.channels(), tags_in("channel"))
     whole = composite(model)
     if center_of_mass(vehicle) is not None:
         origin = rotor_origin(model, vehicle)
@@ -182,24 +164,22 @@ def read_values(root: Element, vehicle: VehicleFile) -> dict[str, float]:
     return read | {name: body[tag] for tag, name in tags.items() if tag in body}
 
 
-def _child_text(element: ElementTree.Element, tag: str) -> str:
-    return (element.findtext(tag) or "").strip()
-
-
-def _shared_values(
-    elements: Iterable[ElementTree.Element], tags: dict[str, str], path: Path
-) -> dict[str, float]:
+def _shared_values(elements: Sequence[Element], tags: dict[str, str]) -> dict[str, float]:
     """Return the values that elements share."""
     read: dict[str, float] = {}
     for tag, name in tags.items():
-        texts = {_child_text(element, tag) for element in elements}
+        children = [element.find(tag) for element in elements]
+        texts = {"" if child is None else child.value for child in children}
         try:
             values = {float(text) if text else None for text in texts}
         except ValueError:
             raise ExportError(
-                path, f"has the <{tag}> {' and '.join(sorted(texts))}", "write a number"
+                elements[0].source.path,
+                f"has the <{tag}> {' and '.join(sorted(texts))}",
+                "write a number",
             ) from None
         if len(values) > 1:
+            path = elements[0].source.path
             raise ExportError(path, f"has rotors of different {tag}", "give them one value")
         for value in values:
             if value is not None:
