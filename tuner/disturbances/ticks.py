@@ -94,11 +94,13 @@ def with_equal_weights(commands: Measured) -> Measured:
 
     Least squares takes equal values in a row for one reading (`repeat_counts`). A run's length
     depends on later values, and innovations with such weights would not be white: a filter weights
-    all equally, and estimates their noise.
+    all equally, and estimates their noise. Commands of which one is at its limit have no weight:
+    what they answer is cut off, and a filter that is linear would take the rest for the whole.
     """
     values = np.asarray(commands.values)
     rests = np.stack([repeat_counts(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
-    return replace(commands, weight=np.asarray(commands.weight) * np.sqrt(rests))
+    inside = ~((values <= 0.0) | (values >= 1.0)).any(axis=1, keepdims=True)
+    return replace(commands, weight=np.asarray(commands.weight) * np.sqrt(rests) * inside)
 
 
 def setpoints_on_ticks(

@@ -56,7 +56,7 @@ def test_a_clock_that_is_late_moves_the_samples_and_a_command_holds() -> None:
 
 def test_a_command_that_rests_weighs_in_a_filter_as_one_that_moves() -> None:
     commands = measured(0.01 * np.arange(1, 50), 4)
-    values = np.round(10.0 * np.asarray(commands.values)) / 10.0  # some rest for ten samples
+    values = 0.3 + np.round(10.0 * np.asarray(commands.values)) / 10.0  # some rest for ten samples
     is_at_rest = np.stack([repeat_counts(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
     assert is_at_rest.max() > 5
     as_one = replace(
@@ -65,6 +65,16 @@ def test_a_command_that_rests_weighs_in_a_filter_as_one_that_moves() -> None:
         weight=commands.weight / jnp.asarray(np.sqrt(is_at_rest)),
     )
     np.testing.assert_allclose(with_equal_weights(as_one).weight, commands.weight)
+
+
+def test_commands_of_which_one_is_cut_off_weigh_nothing_in_a_filter() -> None:
+    commands = measured(0.01 * np.arange(1, 50), 4)
+    values = np.array(0.3 + commands.values)
+    values[7, 2, 0], values[9, 1, 1] = 1.0, 0.0
+    weight = np.array(commands.weight)
+    weight[7, :, 0] = weight[9, :, 1] = 0.0
+    cut_off = replace(commands, values=jnp.asarray(values))
+    np.testing.assert_allclose(with_equal_weights(cut_off).weight, weight)
 
 
 def test_what_is_gathered_is_what_was_laid_out() -> None:
