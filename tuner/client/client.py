@@ -9,6 +9,7 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
@@ -242,12 +243,16 @@ class Client:
             raise InputError(f"job {job}", f"is {found['state']}", f"tune watch {job}")
         place = None if out is None else Path(out)
         place_for(place)
-        with result_folder(place) as folder:
-            forget(folder)
-            for name in sorted(found["files"], key=lambda name: name != RunResult.FILE):
-                target = inside(folder, name)
-                with whole_file(target) as unfinished:
+        with result_folder(place) as folder, TemporaryDirectory(prefix=".", dir=folder) as part:
+            names = sorted(found["files"], key=lambda name: name != RunResult.FILE)
+            targets = {inside(Path(part), name): inside(folder, name) for name in names}
+            for name, fetched in zip(names, targets, strict=True):
+                with whole_file(fetched) as unfinished:
                     self._download(f"{_job_path(job)}/files/{quote(name)}", unfinished)
+            forget(folder)  # once all is here
+            for fetched, target in targets.items():
+                with whole_file(target) as unfinished:
+                    fetched.replace(unfinished)
             return read_run(folder)
 
     def history(self, vehicle: str) -> dict[str, Any]:

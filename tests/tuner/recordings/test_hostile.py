@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tracemalloc
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from time import process_time
 
@@ -198,6 +198,16 @@ def test_a_database_that_unpacks_to_too_much(tmp_path: Path, monkeypatch) -> Non
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes there")
+def test_database_whose_definitions_are_no_text(tmp_path: Path) -> None:
+    path = tmp_path / "x.db3"
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("CREATE TABLE messages (id INTEGER)")
+    path.write_bytes(
+        path.read_bytes().replace(b"CREATE TABLE messages (", b"CREATE TABLE messages \xff")
+    )
+    assert "x.db3: cannot be read" in refused(path)
+
+
 @pytest.mark.parametrize("name", ["x.mcap", "x.db3.zstd"])
 def test_a_pipe_in_a_folder_of_ros_2_is_not_waited_for(name: str, tmp_path: Path) -> None:
     folder = tmp_path / "b"

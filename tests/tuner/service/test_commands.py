@@ -15,7 +15,7 @@ import tuner
 from tests.tuner.service.conftest import submit, upload
 from tuner.cli import main
 from tuner.client import folder as folder_module
-from tuner.client.client import job_request_of
+from tuner.client.client import Client, job_request_of
 from tuner.config import Options
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.result import Run
@@ -125,6 +125,29 @@ def test_the_client_gives_what_fit_gives(server, table, tmp_path, updated):
         client.fit([table], namespace="refuse", out=tmp_path / "refused")
     with pytest.raises(ServerFaultError, match="ZeroDivisionError"):
         client.fit([table], namespace="fault", out=tmp_path / "fault")
+    client.close()
+
+
+def test_a_result_is_kept_until_the_next_one_is_all_here(server, table, tmp_path, monkeypatch):
+    client, out = tuner.connect(server), tmp_path / "run"
+    client.fit([table], out=out)
+    kept = {file: file.read_bytes() for file in out.rglob("*") if file.is_file()}
+    job = client.submit(Options([str(table)], mass=2.3))
+    client.wait(job)
+    download = Client._download
+
+    def cut_off(self: Client, path: str, target: Path) -> None:
+        if path.endswith("report.html"):
+            raise InputError("--server", "cannot be reached", "check the address")
+        download(self, path, target)
+
+    monkeypatch.setattr(Client, "_download", cut_off)
+    with pytest.raises(InputError, match="cannot be reached"):
+        client.fetch(job, out)
+    monkeypatch.undo()
+    assert {file: file.read_bytes() for file in out.rglob("*") if file.is_file()} == kept
+    assert client.fetch(job, out).result.coefficients["mass"].best == 2.3
+    assert sorted(file for file in out.rglob("*") if file.is_file()) == sorted(kept)
     client.close()
 
 

@@ -32,8 +32,8 @@ BYTES_PER_BLOCK = 16 << 20
 MAX_QUERY_STEPS = 5_000
 #: Reading resumes so often after a damaged page, each time twice as far behind it.
 MAX_ATTEMPTS = 24
-#: Errors of a damaged file; SQLite takes absurd sizes for a lack of memory.
-DAMAGE_ERRORS = (sqlite3.Error, MemoryError, OverflowError)
+#: Errors of a damaged file; SQLite takes absurd sizes for a lack of memory, and quotes any bytes.
+DAMAGE_ERRORS = (sqlite3.Error, MemoryError, OverflowError, UnicodeDecodeError)
 
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
