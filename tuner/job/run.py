@@ -60,7 +60,7 @@ from tuner.search.rotor_change import cut_at_rotor_changes
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import ExaminedFit, refit_and_examine
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
-from tuner.uncertainty.agreement import flights_disagree
+from tuner.uncertainty.agreement import flights_disagree, ground_conflicts, sources_of
 from tuner.uncertainty.estimates import (
     FLIGHTS_REFUTE,
     finer_than_steps,
@@ -68,7 +68,6 @@ from tuner.uncertainty.estimates import (
     term_findings,
 )
 from tuner.uncertainty.examination import Examination
-from tuner.uncertainty.ground import ground_conflicts, sources_of
 from tuner.uncertainty.model_error import model_error_findings
 from tuner.uncertainty.records import Sources
 from tuner.uncertainty.refits import bootstrap, cross_validate, jackknife_errors

@@ -1,24 +1,30 @@
-"""Test for flights that need different values of a coefficient.
+"""Agreement of flights with each other, and with measurements on the ground.
 
-A coefficient gets a second value in some of the flights, as the last of K + 1 coefficients: size
-and error of the difference follow from the residuals at the fit. Flights are split in two by the
-values that each needs, so that two vehicles, payloads or sets of gains show.
+Flights may need different values of a coefficient. It gets a second value in some of them, as the
+last of K + 1 coefficients: size and error of the difference follow from the residuals at the fit.
+Flights are split in two by the values that each needs, so that two vehicles, payloads or sets of
+gains show.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri  # scipy.stats takes a quarter of a second to import
 
+from tuner.core.numerics import Array, scaled_inverse, unit_diagonal
 from tuner.findings.findings import Code, Finding
 from tuner.objective.information import Change, FisherInformation
+from tuner.objective.space import Space
 from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import covariance_of
+from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination
+from tuner.uncertainty.records import CONFLICT_SE, Sources
+from tuner.vehicle import COEFFICIENTS
 
 FALSE_ALARM_LEVEL = 0.001
 """Probability of a false alarm among all coefficients and splits."""
@@ -103,3 +109,82 @@ def _with_two_values(information: FisherInformation, split: Split) -> FisherInfo
     across = np.where(inside[..., None], information.blocks[..., split.number], 0.0)
     score = np.where(inside, information.score[..., split.number], 0.0)
     return information.with_change(Change(across, across[..., split.number], score))
+
+
+def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[str, Sources]:
+    """Return each measured coefficient's value on the ground, from flights alone, and from both.
+
+    It is empty for a fit without ground measurements.
+
+    One Gauss-Newton step from the end of the fit without the ground measurements leads to the
+    values of flights alone: there the loss's slope is minus that of the measurements. Standard
+    errors of flights are widened for model error as those of the fit are.
+
+    Parameters
+    ----------
+    fitted, uncertainty
+        The fit; coefficients held at initial values have none from flights.
+    total
+        (K, K) information about its parameters, priors and ground measurements included.
+    """
+    space = fitted.objective.space
+    prior, rows, offset = space.joint_prior, space.joint_rows, space.joint_offset
+    if prior is None:
+        return {}
+    end = space.scaled(fitted.point.coefficients)
+    flights_only = total - rows.T @ rows
+    held = set(fitted.held.values())
+    moves = np.array([name not in held for name in space.names])
+    inverse = np.zeros_like(flights_only)
+    inverse[np.ix_(moves, moves)] = scaled_inverse(flights_only[np.ix_(moves, moves)])
+    alone = end + inverse @ rows.T @ (rows @ end + offset)
+    alone_error = np.sqrt(np.diag(inverse)) * uncertainty.covariance.beyond_noise
+    unit = unit_diagonal(prior.information)
+    measured = np.linalg.pinv(prior.information * np.outer(unit, unit), rcond=1e-10)
+    ground_error = np.sqrt(np.diag(measured)) * unit
+    sources = {}
+    for place, name in enumerate(prior.names):
+        if name not in space.names:
+            continue
+        index = space.names.index(name)
+        estimate = uncertainty.estimates[name]
+        ground = float(prior.mean[place])
+        known = bool(moves[index])
+        spread = float(np.hypot(alone_error[index], ground_error[place]))
+        sources[name] = Sources(
+            ground=space.from_scaled(index, ground),
+            ground_error=_error(space, index, ground, ground_error[place]),
+            flights=space.from_scaled(index, alone[index]) if known else None,
+            flights_error=_error(space, index, alone[index], alone_error[index]) if known else None,
+            both=estimate.value,
+            both_error=estimate.std_error,
+            deviation=float(alone[index] - ground) / spread if known else None,
+        )
+    return sources
+
+
+def _error(space: Space, index: int, scaled: float, error: float) -> float:
+    value = space.from_scaled(index, float(scaled))
+    return float(error * value) if space.is_log[index] else float(error)
+
+
+def ground_conflicts(sources: Mapping[str, Sources], mass: float | None) -> tuple[Finding, ...]:
+    """Return findings on coefficients where ground measurements and flights contradict each other.
+
+    Where flights determine only a coefficient over the mass, with the mass at which they agree.
+    ``mass`` is that of the fit in kg, None if it was fitted.
+    """
+    findings = []
+    for name, source in sources.items():
+        if (
+            source.flights is None
+            or source.deviation is None
+            or abs(source.deviation) <= CONFLICT_SE
+        ):
+            continue
+        row, ground, flights = COEFFICIENTS[name], source.ground, source.flights
+        numbers = {"deviation": source.deviation, "ground": ground, "flights": flights}
+        if mass is not None and row.mass_exponent == 1:
+            numbers["mass"] = mass * ground / flights
+        findings.append(Finding(Code.GROUND_CONFLICT, "warning", name, numbers, (row.unit,)))
+    return tuple(findings)

@@ -13,7 +13,7 @@ from tuner.ground.bench_json import BenchRecord, joint_prior
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.normal_equations import normal_equations
 from tuner.objective.space import space_of
-from tuner.uncertainty.ground import ground_conflicts, sources_of
+from tuner.uncertainty.agreement import ground_conflicts, sources_of
 from tuner.vehicle import ControllerFile, read_vehicle
 from tuner.vehicle.joint_prior import JointPrior
 
