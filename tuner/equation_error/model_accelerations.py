@@ -18,15 +18,19 @@ from sim_jax.rigid_body import angular_acceleration
 from sim_jax.terms import total
 from sim_jax.terms.total import total_wrench
 from tuner.core.numerics import Array
-from tuner.equation_error.recorded_accelerations import Steps, rotor_response, with_rotors
+from tuner.equation_error.recorded_accelerations import (
+    Mask,
+    Steps,
+    directions,
+    rotor_response,
+    weighed_rotors,
+    with_rotors,
+)
 from tuner.objective.simulation import CODE
 from tuner.recordings.flight import Series
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model, with_coefficients
-
-MOTOR_STEP = 1e-2
-"""Step of a motor's logarithm, or of a number over its usual size, in finite differences."""
 
 
 @dataclass(frozen=True)
@@ -75,34 +79,46 @@ class ModelAccelerations:
 
         With derivatives by some of these; by default by all.
         """
-        flights, by = self._with_rotors(point), np.arange(len(point)) if by is None else by
-        made = _modelled(self.model, self.parameters, point, flights, by)
-        errors = [
-            part.accelerations - values for part, (values, _) in zip(flights, made, strict=True)
-        ]
-        columns = [of_flight.copy() for _, of_flight in made]
-        here = self._model(point) if self.commands else self.model
-        for number, which in enumerate(by if self.commands else ()):
-            parameter = self.parameters[which]
-            if moves_rotors(parameter.name):
-                step = MOTOR_STEP * (parameter.usual or 1.0)
-                beside = self._with_rotors(point + step * np.eye(len(point))[which])
-                ends = _modelled(here, (), np.zeros(0), beside, by[:0])
-                for flight, (part, (modelled, _)) in enumerate(zip(beside, ends, strict=True)):
-                    change = errors[flight] - (part.accelerations - modelled)
-                    columns[flight][:, :, number] = change / step
-        return tuple(map(LinearisedAccelerations, flights, errors, columns))
+        by = np.arange(len(point)) if by is None else by
+        values, slopes = values_at(self.parameters, point), self._slopes(point)
+        motors = [n for n, p in enumerate(self.parameters) if moves_rotors(p.name)] or [-1]
+        flights, turned = self.flights, None
+        if self.commands:
+            of_motors = {n: slope[motors] for n, slope in slopes.items() if moves_rotors(n)}
+            flights, turned = self._by_commands(
+                values, directions(self.model, of_motors, len(motors))
+            )
+        of_point = {name: slope[by] for name, slope in slopes.items()}
+        by_motors = by[:, None] == motors
+        made = _modelled(self.model, values, of_point, flights, turned=turned, by_motors=by_motors)
+        return tuple(
+            LinearisedAccelerations(part, part.accelerations - accelerations, columns)
+            for part, (accelerations, columns) in zip(flights, made, strict=True)
+        )
 
-    def _model(self, point: Array) -> Model:
-        values = values_at(self.parameters, point)
-        return with_coefficients(self.model, {n: np.asarray(v) for n, v in values.items()})
+    def _slopes(self, point: Array) -> dict[str, Array]:
+        """Return coefficient -> derivatives (K,) of its value by a point's coordinates (K,)."""
+        return {
+            name: ratio * (np.exp(x) if parameter.scale == "log" else 1.0) * unit
+            for parameter, x, unit in zip(self.parameters, point, np.eye(len(point)), strict=True)
+            for name, ratio in parameter.ratios.items()
+        }
 
-    def _with_rotors(self, point: Array) -> tuple[Steps, ...]:
-        """Return the steps with the rotor speeds that a point's motors make of commands."""
-        if not self.commands:
-            return self.flights
-        model, pairs = self._model(point), zip(self.flights, self.commands, strict=True)
-        return tuple(with_rotors(part, rotor_response(model, command)) for part, command in pairs)
+    def _by_commands(
+        self, values: Mapping[str, float], slopes: Model
+    ) -> tuple[tuple[Steps, ...], Array]:
+        """Return the steps with the rotor speeds that motors make of commands, and derivatives.
+
+        These (8, q, N) are those of all flights' rotor speeds and accelerations along q directions.
+        """
+        model = with_coefficients(self.model, {n: np.asarray(v) for n, v in values.items()})
+        steps, changes = list[Steps](), list[Array]()
+        for part, command in zip(self.flights, self.commands, strict=True):
+            speeds, derivatives = rotor_response(model, command, slopes)
+            steps.append(with_rotors(part, speeds))
+            weighed = weighed_rotors(part, derivatives).reshape(2, len(part.time), 4, -1)
+            changes.append(np.concatenate(list(weighed), axis=1))
+        return tuple(steps), np.moveaxis(np.concatenate(changes), 0, -1)
 
 
 def moves_rotors(name: str) -> bool:
@@ -122,41 +138,52 @@ def values_at(parameters: Sequence[Parameter], point: Array) -> dict[str, float]
 
 def _modelled(
     model: Model,
-    parameters: Sequence[Parameter],
-    point: Array,
+    values: Mapping[str, float],
+    slopes: Mapping[str, Array],
     flights: Sequence[Steps],
-    by: NDArray[np.intp],
+    *,
+    turned: Array | None,
+    by_motors: Mask,
 ) -> list[tuple[Array, Array]]:
-    """Return each flight's modelled accelerations (N, 6) and columns (N, 6, k) by k coordinates."""
+    """Return each flight's modelled accelerations (N, 6) and columns (N, 6, k) by k coordinates.
+
+    Of these, ``by_motors`` (k, q) are directions along which rotor speeds change, too: by
+    ``turned`` (8, q, N), of all flights.
+    """
     # motion, rotor speeds and accelerations of all flights' steps
     steps: Any = jax.tree.map(
         lambda *leaves: np.concatenate(leaves, axis=-1),
-        *((part.motion, part.rotor_speed.T, part.rotor_acceleration.T) for part in flights),
+        *(
+            (part.motion, np.hstack([part.rotor_speed, part.rotor_acceleration]).T)
+            for part in flights
+        ),
     )
-    values, slopes = values_at(parameters, point), dict[str, Array]()
-    for number, parameter in enumerate(parameters):
-        for name, ratio in parameter.ratios.items():
-            slope = values[name] if parameter.scale == "log" else ratio
-            slopes[name] = slope * (by == number)
     numbers = {name: np.asarray(values[name]) for name in sorted(values)}
-    given = (jax.tree.map(np.asarray, model), numbers, steps)
+    tangents, shift = [slopes[name] for name in numbers], None
+    if turned is not None:
+        shift = np.zeros(turned.shape[1])
+        tangents.append(by_motors.astype(float))
+    given = (jax.tree.map(np.asarray, model), (numbers, shift), (*steps, turned))
     arguments = (
         jax.tree.map(partial(Argument.of, lanes=False), given[0]),
-        dict.fromkeys(numbers, Argument((), float, lanes=False, moves=True)),
-        jax.tree.map(partial(Argument.of, lanes=True), steps),
+        jax.tree.map(partial(Argument.of, lanes=False, moves=True), given[1]),
+        jax.tree.map(partial(Argument.of, lanes=True), given[2]),
     )
     program = program_of(
         _accelerations, arguments, name="accelerations", made_of=total.TERMS, packages=CODE
     )
-    run = program(given, [slopes[name] for name in numbers], lanes=steps[1].shape[1])
-    columns = run.columns if numbers else np.zeros((*run.values.shape, 0))
+    run = program(given, tangents, lanes=steps[1].shape[1])
+    columns = np.zeros((*run.values.shape, 0)) if run.columns is None else run.columns
     ends = np.cumsum([len(part.rotor_speed) for part in flights])[:-1]
     return list(zip(np.split(run.values, ends), np.split(columns, ends), strict=True))
 
 
 def _accelerations(given: Any, _: Mapping[str, int]) -> jax.Array:
     """Return specific force and angular acceleration (6,), body axes, at one step."""
-    model, numbers, (motion, speeds, changes) = given
+    model, (numbers, shift), (motion, rotors, turned) = given
+    if shift is not None:
+        rotors = rotors + jnp.sum(turned * shift, axis=1)
+    speeds, changes = jnp.split(rotors, 2)
     vehicle = with_coefficients(model, numbers).vehicle
     air = Air.around(vehicle, motion, rotor_acceleration=tuple(changes))
     acting = total_wrench(vehicle, motion, tuple(speeds), air)

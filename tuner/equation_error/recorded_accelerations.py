@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,10 +15,10 @@ from sim_jax.rigid_body import Motion
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
 from tuner.objective.inlets import MAX_PERIODS, linear_interpolation, zero_order_hold
-from tuner.objective.rotor_response import MotorLags, rotor_speeds
+from tuner.objective.rotor_response import MotorLags, linearised_speeds
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import local_parabolas, states_at
-from tuner.vehicle.model import Model
+from tuner.vehicle.model import Model, with_coefficients
 
 Mask = NDArray[np.bool_]
 
@@ -145,9 +146,14 @@ def steps_with(flight: Flight, rotors: Series, *, averaged: bool = False) -> Ste
     return part if np.count_nonzero(part.known) >= MIN_SAMPLES else None
 
 
+def weighed_rotors(part: Steps, rotors: Series) -> Array:
+    """Return a signal of the rotors (2, N, k) in the mean of each step and, per s, its change."""
+    return _weighed(rotors, part.time, part.weights, part.step / part.samples_per_step)
+
+
 def with_rotors(part: Steps, rotors: Series) -> Steps:
     """Return the steps with other rotor speeds; where these are unknown, so is the step."""
-    mean, change = _weighed(rotors, part.time, part.weights, part.step / part.samples_per_step)
+    mean, change = weighed_rotors(part, rotors)
     there = np.isfinite(mean)
     known, usual = there.all(axis=1, keepdims=True), np.nanmean(mean) if there.any() else 0.0
     return replace(
@@ -186,7 +192,8 @@ def read_commands(
         command = flight.series["command"]
         recorded = Series(command.time - late, command.values)
         every, second = (_held(flight, recorded, rate, count) for count in (1, 2))
-        part = steps_with(flight, rotor_response(model, every))
+        response, _ = rotor_response(model, every)
+        part = steps_with(flight, response)
         part = None if part is None else without_gaps_of(recorded, part)
         if part is None or np.count_nonzero(part.known) < MIN_SAMPLES:
             return None
@@ -216,12 +223,32 @@ def steps_by_inlet(
     return read_commands(model, flights, rate) if inlet == "actuator" else None
 
 
-def rotor_response(model: Model, command: Series) -> Series:
-    """Return the rotor speeds (n, 4) in response to commands on a clock."""
+def rotor_response(
+    model: Model, command: Series, slopes: Model | None = None
+) -> tuple[Series, Series]:
+    """Return the rotor speeds (n, 4) in response to commands on a clock, and their derivatives.
+
+    These (n, 4·Q) are along Q directions; ``slopes`` hold the change (Q,) of each number of the
+    motors. Along one that changes nothing by default.
+    """
     motor, late = model.vehicle.motor, float(model.vehicle.setup.actuator_latency)
     lags = MotorLags(float(motor.time_constant_up), float(motor.time_constant_down), late)
     step = float(command.time[1] - command.time[0])
-    return Series(command.time, rotor_speeds(command.values, step, motor, lags))
+    moved = directions(model, {}, 1) if slopes is None else slopes
+    speeds, columns = linearised_speeds(
+        command.values,
+        step,
+        motor,
+        lags,
+        slopes=moved.vehicle.motor,
+        delays=np.asarray(moved.vehicle.setup.actuator_latency),
+    )
+    return Series(command.time, speeds), Series(command.time, columns.reshape(len(columns), -1))
+
+
+def directions(model: Model, slopes: Mapping[str, Array], count: int) -> Model:
+    """Return the change (count,) of each number of a model along directions of coefficients."""
+    return with_coefficients(jax.tree.map(lambda _: np.zeros(count), model), slopes)
 
 
 def _held(flight: Flight, recorded: Series, rate: float, every: int) -> Series:
@@ -259,8 +286,9 @@ def _weighed(series: Series, times: Array, weights: Array, spacing: float) -> Ar
 def _read(series: Series, times: Array) -> Array:
     """Return a signal (n, k) between its samples; NaN in gaps."""
     after = np.clip(np.searchsorted(series.time, times), 1, len(series.time) - 1)
-    gap = series.time[after] - series.time[after - 1]
-    table = np.column_stack([np.interp(times, series.time, column) for column in series.values.T])
+    before, gap = series.time[after - 1], series.time[after] - series.time[after - 1]
+    share = np.clip((times - before) / gap, 0.0, 1.0)[:, None]
+    table = (1.0 - share) * series.values[after - 1] + share * series.values[after]
     table[gap > MAX_GAP_PERIODS / series.rate] = np.nan
     return np.asarray(table)
 

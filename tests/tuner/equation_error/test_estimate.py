@@ -15,7 +15,11 @@ from benchmarks import fast_flights
 from tuner.config import Options, resolve_settings
 from tuner.config.job import Search
 from tuner.equation_error.estimate import TORQUE_GAINS, Estimate
-from tuner.equation_error.model_accelerations import LinearisedAccelerations
+from tuner.equation_error.model_accelerations import (
+    LinearisedAccelerations,
+    ModelAccelerations,
+    moves_rotors,
+)
 from tuner.equation_error.recorded_accelerations import (
     read_commands,
     steps_by_inlet,
@@ -348,6 +352,30 @@ def test_commands_alone_tell_inertia_by_the_lags_that_they_need(racer, commanded
     assert lag + found.values["actuator_latency"] == pytest.approx(fast_flights.MOTOR_LAG, rel=0.2)
     assert finding.numbers["explained_x"] < 0.9
     assert not set(job.space.names) & {*TILTING, "time_constant_up"}
+
+
+@pytest.mark.parametrize("commanded", [400.0], ids=["400 Hz"], indirect=True)
+def test_columns_by_motors_are_derivatives(commanded):
+    given, _ = commanded
+    model, parameters = given.objective.model, given.space.parameters
+    flight = given.recordings[0].flight
+    steps, (commands, _) = read_commands(model, [(flight, 0.0)], 400.0)
+    made = ModelAccelerations(model, parameters, steps, commands)
+    late = {"actuator_latency": 0.004}
+    point = np.array([p.scaled(late.get(p.name, p.initial)) for p in parameters])
+    motors = np.array([n for n, p in enumerate(parameters) if moves_rotors(p.name)])
+    (at,) = made.at(point, motors)
+    assert len(motors) > 3
+    for number, place in enumerate(motors):
+        beside = 1e-6 * np.eye(len(point))[place]
+        above, below = (made.at(point + way * beside)[0].errors for way in (1, -1))
+        known = at.steps.known
+        np.testing.assert_allclose(
+            at.columns[known, :, number],
+            (below - above)[known] / 2e-6,
+            rtol=1e-4,
+            atol=1e-4 * np.abs(at.columns[known]).max(),
+        )
 
 
 @pytest.mark.parametrize("commanded", [100.0], ids=["100 Hz"], indirect=True)
