@@ -64,6 +64,21 @@ def linear_interpolation(series: Series, clock: Array) -> Array:
     return np.column_stack(columns)
 
 
+def mean_of_hold(series: Series, clock: Array) -> Array:
+    """Return the mean (m, k) of a held signal (n, k) from each of (m + 1,) times in s to the next.
+
+    The integral of a signal that holds until its next sample is linear between samples.
+    """
+    columns = []
+    for column in series.values.T:
+        known = np.isfinite(column)
+        time, values = series.time[known], column[known]
+        ends = np.array([min(time[0], clock[0]), *time[1:], max(time[-1], clock[-1])])
+        total = np.concatenate([[0.0], np.cumsum((values - values[0]) * np.diff(ends))])
+        columns.append(values[0] + np.diff(np.interp(clock, ends, total)) / np.diff(clock))
+    return np.column_stack(columns)
+
+
 def reference_points(flight: Flight, length: int) -> list[Array]:
     """Return position, velocity and acceleration, each (3, length), the last point repeated."""
     parts = []
@@ -177,13 +192,23 @@ class RecordedInlet(ABC):
         del trim
         return inlet
 
-    def _resampled(self, signal: str, flights: Sequence[Flight], schedule: Schedule) -> list[Array]:
-        """Return a signal's columns, each (steps, F), at the physics rate."""
+    def _resampled(
+        self, signal: str, flights: Sequence[Flight], schedule: Schedule, *, mean: bool = False
+    ) -> list[Array]:
+        """Return a signal's columns, each (steps, F), at the physics steps or its mean over them.
+
+        A signal that acts all through a step has to be fed by its mean: it changes within steps,
+        and what is read where a step begins acts late, by half a step on average.
+        """
         longest = max(flight.duration for flight in flights)
         steps = int(np.ceil(longest * schedule.physics_rate)) + 2
         clock, rate = np.arange(steps) / schedule.physics_rate, self.update_rate(schedule)
-        moves = rate is None or is_sparse(flights, signal, rate)
-        read = linear_interpolation if moves else zero_order_hold
+        if rate is None or is_sparse(flights, signal, rate):
+            read, clock = linear_interpolation, clock + mean * 0.5 * schedule.step
+        elif mean:
+            read, clock = mean_of_hold, np.append(clock, steps / schedule.physics_rate)
+        else:
+            read = zero_order_hold
         table = np.stack(
             [read(with_gaps_filled(flight.series[signal]), clock) for flight in flights], axis=-1
         )
@@ -269,7 +294,7 @@ class RecordedCommand(RecordedInlet):
 
     def lay_out(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
         """Lay the commands out step by step."""
-        return ActuatorInlet(tuple(self._resampled("command", flights, schedule)))
+        return ActuatorInlet(tuple(self._resampled("command", flights, schedule, mean=True)))
 
     def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
         """Add the trim to the commands."""
@@ -312,7 +337,7 @@ class _RecordedThrust(RecordedInlet):
 
     def lay_out(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
         """Lay the set-points out step by step, for each of four rotors."""
-        (thrust,) = self._resampled("thrust_setpoint", flights, schedule)
+        (thrust,) = self._resampled("thrust_setpoint", flights, schedule, mean=True)
         return ActuatorInlet((thrust,) * ROTORS)
 
 

@@ -9,7 +9,7 @@ from sim_jax.inlet import ActuatorInlet
 from sim_jax.schedule import Schedule
 from tuner.core.errors import RecordingError
 from tuner.objective.initial_conditions import ROWS
-from tuner.objective.inlets import INLETS, linear_interpolation, zero_order_hold
+from tuner.objective.inlets import INLETS, linear_interpolation, mean_of_hold, zero_order_hold
 from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.windows import windows_of
 from tuner.recordings.flight import Series
@@ -78,6 +78,26 @@ def test_commands_recorded_in_full_are_held_and_sparse_ones_joined():
     clock = np.array([0.0, 0.05, 0.1, 0.3])
     assert zero_order_hold(series, clock)[:, 0].tolist() == [0.0, 0.0, 1.0, 1.0]
     assert linear_interpolation(series, clock)[:, 0].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.0])
+
+
+def test_the_mean_of_a_hold_counts_what_holds_for_a_part_of_a_step():
+    series = Series(np.array([0.1, 0.15, 0.3]), np.array([[2.0], [4.0], [1.0]]))
+    edges = np.array([0.0, 0.1, 0.2, 0.3, 0.5])
+    assert mean_of_hold(series, edges)[:, 0] == pytest.approx([2.0, 3.0, 4.0, 1.0], abs=1e-12)
+
+
+@pytest.mark.parametrize("rate", [160.0, 500.0])
+def test_commands_act_on_time_at_any_rate_of_their_log(flight, rate):
+    schedule = Schedule()
+    time = np.arange(round(flight.duration * rate)) / rate
+    ramp = Series(time, np.tile(time[:, None], 4))
+    inlet = INLETS["actuator"].lay_out(
+        [replace(flight, series={**flight.series, "command": ramp})], schedule
+    )
+    middle = (np.arange(800, 1600) + 0.5) * schedule.step
+    held_for = 0.0 if rate < 0.5 * schedule.rate_control_rate else 0.5 / rate
+    late = middle - np.asarray(inlet.command[0])[800:1600, 0]
+    assert np.mean(late) == pytest.approx(held_for, abs=1e-6)
 
 
 def test_the_actuator_inlet_holds_recorded_commands(flight):
