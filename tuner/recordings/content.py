@@ -11,10 +11,10 @@ import numpy as np
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.numerics import Array
 from tuner.recordings.clocks import align_pose, message_times
+from tuner.recordings.consistency import DOUBTS, contradiction, correct_frames
 from tuner.recordings.defects import clean, is_position_frozen, without_stale_end
 from tuner.recordings.flight import SIGNALS, Series
 from tuner.recordings.formats import is_tabular, open_recording
-from tuner.recordings.frames import DOUBTS, contradiction, correct_frames
 from tuner.recordings.missions import Mission, find_missions, split_into_manoeuvres
 from tuner.recordings.notes import Damage, Note, NoteCode
 from tuner.recordings.recording import Clock, Nanoseconds, ReadResult, Recording, Samples

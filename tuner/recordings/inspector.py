@@ -20,6 +20,7 @@ from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
 from tuner.recordings.clocks import clock_of, pose_offset
+from tuner.recordings.consistency import contradiction_in
 from tuner.recordings.content import (
     Content,
     ReadOptions,
@@ -31,7 +32,6 @@ from tuner.recordings.content import (
 from tuner.recordings.defects import has_stale_attitude
 from tuner.recordings.flight import SIGNALS, Series
 from tuner.recordings.formats import is_tabular, open_recording
-from tuner.recordings.frames import contradiction_in
 from tuner.recordings.inspection import (
     CoefficientReport,
     InletReport,

@@ -23,7 +23,7 @@ import numpy as np
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
-from tuner.recordings.interpolation import upward
+from tuner.recordings.interpolation import rotate, upward
 from tuner.recordings.notes import Note, NoteCode
 
 #: Unit name in a topic map -> (factor, offset): SI value = factor * recorded + offset.
@@ -100,23 +100,55 @@ def quaternion_of(angles: Array) -> Array:
 
 @dataclass(frozen=True)
 class Reading:
-    """Another frame or order of recorded numbers, and its name in a sentence."""
+    """Another frame, order or unit of recorded numbers: a row of the table of hypotheses.
+
+    Attributes
+    ----------
+    name
+        As a sentence names it.
+    read
+        (n, k) recorded values, and (n, 4) right attitudes at their times -> right values.
+    """
 
     name: str
-    read: Callable[[Array], Array]
+    read: Callable[[Array, Array], Array]
 
 
-def _scalar_last(q: Array) -> Array:
-    return q[:, [3, 0, 1, 2]]
-
-
-#: Other attitudes than (w, x, y, z) from FLU to ENU; the likelier first.
-ATTITUDE_READINGS = (
-    Reading("scalar-last", _scalar_last),
-    Reading("world to body", lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])),
-    Reading("NED and FRD", lambda q: to_enu_flu(q, "attitude")),
-    Reading("scalar-last, NED and FRD", lambda q: to_enu_flu(_scalar_last(q), "attitude")),
+INVERSE = np.array([1.0, -1.0, -1.0, -1.0])
+"""Turns a quaternion (w, x, y, z) into its inverse."""
+_DEGREE = math.pi / 180
+_SCALAR_LAST = [3, 0, 1, 2]
+_TURN_READINGS = (
+    Reading("in FRD axes", lambda w, _: to_enu_flu(w, "body_rate")),
+    Reading("in degrees per second", lambda w, _: w * _DEGREE),
+    Reading("in FRD axes and degrees", lambda w, _: to_enu_flu(w, "body_rate") * _DEGREE),
+    Reading("in milliradians per second", lambda w, _: w * 1e-3),
+    Reading("in milliradians, not degrees, per second", lambda w, _: w * 1e-3 / _DEGREE),
 )
+IN_WORLD_AXES = Reading("in world axes", lambda w, q: rotate(q * INVERSE, w))
+READINGS: Mapping[str, tuple[Reading, ...]] = {
+    "attitude": (
+        Reading("scalar-last", lambda q, _: q[:, _SCALAR_LAST]),
+        Reading("world to body", lambda q, _: q * INVERSE),
+        Reading("NED and FRD", lambda q, _: to_enu_flu(q, "attitude")),
+        Reading(
+            "scalar-last, NED and FRD", lambda q, _: to_enu_flu(q[:, _SCALAR_LAST], "attitude")
+        ),
+    ),
+    "body_rate": (*_TURN_READINGS, IN_WORLD_AXES),
+    "rate_setpoint": _TURN_READINGS,
+    "velocity": (
+        Reading("in body axes", lambda v, q: rotate(q, v)),
+        Reading("in NED axes", lambda v, _: to_enu_flu(v, "velocity")),
+    ),
+    "acceleration": (
+        Reading("in FRD axes", lambda a, _: to_enu_flu(a, "acceleration")),
+        Reading("with x and y swapped", lambda a, _: a[:, [1, 0, 2]]),
+        Reading("turned left about z", lambda a, _: a[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]),
+        Reading("turned right about z", lambda a, _: a[:, [1, 0, 2]] * [1.0, -1.0, 1.0]),
+    ),
+}
+"""Signal -> other ways in which it may be recorded than declared; the likelier first."""
 
 
 LENGTH_SIGNALS = {"position": False, "velocity": True}
@@ -293,7 +325,10 @@ def scale_of(lengths: RawSeries, attitude: RawSeries, *, speeds: bool = False) -
         return Scale()
     centres = _bin_centres(lengths, attitude)
     push = _accelerations(lengths, centres, speeds=speeds)
-    readings = (attitude.values, *(r.read(attitude.values) for r in ATTITUDE_READINGS))
+    readings = (
+        attitude.values,
+        *(r.read(attitude.values, attitude.values) for r in READINGS["attitude"]),
+    )
     return _best_known(
         _slope_scale(*_force_and_tilt(push, RawSeries(attitude.time, values), centres))
         for values in readings

@@ -23,9 +23,9 @@ from tuner.objective.rotor_signals import (
 )
 from tuner.objective.trajectory import with_named_reference
 from tuner.objective.windows import require_windows
+from tuner.recordings.consistency import contradiction_in
 from tuner.recordings.defects import has_stale_attitude
 from tuner.recordings.flight import Flight
-from tuner.recordings.frames import contradiction_in
 from tuner.recordings.loader import InertialFlight, load_flights, read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import parameters_of

@@ -14,8 +14,8 @@ from tests.tuner.recordings import making
 from tuner.config.job import TrajectorySettings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.yaml_section import build
+from tuner.recordings.consistency import correct_frames
 from tuner.recordings.flight import Flight, Series
-from tuner.recordings.frames import correct_frames
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause, Note, NoteCode, damage_sentence
 from tuner.search.job_flights import load_flights

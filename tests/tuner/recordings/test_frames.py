@@ -18,11 +18,12 @@ from tuner.cli import main
 from tuner.config import Options, resolve_settings
 from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
+from tuner.recordings.consistency import contradiction, contradiction_in, correct_frames
 from tuner.recordings.flight import Series
-from tuner.recordings.frames import contradiction, contradiction_in, correct_frames
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.unit_detection import READINGS, Reading
 from tuner.search.job_flights import load_flights, read_recordings
 
 SHARED = Path(__file__).parents[4] / "shared"
@@ -193,6 +194,85 @@ def test_a_velocity_in_other_axes_is_turned_into_the_worlds(axes: str, wind: flo
     assert np.allclose(fixed["velocity"].values, world, atol=0.3)
     signals["velocity"] = Series(TIME, world + noise)
     assert correct_frames(signals, {})[1] == ()
+
+
+def flown_at_random(seed: int) -> dict[str, Series]:
+    """Return a random flight with drag and noise, and all signals that frames are judged by."""
+    random = np.random.default_rng(seed)
+    rates, phases = random.uniform(0.5, 2.0, (2, 3, 3)) * [[[1.0]], [[3.0]]]
+    sizes = random.uniform(0.5, 1.5, (3, 3)) / rates * [[1.0], [1.0], [0.3]]
+    angle = rates * TIME[:, None, None] + phases
+    position, velocity, push = (
+        (sizes * part).sum(axis=2)
+        for part in (np.sin(angle), rates * np.cos(angle), -(rates**2) * np.sin(angle))
+    )
+    felt = push + np.array([0.0, 0.0, 9.81])
+    thrust = felt + 0.4 * velocity  # what is felt is thrust without drag
+    up = thrust / np.linalg.norm(thrust, axis=1, keepdims=True)
+    shortest = np.column_stack([-up[:, 1], up[:, 0], 0.0 * TIME, 1.0 + up[:, 2]])
+    attitude = Rotation.from_quat(shortest) * Rotation.from_rotvec(
+        np.outer(np.sin(0.7 * TIME), [0.0, 0.0, 1.0])
+    )
+    turns = (attitude[:-2].inv() * attitude[2:]).as_rotvec() / 0.02
+    turning = np.pad(turns, ((1, 1), (0, 0)), "edge")
+    signals = {
+        "position": position + 0.001 * random.normal(size=position.shape),
+        "attitude": attitude.as_quat(scalar_first=True),
+        "body_rate": turning + 0.05 * random.normal(size=turning.shape),
+        "velocity": velocity + 0.05 * random.normal(size=velocity.shape),
+        "acceleration": attitude.inv().apply(felt) + 0.3 * random.normal(size=felt.shape),
+        "rate_setpoint": turning + 0.1 * random.normal(size=turning.shape),
+    }
+    return {name: Series(TIME, values) for name, values in signals.items()}
+
+
+RECORDED: dict[str, Callable[[np.ndarray, Rotation], np.ndarray]] = {
+    "in FRD axes": lambda values, _: values * [1.0, -1.0, -1.0],
+    "in degrees per second": lambda values, _: np.degrees(values),
+    "in FRD axes and degrees": lambda values, _: np.degrees(values) * [1.0, -1.0, -1.0],
+    "in milliradians per second": lambda values, _: 1e3 * values,
+    "in milliradians, not degrees, per second": lambda values, _: 1e3 * np.radians(values),
+    "in world axes": lambda values, attitude: attitude.apply(values),
+    "in body axes": lambda values, attitude: attitude.inv().apply(values),
+    "in NED axes": lambda values, _: values[:, [1, 0, 2]] * [1.0, 1.0, -1.0],
+    "with x and y swapped": lambda values, _: values[:, [1, 0, 2]],
+    "turned left about z": lambda values, _: values[:, [1, 0, 2]] * [1.0, -1.0, 1.0],
+    "turned right about z": lambda values, _: values[:, [1, 0, 2]] * [-1.0, 1.0, 1.0],
+}
+"""Reading -> what was recorded, from right values and attitude."""
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    ("signal", "reading"),
+    [(name, row) for name in READINGS if name != "attitude" for row in READINGS[name]],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_each_reading_of_the_table_is_recognised(signal: str, reading: Reading, seed: int) -> None:
+    signals = flown_at_random(seed)
+    attitude = Rotation.from_quat(signals["attitude"].values, scalar_first=True)
+    right = signals[signal].values
+    recorded = Series(TIME, RECORDED[reading.name](right, attitude))
+    fixed, (note,) = correct_frames({**signals, signal: recorded}, {})
+    assert (note.code, note.names) == (NoteCode.FRAME_TURNED, (signal, reading.name))
+    np.testing.assert_allclose(fixed[signal].values, right, atol=1e-9)
+
+
+def test_the_weight_alone_tells_the_axes_of_an_accelerometer() -> None:
+    still = np.zeros((len(TIME), 3))
+    signals = {
+        "position": Series(TIME, still + 1.0),
+        "attitude": Series(TIME, np.tile([1.0, 0.0, 0.0, 0.0], (len(TIME), 1))),
+        "acceleration": Series(TIME, still - [0.0, 0.0, 9.81]),
+    }
+    fixed, (note,) = correct_frames(signals, {})
+    assert note.names == ("acceleration", "in FRD axes")
+    assert np.all(fixed["acceleration"].values[:, 2] == 9.81)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_flight_read_as_declared_raises_no_doubt(seed: int) -> None:
+    assert correct_frames(flown_at_random(seed), {})[1] == ()
 
 
 def test_a_moment_is_no_certainty() -> None:

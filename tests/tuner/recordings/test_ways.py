@@ -17,9 +17,9 @@ from tuner.config import Options, resolve_settings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.findings.findings import one_line
 from tuner.objective.rotor_signals import levers, order_findings
+from tuner.recordings.consistency import _axis_doubts
 from tuner.recordings.content import ReadOptions, read_content
 from tuner.recordings.flight import Flight, Series
-from tuner.recordings.frames import _axis_doubts
 from tuner.recordings.inspector import suggested_map
 from tuner.recordings.interpolation import rotate
 from tuner.recordings.loader import load_flight, read_inertial
@@ -508,7 +508,7 @@ def test_a_spin_seen_by_tilted_markers_is_not_another_size(wobble: float, doubte
     spin = 2.0 * np.sin(time)
     turning = np.column_stack([0.0 * time, wobble * np.sin(time), spin])
     gyro = turning + np.column_stack([0.0 * time, 0.1 * wobble * np.sin(time), 0.0 * time])
-    notes = _axis_doubts(turning, gyro, ("body_rate", "attitude"), 0.05)
+    notes = _axis_doubts(turning, gyro, ("body_rate", "attitude"))
     assert "".join(note.names[1] for note in notes) == doubted
 
 
