@@ -144,8 +144,8 @@ READINGS: Mapping[str, tuple[Reading, ...]] = {
     "acceleration": (
         Reading("in FRD axes", lambda a, _: to_enu_flu(a, "acceleration")),
         Reading("with x and y swapped", lambda a, _: a[:, [1, 0, 2]]),
-        Reading("turned left about z", lambda a, _: a[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]),
-        Reading("turned right about z", lambda a, _: a[:, [1, 0, 2]] * [1.0, -1.0, 1.0]),
+        Reading("in axes turned left about z", lambda a, _: a[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]),
+        Reading("in axes turned right about z", lambda a, _: a[:, [1, 0, 2]] * [1.0, -1.0, 1.0]),
     ),
 }
 """Signal -> other ways in which it may be recorded than declared; the likelier first."""

@@ -236,8 +236,8 @@ RECORDED: dict[str, Callable[[np.ndarray, Rotation], np.ndarray]] = {
     "in body axes": lambda values, attitude: attitude.inv().apply(values),
     "in NED axes": lambda values, _: values[:, [1, 0, 2]] * [1.0, 1.0, -1.0],
     "with x and y swapped": lambda values, _: values[:, [1, 0, 2]],
-    "turned left about z": lambda values, _: values[:, [1, 0, 2]] * [1.0, -1.0, 1.0],
-    "turned right about z": lambda values, _: values[:, [1, 0, 2]] * [-1.0, 1.0, 1.0],
+    "in axes turned left about z": lambda values, _: values[:, [1, 0, 2]] * [1.0, -1.0, 1.0],
+    "in axes turned right about z": lambda values, _: values[:, [1, 0, 2]] * [-1.0, 1.0, 1.0],
 }
 """Reading -> what was recorded, from right values and attitude."""
 
