@@ -280,6 +280,9 @@ def backward_elimination(
     at a time, and none together with those: beside superfluous groups, others seem insignificant,
     so a refit comes first.
 
+    Where a group is needed without the one that goes, and that one without it, noise chooses
+    between the two. Then the one with more coefficients goes.
+
     Parameters
     ----------
     linear, candidates, min_gain
@@ -297,22 +300,26 @@ def backward_elimination(
     without_refits
         Whether to remove all rejected groups without a refit between.
     """
-    left, taken = dict(groups), dict[str, Score]()
-    while True:
-        dropped = _concatenated([without, *(groups[name] for name in taken)])
-        scores = {}
-        for name, columns in left.items():
-            others = _concatenated([model, *(c for other, c in left.items() if other != name)])
-            scores[name] = score(
+
+    def scored(left: Mapping[str, Columns]) -> dict[str, Score]:
+        gone = [columns for name, columns in groups.items() if name not in left]
+        return {
+            name: score(
                 linear,
-                others,
+                _concatenated([model, *(c for other, c in left.items() if other != name)]),
                 columns,
                 candidates=candidates,
                 inside=True,
-                dropped=dropped,
+                dropped=_concatenated([without, *gone]),
                 excludes_gusts=name in excluding_gusts,
                 min_gain=min_gain,
             )
+            for name, columns in left.items()
+        }
+
+    taken = dict[str, Score]()
+    left, scores = dict(groups), scored(groups)
+    while True:
         idle = [name for name, found in scores.items() if not found.is_accepted]
         if not idle:
             return scores, taken
@@ -328,8 +335,17 @@ def backward_elimination(
         )
         if taken and not (without_refits or least in vain or least in lumped):
             return scores, taken
+        rest = {name: columns for name, columns in left.items() if name != least}
+        after = scored(rest)
+        for name in idle:
+            if len(left[name]) > len(left[least]) and after[name].is_accepted:
+                others = {other: columns for other, columns in left.items() if other != name}
+                instead = scored(others)
+                if instead[least].is_accepted:
+                    least, rest, after = name, others, instead
+                    break
         taken[least] = scores[least]
-        del left[least]
+        left, scores = rest, after
 
 
 def _concatenated(parts: Sequence[Columns]) -> Columns:

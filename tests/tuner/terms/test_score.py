@@ -146,6 +146,40 @@ def test_of_two_equivalent_groups_the_lumped_one_is_removed(stand_in):
     assert len(kept) == 1
 
 
+def test_of_two_groups_that_replace_each_other_the_larger_is_removed(monkeypatch):
+    """Noise would choose between them: the larger seems the more significant here."""
+
+    def scored(_, others, columns, **__):
+        beside_the_other = len(others) > len(MODEL)
+        reason = SelectionCode.NOT_SIGNIFICANT if beside_the_other else needed
+        return Score(0.1, 0.1, 0.1, 0.3 if columns is FIRST else 0.2, reason)
+
+    monkeypatch.setattr("tuner.terms.score.score", scored)
+    groups = {"first": FIRST, "two": np.concatenate([SECOND, COPY])}
+    of = {"candidates": 2, "without_refits": True}
+    needed = SelectionCode.PREDICTS_FLIGHTS
+    kept, taken = backward_elimination(linear_fit(0.0), MODEL, groups, **of)
+    assert (list(kept), list(taken)) == (["first"], ["two"])
+    needed = SelectionCode.NOT_SIGNIFICANT  # neither replaces anything
+    kept, taken = backward_elimination(linear_fit(0.0), MODEL, groups, **of)
+    assert (list(kept), list(taken)) == ([], ["first", "two"])
+
+
+def test_a_larger_group_stays_that_a_smaller_one_replaces_in_part(monkeypatch):
+    def scored(_, others, columns, **__):
+        beside_the_other = len(others) > len(MODEL)
+        suffices = columns is not FIRST and not beside_the_other
+        reason = SelectionCode.PREDICTS_FLIGHTS if suffices else SelectionCode.NOT_SIGNIFICANT
+        return Score(0.1, 0.1, 0.1, 0.3 if columns is FIRST else 0.2, reason)
+
+    monkeypatch.setattr("tuner.terms.score.score", scored)
+    groups = {"first": FIRST, "two": np.concatenate([SECOND, COPY])}
+    kept, taken = backward_elimination(
+        linear_fit(0.0), MODEL, groups, candidates=2, without_refits=True
+    )
+    assert (list(kept), list(taken)) == (["two"], ["first"])
+
+
 def _with_a_twin(linear):
     """Return the fields of a loss in which one more coefficient does what the first term does."""
     (first,) = FIRST
