@@ -17,7 +17,7 @@ from sim_jax.constants import GRAVITY, RAD_S_PER_RPM
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
 from tuner.exporters.sdf.model import MAX_ROTORS, Inertial, Model, composite, inertials, read_model
-from tuner.exporters.sdf.spans import Element, read_tree, render
+from tuner.exporters.sdf.spans import read_tree, render
 from tuner.exporters.target import read_file
 from tuner.exporters.targets.px4 import outside_range, read_parameters
 from tuner.result import Run
@@ -38,6 +38,18 @@ MAX_TIP_SPEED = 343.0
 """m/s. No propeller's tips are faster than sound."""
 MAX_ROTOR_SPEED = 6000.0
 """rad/s. Propellers of one inch reach it."""
+REQUIRED_TAGS = ("motorConstant", "momentConstant", "timeConstantUp", "timeConstantDown")
+_LAG = (TIME_CONSTANT_RANGE_S, "s is no motor's ({limits} s)", ": is it in ms?")
+NUMBER_RANGES = {
+    "timeConstantUp": _LAG,
+    "timeConstantDown": _LAG,
+    "momentConstant": (
+        MOMENT_CONSTANT_RANGE_M,
+        "m is no propeller's ({limits} m): it is drag torque over thrust, not 60/(2π kV)",
+        "",
+    ),
+}
+"""Tag of a motor -> its range, the fault outside, and what follows it above."""
 LAYOUT_TOLERANCE_M = 0.02
 """Positions of rotors in allocation and model may differ by this."""
 RELATIVE_TOLERANCE = 0.1
@@ -52,7 +64,8 @@ class Rotor:
     place: Array
     turns: str
     numbers: Mapping[str, float]
-    radius: float | None
+    radius: float
+    """m, of its collision disc; zero without one."""
 
 
 @dataclass(frozen=True)
@@ -107,21 +120,12 @@ def _rotors(model: Model) -> list[Rotor]:
     motors = {model.motor_number(motor): motor for motor in model.motors()}
     rotors = []
     for index, (link, turns) in sorted(links.items()):
-        numbers = {}
-        for child in motors[index].children:
-            if child.number is not None:
-                numbers[child.tag] = child.number
+        children = motors[index].children
+        numbers = {child.tag: child.number for child in children if child.number is not None}
+        radii = [radius.number for disc in link.all("collision") for radius in disc.all("radius")]
         place = model.pose_of_link(link).position
-        rotors.append(Rotor(index, place, turns, numbers, _radius(link)))
+        rotors.append(Rotor(index, place, turns, numbers, (radii or [0.0])[0] or 0.0))
     return rotors
-
-
-def _radius(link: Element) -> float | None:
-    """Return the radius in m of a rotor's collision disc."""
-    for collision in link.all("collision"):
-        for radius in collision.all("radius"):
-            return radius.number
-    return None
 
 
 def _body_faults(model: Model) -> Iterator[str]:
@@ -159,33 +163,15 @@ def _rotor_faults(rotors: list[Rotor], model: Model) -> Iterator[str]:
     """Yield faults of motors, and differences between them."""
     for rotor in rotors:
         where, given = f"rotor {rotor.number}", rotor.numbers
-        for tag in ("motorConstant", "momentConstant", "timeConstantUp", "timeConstantDown"):
+        for tag in REQUIRED_TAGS:
             if tag not in given:
                 yield f"{where}: it has no {tag}, and the plugin's default flies"
-        for tag in ("timeConstantUp", "timeConstantDown"):
-            value = given.get(tag)
-            if (
-                value is not None
-                and not TIME_CONSTANT_RANGE_S[0] <= value <= TIME_CONSTANT_RANGE_S[1]
-            ):
-                hint = ": is it in ms?" if value > TIME_CONSTANT_RANGE_S[1] else ""
-                limits = _range(TIME_CONSTANT_RANGE_S)
-                yield f"{where}: {tag} {value:g} s is no motor's ({limits} s){hint}"
-        moment = given.get("momentConstant")
-        if (
-            moment is not None
-            and not MOMENT_CONSTANT_RANGE_M[0] <= moment <= MOMENT_CONSTANT_RANGE_M[1]
-        ):
-            yield (
-                f"{where}: momentConstant {moment:g} m is no propeller's "
-                f"({_range(MOMENT_CONSTANT_RANGE_M)} m): it is drag torque over thrust, not "
-                "60/(2π kV)"
-            )
-        limit = given.get("maxRotVelocity")
-        tip = None if limit is None or rotor.radius is None else limit * rotor.radius
-        if limit is not None and (
-            limit > MAX_ROTOR_SPEED or (tip is not None and tip > MAX_TIP_SPEED)
-        ):
+        for tag, ((low, high), fault, above) in NUMBER_RANGES.items():
+            if not low <= (value := given.get(tag, low)) <= high:
+                text = fault.format(limits=_range((low, high))) + (above if value > high else "")
+                yield f"{where}: {tag} {value:g} {text}"
+        limit = given.get("maxRotVelocity", 0.0)
+        if limit > MAX_ROTOR_SPEED or limit * rotor.radius > MAX_TIP_SPEED:
             yield (
                 f"{where}: maxRotVelocity {limit:g} rad/s is too fast for its propeller; is it in "
                 f"rpm? that would be {limit * RAD_S_PER_RPM:.4g} rad/s"

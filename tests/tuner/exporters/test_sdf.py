@@ -20,7 +20,6 @@ from tuner.exporters.sdf.model import (
     pose_of,
     read_model,
 )
-from tuner.exporters.sdf.patch import sdf_draft
 from tuner.exporters.sdf.spans import (
     Edit,
     Source,
@@ -34,7 +33,7 @@ from tuner.exporters.sdf.spans import (
 from tuner.exporters.sdf.tags import carried_values, read_values
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.exporters.target import not_carried, target_of, write
-from tuner.exporters.targets.sdf import TARGET
+from tuner.exporters.targets.sdf import TARGET, sdf_draft
 from tuner.vehicle import COEFFICIENTS, Written, values_of
 
 CLASSIC, GZ, TEMPLATE = (
@@ -330,7 +329,9 @@ def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
     model = f"<model><link name='base_link'>{draft.text}</link></model>"
     classic = simulator is GAZEBO_CLASSIC
     if classic:
-        assert read_values(parse(model, path), vehicle) == carried_values(vehicle, channels=True)
+        assert read_values(read_model(parse(model, path), 4), vehicle) == carried_values(
+            vehicle, channels=True
+        )
     flown = simulator.flown(vehicle)
     assert values_of(draft.vehicle) == pytest.approx(values_of(flown), rel=1e-11)
     assert draft.text.count("<channel ") == (4 if classic else 0)

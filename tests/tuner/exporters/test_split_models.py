@@ -12,10 +12,10 @@ import pytest
 from tests.tuner.exporters.conftest import MODELS
 from tuner.core.errors import ExportError
 from tuner.exporters.sdf.model import composite, read_model
-from tuner.exporters.sdf.patch import sdf_draft
 from tuner.exporters.sdf.spans import read_tree, render
 from tuner.exporters.simulators import GZ_SIM
 from tuner.exporters.target import read_file, write
+from tuner.exporters.targets.sdf import sdf_draft
 from tuner.vehicle import values_of
 
 SHIPPED = Path(__file__).resolve().parents[4] / "shared" / "models"

@@ -20,6 +20,7 @@ from tuner.core.errors import ExportError
 
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_TAG = re.compile(r"""(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _FILLER = "J"
 
 
@@ -151,16 +152,8 @@ def without_comments(text: str) -> str:
 
 def _after_tag(text: str, start: int) -> int:
     """Return the position after a tag that begins at another."""
-    quote = ""
-    for place in range(start, len(text)):
-        character = text[place]
-        if quote:
-            quote = "" if character == quote else quote
-        elif character in "\"'":
-            quote = character
-        elif character == ">":
-            return place + 1
-    return len(text)
+    tag = _TAG.match(text, start)
+    return tag.end() if tag else len(text)
 
 
 def set_value(element: Element, value: str) -> Edit:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
-from tuner.exporters.sdf.model import Model, composite, read_model
+from tuner.exporters.sdf.model import Model, composite
 from tuner.exporters.sdf.spans import Element
 from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of, with_values
 
@@ -23,6 +23,15 @@ MOTOR_CONSTANT = "motorConstant"
 CENTER_OF_MASS = tuple(f"center_of_mass_{axis}" for axis in "xyz")
 
 
+def _entries() -> dict[str, Written]:
+    """Return coefficient -> its tag and parent element."""
+    return {
+        name: entry
+        for name, row in COEFFICIENTS.items()
+        if isinstance(entry := row.exported_as.get("sdf"), Written)
+    }
+
+
 def tags_in(parent: Parent) -> dict[str, str]:
     """Return tag -> name of its number.
 
@@ -32,12 +41,8 @@ def tags_in(parent: Parent) -> dict[str, str]:
         Their parent element: ``motor`` is a motor model plugin of Gazebo classic or gz-sim,
         ``channel`` a control channel of PX4's interface plugin for Gazebo classic.
     """
-    tags = {SPEED_LIMIT: SPEED_LIMIT_KEY} if parent == "motor" else {}
-    for name, row in COEFFICIENTS.items():
-        entry = row.exported_as.get("sdf")
-        if isinstance(entry, Written) and entry.parent == parent:
-            tags[entry.tag] = name
-    return tags
+    limit = {SPEED_LIMIT: SPEED_LIMIT_KEY} if parent == "motor" else {}
+    return limit | {e.tag: name for name, e in _entries().items() if e.parent == parent}
 
 
 def numbers_of(vehicle: VehicleFile) -> dict[str, float]:
@@ -89,16 +94,11 @@ def carried_values(vehicle: VehicleFile, *, channels: bool) -> dict[str, float]:
     channels
         Whether it has control channels, as for Gazebo classic.
     """
-    carried: set[str] = set()
-    for name, row in COEFFICIENTS.items():
-        entry = row.exported_as.get("sdf")
-        if isinstance(entry, Written) and (channels or entry.parent != "channel"):
-            carried.add(name)
-    carried.add(SPEED_LIMIT_KEY)
+    tagged = {name for name, e in _entries().items() if channels or e.parent != "channel"}
     numbers = {
         name: value
         for name, value in numbers_of(vehicle).items()
-        if name in carried and name not in vehicle.effects
+        if name in tagged | {SPEED_LIMIT_KEY} and name not in vehicle.effects
     }
     uneven, centre = motor_constants(vehicle), center_of_mass(vehicle)
     if centre is not None:
@@ -129,11 +129,13 @@ def plugin_deviations(vehicle: VehicleFile) -> tuple[str, ...]:
     return ("the plugins' reaction torque acts about the body's z axis, not the world's",)
 
 
-def read_values(root: Element, vehicle: VehicleFile) -> dict[str, float]:
-    """Return name -> value of the numbers in a rendered model.
+def read_values(model: Model, vehicle: VehicleFile) -> dict[str, float]:
+    """Return name -> value of the numbers in a model.
 
     Parameters
     ----------
+    model
+        As rendered.
     vehicle
         Gives the rotors, whether they are equal, and whether rotor positions count from its
         centre of mass.
@@ -143,8 +145,7 @@ def read_values(root: Element, vehicle: VehicleFile) -> dict[str, float]:
     ExportError
         Its rotors have different values.
     """
-    model, motor_tags = read_model(root, len(vehicle.rotors)), tags_in("motor")
-    read: dict[str, float] = {}
+    motor_tags, read = tags_in("motor"), dict[str, float]()
     if motor_constants(vehicle) is not None:
         del motor_tags[MOTOR_CONSTANT]
         for motor in model.motors():
@@ -168,8 +169,7 @@ def _shared_values(elements: Sequence[Element], tags: dict[str, str]) -> dict[st
     """Return the values that elements share."""
     read: dict[str, float] = {}
     for tag, name in tags.items():
-        children = [element.find(tag) for element in elements]
-        texts = {"" if child is None else child.value for child in children}
+        texts = {child.value if (child := of.find(tag)) else "" for of in elements}
         try:
             values = {float(text) if text else None for text in texts}
         except ValueError:
