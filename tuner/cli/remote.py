@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -34,9 +33,8 @@ Token = Annotated[
 JobName = Annotated[str, Parameter(help="Take this job, by its id.")]
 
 
-@contextmanager
-def client_of(server: str | None, token: str | None) -> Iterator[Client]:
-    """Yield a client of the server that the options name.
+def client_of(server: str | None, token: str | None) -> closing[Client]:
+    """Return a client of the server that the options name, closed at the end of the context.
 
     Raises
     ------
@@ -45,11 +43,7 @@ def client_of(server: str | None, token: str | None) -> Iterator[Client]:
     """
     from tuner.client.client import Client
 
-    client = Client(server, token)
-    try:
-        yield client
-    finally:
-        client.close()
+    return closing(Client(server, token))
 
 
 def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> None:

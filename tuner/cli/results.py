@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,11 +12,9 @@ from rich.text import Text
 from tuner.cli.tables import STYLE_OF_LOOK, console, rich_table
 from tuner.core.phrases import listed_within, shorten
 from tuner.evaluate.records import RMSE_UNITS
-from tuner.report.section import Cell, Section, Table
+from tuner.report.section import Cell, Table
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from tuner.job.bench import BenchResult
     from tuner.job.sensitivity import SensitivityResult
     from tuner.report.contents import Contents
@@ -48,7 +46,7 @@ def print_run(
 
     contents = read_contents(folder)
     if verbose:
-        print_sections(folder)
+        _print_sections(contents, lambda key: key != "provenance")
     screen = console(WIDTH)
     for line in _summary(contents, result, seconds):
         if isinstance(line, Table):
@@ -167,27 +165,21 @@ def _print_files(folder: Path, exports: Sequence[ExportRecord], seconds: float |
     return [*lines, f"Written to {shlex.quote(str(folder))}{took}: report.html, best_fit.yaml."]
 
 
-def print_sections(folder: Path) -> None:
-    """Print the page of a result folder, without its figures."""
-    from tuner.report.contents import read_contents
+def _print_sections(contents: Contents, wanted: Callable[[str], bool]) -> None:
+    """Print the page of a result folder, without its figures: the sections of wanted keys."""
     from tuner.report.page import sections_of
 
     screen = console()
-    for section in sections_of(read_contents(folder)):
-        if section.key != "provenance":
-            _print_section(screen, section)
-
-
-def _print_section(screen: Console, section: Section) -> None:
-    screen.print(Text(f"\n{section.title}", "bold"))
-    for sentence in section.sentences:
-        screen.print(Text(sentence))
-    for point in section.points:
-        screen.print(Text(f"- {point.text}", STYLE_OF_LOOK.get(point.look, "")))
-    for table in section.tables:
-        screen.print(rich_table(table))
-    if section.note:
-        screen.print(Text(section.note, "dim"))
+    for section in filter(lambda section: wanted(section.key), sections_of(contents)):
+        screen.print(Text(f"\n{section.title}", "bold"))
+        for sentence in section.sentences:
+            screen.print(Text(sentence))
+        for point in section.points:
+            screen.print(Text(f"- {point.text}", STYLE_OF_LOOK.get(point.look, "")))
+        for table in section.tables:
+            screen.print(rich_table(table))
+        if section.note:
+            screen.print(Text(section.note, "dim"))
 
 
 def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
@@ -206,13 +198,10 @@ def print_sensitivity(result: SensitivityResult, *, verbose: bool = False) -> No
     """Print each coefficient's interval, the next flight, and the folder."""
     from tuner.findings.findings import one_line
     from tuner.report.contents import read_contents
-    from tuner.report.page import sections_of
     from tuner.uncertainty.verdict_texts import direction_in_words
 
-    screen = console()
-    for section in sections_of(read_contents(result.folder)):
-        if verbose or section.key in ("coefficients", "next_flight"):
-            _print_section(screen, section)
+    screen, first = console(), ("coefficients", "next_flight")
+    _print_sections(read_contents(result.folder), lambda key: verbose or key in first)
     for finding in result.findings:
         screen.print(one_line(finding))
     for direction in result.knowledge.directions[:1]:

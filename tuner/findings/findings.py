@@ -131,7 +131,11 @@ class Code(Worded):
     INLET_CHOSEN = (
         "inlet_chosen",  # correlation, recorded, gyro (Hz); names: inlet, signal, order?
         sentences.inlet_chosen,
-        sentences.inlet_remedy,
+        lambda finding: (
+            ""  # the motors' order, with its own finding, is the cause
+            if len(finding.names) > 2
+            else f"Log the {finding.names[1].replace('_', ' ')} as often as its loop runs."
+        ),
     )
     MANOEUVRES_CHOSEN = (
         "manoeuvres_chosen",  # fitted, flights; names: recording, numbers
@@ -183,7 +187,11 @@ class Code(Worded):
     SETPOINTS_SCALED = (
         "setpoints_scaled",  # gain, correlation; names: the axis, the law guessed
         sentences.setpoints_scaled,
-        sentences.setpoints_remedy,
+        lambda finding: (
+            f"Set attitude.law: {finding.names[1]} in the controller file."
+            if finding.names[1]
+            else "Check the gains of position and attitude control in the controller file."
+        ),
     )
     SETPOINTS_LATE = (
         "setpoints_late",  # seconds
@@ -333,7 +341,13 @@ class Code(Worded):
     FLIGHT_NOT_FLOWN = (
         "flight_not_flown",  # rmse, others (m), seconds; beyond, beyond_recorded (shares)?
         sentences.flight_not_followed,
-        sentences.flight_not_followed_remedy,
+        lambda finding: (
+            "Check position.max_feedback_acceleration in the controller file; at this speed a few "
+            "percent of thrust decide: fly it slower, and judge the fit by the other flights."
+            if "beyond" in finding.numbers
+            else "Look at what changes there: wind, damage, a reference or a controller that is "
+            "another."
+        ),
     )
     LAW_LACKING = (
         "law_lacking",  # share; names: axis, what it goes with, coefficients it moves
@@ -343,7 +357,11 @@ class Code(Worded):
     CONTROLLER_ANSWERS = (
         "controller_answers",  # AXIS, AXIS_error; names: P, I or late, the AXES
         sentences.controller_gains_differ,
-        sentences.controller_remedy,
+        lambda finding: (
+            "Compare the controller file with the autopilot's parameters, as they are now."
+            if finding.subject == sentences.CONTROLLER_FILE
+            else "Leave it out, or fit it by itself with the gains that flew."
+        ),
     )
     ROTOR_SPEEDS_LATE = (
         "rotor_speeds_late",  # seconds
@@ -357,8 +375,8 @@ class Code(Worded):
     )
     TERM_SHOWS = (
         "term_shows",  # NAME, NAME_error; names: NAMEs; the subject is their group
-        sentences.significant_term,
-        sentences.significant_term_remedy,
+        lambda finding: sentences.TERM_SENTENCES[finding.subject][0](finding.numbers),
+        lambda finding: sentences.TERM_SENTENCES[finding.subject][1],
     )
     INPUT_LATE = (
         "input_late",  # seconds
@@ -448,7 +466,11 @@ class Code(Worded):
     GROUND_CONFLICT = (
         "ground_conflict",  # deviation (standard errors), ground, flights, mass (kg)?; names: unit
         sentences.ground_conflict,
-        sentences.ground_remedy,
+        lambda finding: (
+            "Weigh the vehicle again; else look for what is wrong with the rig, or the model."
+            if "mass" in finding.numbers
+            else "Find out which is wrong, the rig or the model."
+        ),
     )
     SCALES_WITH_MASS = (
         "scales_with_mass",  # mass (kg); names: the coefficients

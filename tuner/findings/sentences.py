@@ -98,13 +98,6 @@ def ground_conflict(finding: Finding) -> str:
     )
 
 
-def ground_remedy(finding: Finding) -> str:
-    """Return the remedy of a conflict of ground and flights."""
-    if "mass" in finding.numbers:
-        return "Weigh the vehicle again; else look for what is wrong with the rig, or the model."
-    return "Find out which is wrong, the rig or the model."
-
-
 def inlet_chosen(finding: Finding) -> str:
     """Return why a flight has an inlet further down the loop than recorded."""
     inlet, signal, *order = finding.names
@@ -123,26 +116,12 @@ def inlet_chosen(finding: Finding) -> str:
     return as_sentence(f"{unexplained} it is simulated from its rotor speeds")
 
 
-def inlet_remedy(finding: Finding) -> str:
-    """Return the signal to log; empty if the motors' order, with its own finding, is the cause."""
-    _, signal, *order = finding.names
-    return "" if order else f"Log the {signal.replace('_', ' ')} as often as its loop runs."
-
-
 def setpoints_scaled(finding: Finding) -> str:
     """Return the factor by which set-points differ, and the law that would explain it."""
     axis, law = finding.names
     so = f", as those of the {law} law would be" if law else ""
     factor = f"{finding.numbers['gain']:.1f}"
     return f"{axis.capitalize()} rate set-points are {factor} times the controller file's{so}."
-
-
-def setpoints_remedy(finding: Finding) -> str:
-    """Return the remedy of set-points that differ by a factor."""
-    _, law = finding.names
-    if law:
-        return f"Set attitude.law: {law} in the controller file."
-    return "Check the gains of position and attitude control in the controller file."
 
 
 def setpoints_foreign(finding: Finding) -> str:
@@ -204,16 +183,6 @@ def flight_not_followed(finding: Finding) -> str:
     )
 
 
-def flight_not_followed_remedy(finding: Finding) -> str:
-    """Return what to check if the loop does not follow a flight."""
-    if "beyond" in finding.numbers:
-        return (
-            "Check position.max_feedback_acceleration in the controller file; at this speed a few "
-            "percent of thrust decide: fly it slower, and judge the fit by the other flights."
-        )
-    return "Look at what changes there: wind, damage, a reference or a controller that is another."
-
-
 def missing_law(finding: Finding) -> str:
     """Return the law that the model lacks, and the coefficients whose intervals include it."""
     axis, feature, *moved = finding.names
@@ -265,13 +234,6 @@ def controller_gains_differ(finding: Finding) -> str:
     return as_sentence(f"{difference}; intervals hold what that moves")
 
 
-def controller_remedy(finding: Finding) -> str:
-    """Return what to compare, or to leave out."""
-    if finding.subject != CONTROLLER_FILE:
-        return "Leave it out, or fit it by itself with the gains that flew."
-    return "Compare the controller file with the autopilot's parameters, as they are now."
-
-
 def rotor_speeds_late(finding: Finding) -> str:
     """Return the delay between rotor speeds and angular acceleration."""
     seconds = finding.numbers["seconds"]
@@ -292,16 +254,6 @@ def rotor_changed(finding: Finding) -> str:
         f"From t = {seconds:.1f} s of this flight rotor {finding.numbers['rotor']:.0f} ({place}) "
         f"gives {change} thrust at the same speed than before: the flight is used up to there."
     )
-
-
-def significant_term(finding: Finding) -> str:
-    """Return what a significant term shows of the vehicle, its autopilot or its files."""
-    return _TERM_SENTENCES[finding.subject][0](finding.numbers)
-
-
-def significant_term_remedy(finding: Finding) -> str:
-    """Return the remedy of a significant term."""
-    return _TERM_SENTENCES[finding.subject][1]
 
 
 def _thrust_exponent(numbers: Numbers) -> str:
@@ -371,7 +323,7 @@ def _excess(numbers: Numbers, name: str) -> str:
     return f"{abs(more):.2g} ± {error:.1g} % {'higher' if more > 0.0 else 'lower'}"
 
 
-_TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
+TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
     "thrust_exponent": (
         _thrust_exponent,
         "A simulator without such a term has the right thrust at the hover alone.",

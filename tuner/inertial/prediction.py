@@ -74,18 +74,13 @@ def _prediction_errors(stretch: Stretch, vehicle: VehicleFile | None) -> Array:
         value = values_of(vehicle)
         inertia = np.array([value[f"inertia_{axis}{axis}"] for axis in "xyz"])
         trim = np.array([value.get(f"torque_trim_{axis}", 0.0) for axis in "xyz"])
-        torque = (
-            value["motor_constant"] * _squared_speeds(stretch, vehicle) @ levers(vehicle) + trim
+        motor = model_of(vehicle, ControllerFile()).vehicle.motor
+        lags = MotorLags(
+            value["time_constant_up"], value["time_constant_down"], value["actuator_latency"]
         )
+        speeds = rotor_speeds(stretch.command, stretch.step, motor, lags)
+        torque = value["motor_constant"] * np.square(speeds) @ levers(vehicle) + trim
         for step in range(places[-1]):
             moment = torque[begin + step] - np.cross(rates[-1], inertia * rates[-1])
             rates.append(rates[-1] + stretch.step * moment / inertia)
     return np.stack([rates[min(n, len(rates) - 1)] - measured[begin + n] for n in places])
-
-
-def _squared_speeds(stretch: Stretch, vehicle: VehicleFile) -> Array:
-    motor, value = model_of(vehicle, ControllerFile()).vehicle.motor, values_of(vehicle)
-    lags = MotorLags(
-        value["time_constant_up"], value["time_constant_down"], value["actuator_latency"]
-    )
-    return np.square(rotor_speeds(stretch.command, stretch.step, motor, lags))

@@ -24,6 +24,7 @@ from tuner.service import jobs, recordings
 from tuner.service.attempt import POLL_INTERVAL_S
 from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
 from tuner.service.jobs import history
+from tuner.service.recordings import FORM_FIELD, Upload, receive
 from tuner.service.request import JobRequest
 from tuner.service.safety import REPORT_POLICY
 from tuner.service.service import Metrics, Service
@@ -41,7 +42,6 @@ from tuner.service.shapes import (
     full_job,
 )
 from tuner.service.tables import FINISHED, EventRow, FileRow, JobRow, RecordingRow, State
-from tuner.service.upload import FORM_FIELD, Upload, receive
 from tuner.service.words import over_http
 
 

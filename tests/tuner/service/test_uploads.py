@@ -21,7 +21,6 @@ from tests.tuner.service.conftest import FLIGHTS, LIMITS, listening, submit, upl
 from tuner.config import Options
 from tuner.core.errors import RecordingError
 from tuner.service import errors, inspection, recordings
-from tuner.service import upload as upload_module
 from tuner.service.service import Service
 from tuner.service.settings import MIB
 from tuner.service.words import FIELD_PHRASES, on_the_web, over_http
@@ -247,7 +246,7 @@ def test_a_full_disk_refuses_the_upload_and_keeps_the_rest(client, service, tabl
         with errors.full_disk():
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(upload_module._Receiver, "flush", refuse)
+    monkeypatch.setattr(recordings._Receiver, "flush", refuse)
     answer = send(client, b"time,x\n0,0\n" * 1000)
     assert answer.status_code == 507
     assert answer.json()["detail"] == "the server: has no space left; free some space and try again"

@@ -245,12 +245,15 @@ def forces(contents: Contents) -> Section | None:
 
     Of the flight that accelerates most: the others' curves are much the same.
     """
-    flights = {name: _forces_by_term(arrays) for name, arrays in contents.traces.items()}
-    flights = {name: of_term for name, of_term in flights.items() if CLOCK in of_term}
+    flights = {
+        name: {key.removeprefix(PREFIX): a for key, a in arrays.items() if key.startswith(PREFIX)}
+        for name, arrays in contents.traces.items()
+        if PREFIX + CLOCK in arrays
+    }
     if not flights:
         return None
     name = max(flights, key=lambda name: _weight_of(flights[name]))
-    of_term = dict(flights[name])
+    of_term = flights[name]
     time = of_term.pop(CLOCK)
     charts = (
         _chart(name, "forces", "N", time, {n: v[:, :3] for n, v in of_term.items()}),
@@ -264,14 +267,6 @@ def forces(contents: Contents) -> Section | None:
         "trajectory."
     )
     return Section("forces", "Forces and moments by term", charts=charts, note=note, folded=True)
-
-
-def _forces_by_term(arrays: Mapping[str, Array]) -> dict[str, Array]:
-    return {
-        name.removeprefix(PREFIX): values
-        for name, values in arrays.items()
-        if name.startswith(PREFIX)
-    }
 
 
 def _weight_of(of_term: Mapping[str, Array]) -> float:
