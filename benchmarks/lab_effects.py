@@ -36,9 +36,11 @@ EFFECTS = (
     "translational_lift",
     "integral_gain",
     "gyro_filter",
+    "attitude_gain",
+    "derivative_filter",
 )
 """As they are drawn: a seed's effect goes with their order."""
-UNKNOWN = ("rotor_damage", "translational_lift", "integral_gain", "gyro_filter")
+UNKNOWN = ("rotor_damage", "translational_lift", "attitude_gain", "derivative_filter")
 KNOWN = tuple(name for name in EFFECTS if name not in UNKNOWN)
 """Groups of terms."""
 CHOICE = os.environ.get("TUNE_LAB_EFFECT", "drawn")
@@ -59,8 +61,8 @@ class Effect:
     size
         Of what this project's simulator does not fly: share of its thrust that a rotor loses; s of
         the filter through which rotor speeds went before they were logged; gain of thrust per
-        squared air velocity across the rotors, s²/m²; factor on the controller file's I, or on its
-        gyro's cutoff.
+        squared air velocity across the rotors, s²/m²; factor on the attitude controller's time
+        constant, or on the cutoff of the filter of the differentiated rate.
     rotor, flight, begin
         Which rotor loses thrust, in which flight, from which s on.
     several
@@ -108,6 +110,8 @@ def effect_of(seed: int, *, seconds: float, flights: int, log_rate: float) -> Ef
         "translational_lift": random.uniform(0.002, 0.006),
         "integral_gain": float(np.exp(signed(0.2, 0.5))),
         "gyro_filter": float(np.exp(signed(0.2, 0.5))),
+        "attitude_gain": float(np.exp(signed(0.05, 0.15))),
+        "derivative_filter": float(np.exp(signed(0.2, 0.5))),
     }
     drawn = Effect(
         name=name,
@@ -116,6 +120,8 @@ def effect_of(seed: int, *, seconds: float, flights: int, log_rate: float) -> Ef
         begin=float(random.uniform(0.4, 0.8) * seconds),
     )
     kept = _kept(sizes["tachometer_lag"], log_rate)
+    values["integral_gain"] = {"integral_gain": sizes.pop("integral_gain")}
+    values["gyro_filter"] = {"gyro_cutoff_factor": sizes.pop("gyro_filter")}
     values["tachometer_lag"] = {"tachometer_lag": kept / (1.0 - kept) / log_rate}
 
     def one(name: str) -> Effect:
@@ -142,13 +148,12 @@ def _kept(seconds: float, rate: float) -> float:
 def controller_with(effect: Effect, file: ControllerFile) -> ControllerFile:
     """Return the controller that flies, which is not the file's."""
     for part in effect.each:
-        if part.name == "integral_gain":
-            axes = {name: getattr(file.rate, name) for name in ("roll", "pitch", "yaw")}
-            changed = {name: axis.replace(i=part.size * axis.i) for name, axis in axes.items()}
-            file = file.replace(rate=file.rate.replace(**changed))
-        if part.name == "gyro_filter":
-            cutoff = part.size * (file.filters.gyro_cutoff or 0.0)
-            file = file.replace(filters=file.filters.replace(gyro_cutoff=cutoff))
+        if part.name == "attitude_gain":
+            slower = part.size * file.attitude.time_constant
+            file = file.replace(attitude=file.attitude.replace(time_constant=slower))
+        if part.name == "derivative_filter":
+            cutoff = part.size * (file.filters.dgyro_cutoff or 0.0)
+            file = file.replace(filters=file.filters.replace(dgyro_cutoff=cutoff))
     return file
 
 

@@ -92,10 +92,11 @@ def start_simulation(
     vehicle, controller, inlet, start, environment = in_precision(arguments, dtype)
     others = jax.tree.leaves((vehicle, controller, start, environment.at_first))
     shape = jnp.broadcast_shapes(*map(jnp.shape, others), inlet.batch_shape())
+    controller = with_gains_of(controller, vehicle)
     senses, read_late = gyro_of(vehicle), vehicle.effects.get("tachometer_lag")
     plant = Plant(
         vehicle=vehicle,
-        controller=with_gains_of(controller, vehicle),
+        controller=controller,
         environment=environment,
         schedule=schedule,
         limits=Limits() if limits is None else limits,

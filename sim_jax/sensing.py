@@ -105,6 +105,10 @@ def constant_history(motion: Motion, length: int, step: float) -> Float[Array, "
     return jnp.concatenate([moved, now[:, 3:]], axis=1)
 
 
+MAX_CUTOFF = 0.495
+"""Highest cut-off of the gyro's filter, as a share of the rate at which it runs."""
+
+
 class GyroFilter(eqx.Module):
     """PX4's low-passes on the gyro, prepared once a rollout; None leaves one out."""
 
@@ -115,18 +119,22 @@ class GyroFilter(eqx.Module):
 
     @staticmethod
     def at(filters: Filters, rate: float) -> GyroFilter:
-        """Prepare PX4's LowPassFilter2p (Butterworth) and AlphaFilter at a sample rate in Hz."""
-        b0 = a1 = a2 = share = None
+        """Prepare PX4's LowPassFilter2p (Butterworth) and AlphaFilter at a sample rate in Hz.
+
+        The cut-off is kept below half of that rate, which a search may try to pass.
+        """
+        b0 = a1 = a2 = derivative_share = None
         if filters.gyro_cutoff is not None:
-            ohm = jnp.tan(pi * filters.gyro_cutoff / rate)
+            share = jnp.minimum(filters.gyro_cutoff / rate, MAX_CUTOFF)
+            ohm = jnp.tan(pi * share)
             norm = 1.0 + sqrt(2.0) * ohm + ohm * ohm
             b0 = ohm * ohm / norm
             a1 = 2.0 * (ohm * ohm - 1.0) / norm
             a2 = (1.0 - sqrt(2.0) * ohm + ohm * ohm) / norm
         if filters.dgyro_cutoff is not None:
             constant = 1.0 / (2.0 * pi * filters.dgyro_cutoff)
-            share = (1.0 / rate) / (constant + 1.0 / rate)
-        return GyroFilter(b0, a1, a2, share)
+            derivative_share = (1.0 / rate) / (constant + 1.0 / rate)
+        return GyroFilter(b0, a1, a2, derivative_share)
 
 
 class GyroMemory(eqx.Module):

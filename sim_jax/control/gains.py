@@ -85,17 +85,25 @@ class Controller(eqx.Module):
 
 
 def with_gains_of(controller: Controller, vehicle: Vehicle) -> Controller:
-    """Return the controller with K of the rates times ``rate_gain_roll_pitch`` and ``_yaw``.
+    """Return the controller that flies a vehicle whose effects say how it differs from its file.
 
-    What the autopilot's gains are over those of the controller file, where a vehicle has these
-    effects: parameters that were changed since, or scaled by an autotune or by the battery (PX4
-    MC_BAT_SCALE_EN).
+    K of the rates is times ``rate_gain_roll_pitch`` and ``rate_gain_yaw``, I times
+    ``integral_gain``, the gyro filter's cut-off times ``gyro_cutoff_factor``: parameters that were
+    changed since, or scaled by an autotune or by the battery (PX4 MC_BAT_SCALE_EN).
     """
-    gains = [vehicle.effects.get(f"rate_gain_{axes}") for axes in ("roll_pitch", "yaw")]
-    if all(gain is None for gain in gains):
+    names = ("rate_gain_roll_pitch", "rate_gain_yaw", "integral_gain", "gyro_cutoff_factor")
+    if not vehicle.effects.keys() & set(names):
         return controller
-    across, about = (1.0 if gain is None else gain for gain in gains)
-    k = controller.rate.k
-    k = Vec3(k.x * across, k.y * across, k.z * about)
-    changed: Controller = eqx.tree_at(lambda c: c.rate.k, controller, k)
+    across, about, integral, filtered = (vehicle.effects.get(name, 1.0) for name in names)
+    rate, cutoff = controller.rate, controller.filters.gyro_cutoff
+    changed: Controller = eqx.tree_at(
+        lambda c: (c.rate.k, c.rate.i, c.filters.gyro_cutoff),
+        controller,
+        (
+            Vec3(rate.k.x * across, rate.k.y * across, rate.k.z * about),
+            rate.i * integral,
+            None if cutoff is None else cutoff * filtered,
+        ),
+        is_leaf=lambda leaf: leaf is None,
+    )
     return changed

@@ -34,7 +34,12 @@ from tuner.vehicle import REGISTRY
 
 TILT = {"autopilot_tilt_x": 0.02, "autopilot_tilt_y": -0.01}
 SCALE = {"gyro_scale_x": 1.01, "gyro_scale_y": 0.99, "gyro_scale_z": 1.02}
-GAINS = {"rate_gain_roll_pitch": 1.05, "rate_gain_yaw": 0.95}
+GAINS = {
+    "rate_gain_roll_pitch": 1.05,
+    "rate_gain_yaw": 0.95,
+    "integral_gain": 1.3,
+    "gyro_cutoff_factor": 0.8,
+}
 ALL = {**TILT, **SCALE, **GAINS, "thrust_exponent": 1.93}
 NEUTRAL = {name: REGISTRY[name].neutral for name in ALL}
 SAMPLES = 150
@@ -138,4 +143,6 @@ def test_gains_are_those_of_the_file_times_a_factor():
     flies = with_gains_of(file, craft_with(GAINS))
     factors = np.array([1.05, 1.05, 0.95])
     np.testing.assert_allclose(flies.rate.k.stacked(), factors * file.rate.k.stacked())
+    np.testing.assert_allclose(flies.rate.i.stacked(), 1.3 * file.rate.i.stacked())
+    assert flies.filters.gyro_cutoff == 0.8 * file.filters.gyro_cutoff
     assert with_gains_of(file, vehicle()) is file

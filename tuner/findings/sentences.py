@@ -284,6 +284,15 @@ def _rate_gain(numbers: Numbers) -> str:
     return as_sentence(f"{listed(parts)} than in the controller file")
 
 
+def _integral_gain(numbers: Numbers) -> str:
+    return f"The rate controller's I acts {_excess(numbers, 'integral_gain')} than its file's."
+
+
+def _gyro_filter(numbers: Numbers) -> str:
+    excess = _excess(numbers, "gyro_cutoff_factor")
+    return f"The gyro's low-pass filter cuts off {excess} than in the controller file."
+
+
 def _autopilot_tilt(numbers: Numbers) -> str:
     parts = [
         f"{math.degrees(numbers[name]):+.2f} ± {math.degrees(numbers[f'{name}_error']):.2f}° "
@@ -336,6 +345,11 @@ TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
         _rate_gain,
         "Compare it with the autopilot's parameters (MC_ROLLRATE_K, _P, MC_BAT_SCALE_EN).",
     ),
+    "integral_gain": (
+        _integral_gain,
+        "Compare it with the autopilot's parameters (MC_ROLLRATE_I, MC_PITCHRATE_I, MC_YAWRATE_I).",
+    ),
+    "gyro_filter": (_gyro_filter, "Compare it with the autopilot's IMU_GYRO_CUTOFF."),
     "autopilot_tilt": (
         _autopilot_tilt,
         "Mount it straight, or calibrate its level (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF).",

@@ -326,6 +326,8 @@ REPORTED_TERMS = (
     "thrust_exponent",
     "motor_lag",
     "rate_gain",
+    "integral_gain",
+    "gyro_filter",
     "autopilot_tilt",
     "gyro_scale",
     "tachometer_lag",

@@ -143,6 +143,24 @@ SURROUNDING_ROWS = (
             ("yaw", "yaw", "MC_YAWRATE_K"),
         )
     ),
+    _factor(
+        "integral_gain",
+        "I of the rate controller over that of its file",
+        "PX4 MC_ROLLRATE_I, MC_PITCHRATE_I, MC_YAWRATE_I; parameters changed since",
+        group="integral_gain",
+        part="rate control",
+        bounds=3.0,
+        prior_sd=0.3,
+    ),
+    _factor(
+        "gyro_cutoff_factor",
+        "cut-off of the gyro's low-pass filter over that of the controller file",
+        "PX4 IMU_GYRO_CUTOFF; parameters changed since",
+        group="gyro_filter",
+        part="rate control",
+        bounds=3.0,
+        prior_sd=0.3,
+    ),
     Coefficient(
         name="tachometer_lag",
         unit="s",

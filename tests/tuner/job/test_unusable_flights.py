@@ -125,6 +125,8 @@ def test_coefficients_that_an_inlet_bypasses_are_not_fitted(updated, flight):
         "gyro_cutoff",
         "rate_gain_roll_pitch",
         "rate_gain_yaw",
+        "integral_gain",
+        "gyro_cutoff_factor",
     }
     with pytest.raises(ConfigError, match="leaves no coefficient that acts"):
         space_of(

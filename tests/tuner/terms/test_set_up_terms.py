@@ -18,6 +18,8 @@ TRUTH = {
     "gyro_scale_z": 1.015,
     "rate_gain_roll_pitch": 1.05,
     "rate_gain_yaw": 0.93,
+    "integral_gain": 1.3,
+    "gyro_cutoff_factor": 0.8,
 }
 GROUPS = {
     group: names for group, names in term_groups().items() if set(names) <= set(TRUTH)
