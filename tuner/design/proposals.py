@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -171,12 +171,8 @@ def effect_in_words(share: float, label: str) -> str:
     return f"narrow {of} by {1 - share:.0%}"
 
 
-def next_log_in_words(proposals: Sequence[LogProposal]) -> list[str]:
-    """Return a sentence on each signal, the most helpful first."""
-    return [_sentence(proposal) for proposal in proposals]
-
-
-def _sentence(proposal: LogProposal) -> str:
+def log_in_words(proposal: LogProposal) -> str:
+    """Return a sentence on a signal to log, and its effects."""
     signal, rate = proposal.signal.replace("_", " "), f"{proposal.rate:.0f} Hz"
     if proposal.change == "faster":
         share = min(proposal.shrinks.values())

@@ -11,7 +11,13 @@ from alembic import command
 from alembic.config import Config
 from alembic.util.exc import CommandError
 from sqlalchemy import Connection, Engine, create_engine, event, make_url
-from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
+from sqlalchemy.exc import (
+    ArgumentError,
+    DBAPIError,
+    InterfaceError,
+    NoSuchModuleError,
+    OperationalError,
+)
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
@@ -116,21 +122,26 @@ def _outages() -> Iterator[None]:
     except PoolTimeout:
         raise UnavailableError("the database", "is busy", "try again in a minute") from None
     except DBAPIError as error:
-        words = str(error.orig)
-        if "locked" in words:
-            what, remedy = "is locked by another program", "close that, or try again in a minute"
-        elif "disk is full" in words or "No space left" in words:
-            what, remedy = "cannot be written: the disk is full", "free some space and try again"
-        elif "not a database" in words or "malformed" in words:
-            what, remedy = "is damaged, or no database", "restore it from a copy"
-        elif error.connection_invalidated or type(error).__name__ in _OUTAGES:
+        said = str(error.orig)
+        for words, what, remedy in _OUTAGES:
+            if any(word in said for word in words):
+                raise UnavailableError("the database", what, remedy) from error
+        if error.connection_invalidated or isinstance(error, OperationalError | InterfaceError):
             what, remedy = "cannot be reached", "check that it runs, and try again"
-        else:
-            raise
-        raise UnavailableError("the database", what, remedy) from error
+            raise UnavailableError("the database", what, remedy) from error
+        raise
 
 
-_OUTAGES = ("OperationalError", "InterfaceError")
+_OUTAGES = (
+    (("locked",), "is locked by another program", "close that, or try again in a minute"),
+    (
+        ("disk is full", "No space left"),
+        "cannot be written: the disk is full",
+        "free some space and try again",
+    ),
+    (("not a database", "malformed"), "is damaged, or no database", "restore it from a copy"),
+)
+"""Words of a driver -> what is wrong, and what to do."""
 
 
 def _engine(given: str) -> Engine:

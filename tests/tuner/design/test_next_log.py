@@ -12,7 +12,7 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import errors_of
 from tuner.design import next_log
 from tuner.design.next_log import propose_logs
-from tuner.design.proposals import LogProposal, next_log_in_words
+from tuner.design.proposals import LogProposal, log_in_words
 from tuner.objective.information import information_at
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import recordings_of
@@ -70,7 +70,7 @@ def test_what_is_foreseen_is_what_comes_of_it(full_flight, full_bag, updated, mo
     assert (added.signal, added.change) == ("rotor_speed", "added")
     assert all(0.0 < share <= 1.0 + 1e-9 for share in added.shrinks.values())
     assert min(added.shrinks.values()) < 0.9
-    (sentence,) = next_log_in_words([added])
+    sentence = log_in_words(added)
     assert sentence.startswith("Log the rotor speed, at 100 Hz and good to")
 
     # speeds without noise would say what turns commands into speeds, and leave the rest to itself
@@ -128,7 +128,7 @@ def test_commands_that_could_be_fed_in_would_tell_what_turns_the_vehicle(
     assert (commands.signal, commands.change) == ("command", "fed")
     assert set(commands.shrinks) == {"inertia_xx", "inertia_yy"}
     assert max(commands.shrinks.values()) < 0.2
-    (sentence,) = next_log_in_words([commands])
+    sentence = log_in_words(commands)
     assert "Log the command at 250 Hz, so that it can be fed in" in sentence
     assert "narrow the interval of inertia_xx (not fitted so far) to" in sentence
 
@@ -142,7 +142,7 @@ def test_sentences_name_what_gains_most():
         shrinks={"motor_constant": 0.5, "inertia_xx": 0.95, "input_scaling": 0.2},
     )
     faster = LogProposal(signal="command", change="faster", rate=250.0, shrinks={"mass": 0.7})
-    of_added, of_faster = next_log_in_words([added, faster])
+    of_added, of_faster = map(log_in_words, (added, faster))
     assert of_added == (
         "Log the rotor speed, at 100 Hz and good to 17 rad/s: it would narrow the interval of "
         "input_scaling to 20% of what it is and halve the interval of motor_constant."

@@ -12,12 +12,12 @@ from tuner.core.errors import ExportError, InputError
 from tuner.exporters import export as exporting
 from tuner.exporters.effective import Effective
 from tuner.exporters.export import (
+    check,
     export,
     export_formats_of_job,
     exported_vehicle,
     provenance,
 )
-from tuner.exporters.gates import check
 from tuner.exporters.target import Draft, write
 from tuner.options import ExportOptions
 from tuner.report.result_texts import export_sentence

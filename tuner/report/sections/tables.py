@@ -6,7 +6,7 @@ import hashlib
 import json
 
 from tuner.core.phrases import percent
-from tuner.design.proposals import next_log_in_words
+from tuner.design.proposals import log_in_words
 from tuner.findings.findings import remedy, sentence
 from tuner.report.contents import Contents
 from tuner.report.result_texts import effective_in_words, refits_in_words, rmse_in_words
@@ -94,7 +94,7 @@ def next_log(contents: Contents) -> Section | None:
     """Return the effects of further signals, or of more samples, on intervals."""
     if contents.run is None or not contents.run.result.next_log:
         return None
-    points = [Cell(sentence) for sentence in next_log_in_words(contents.run.result.next_log)]
+    points = [Cell(log_in_words(proposal)) for proposal in contents.run.result.next_log]
     note = (
         "Computed at the fitted coefficients, with the quoted intervals: an added signal is "
         "simulated and weighed with the noise named; what twice the samples of an input would "
