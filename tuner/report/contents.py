@@ -54,6 +54,11 @@ class Contents:
     exports: Sequence[ExportRecord]
     traces: Mapping[str, Mapping[str, Array]]
 
+    @property
+    def result(self) -> RunResult | None:
+        """The result of the run."""
+        return None if self.run is None else self.run.result
+
 
 def read_contents(folder: str | Path) -> Contents:
     """Read the folder of a run, or of an examination without one.

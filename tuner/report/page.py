@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -46,24 +47,37 @@ LIBRARIES = ("d3.min.js", "plot.umd.min.js")
 """Observable Plot and what it draws with."""
 
 
+Maker = Callable[[Contents], Section | None]
+
+
+def _of(part: Callable[[Contents], Any], section: Callable[[Any], Section | None]) -> Maker:
+    """Return the section on one part of a folder; None where it is lacking or empty."""
+
+    def made(contents: Contents) -> Section | None:
+        found = part(contents)
+        return section(found) if found else None
+
+    return made
+
+
 #: In the order in which a reader needs them.
-SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
+SECTIONS: tuple[Maker, ...] = (
     coefficients,
     flights,
-    selection,
-    effective,
-    bench,
-    sources,
-    refits,
-    next_flight,
-    next_log,
-    profiles,
-    global_sensitivity,
+    _of(lambda contents: contents.result and contents.result.selection, selection),
+    _of(lambda contents: contents.result, effective),
+    _of(lambda contents: contents.bench, bench),
+    _of(lambda contents: contents.result and contents.result.sources, sources),
+    _of(lambda contents: contents.result, refits),
+    _of(lambda contents: contents.proposals, next_flight),
+    _of(lambda contents: contents.result and contents.result.next_log, next_log),
+    _of(lambda contents: contents.profiles and contents.profiles.profiles, profiles),
+    _of(lambda contents: contents.global_sensitivity, global_sensitivity),
     remarks,
     forces,
-    effects,
-    information,
-    residuals,
+    _of(lambda contents: contents.knowledge, effects),
+    _of(lambda contents: contents.knowledge, information),
+    _of(lambda contents: contents.knowledge and contents.knowledge.residuals, residuals),
     search,
     provenance,
 )

@@ -6,7 +6,6 @@ import html
 import json
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -220,11 +219,6 @@ def test_no_figure_shows_a_single_point(tmp_path: Path) -> None:
     assert not {"waterfall", "trace", "selection"} & set(keys)
 
 
-def contents(**by_name):
-    run = SimpleNamespace(result=SimpleNamespace(sources=by_name))
-    return SimpleNamespace(run=run)
-
-
 def source(deviation, flights=1.4e-5):
     return Sources(
         ground=1.5e-5,
@@ -239,16 +233,17 @@ def source(deviation, flights=1.4e-5):
 
 def test_a_conflict_is_marked_and_what_flights_do_not_say_is_none():
     section = sources(
-        contents(
-            motor_constant=source(-10.0),
-            moment_constant=source(1.0),
-            inertia_xx=source(None, flights=None),
-        )
+        {
+            "motor_constant": source(-10.0),
+            "moment_constant": source(1.0),
+            "inertia_xx": source(None, flights=None),
+        }
     )
     said = [row[-1].text for row in section.tables[0].rows]
     assert said == ["● conflict", "○ yes", "flights do not identify it"]
 
 
-def test_a_fit_without_ground_measurements_has_no_such_section():
-    assert sources(contents()) is None
-    assert sources(SimpleNamespace(run=None)) is None
+def test_a_fit_without_ground_measurements_has_no_such_section(report: Path) -> None:
+    keys = {section.key for section in sections_of(read_contents(report.parent))}
+    assert "coefficients" in keys
+    assert not {"sources", "bench"} & keys

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tuner.ground.bench_json import (
+    BenchRecord,
     ExperimentRecord,
     agreement_in_words,
     is_of_flights,
@@ -13,7 +14,6 @@ from tuner.ground.bench_json import (
 )
 from tuner.ground.measurement import Curve
 from tuner.report.chart import FITTED, GREY, PALETTE, Chart, Line, Look, Panel
-from tuner.report.contents import Contents
 from tuner.report.section import Section, Table
 
 USED = Look(PALETTE[2], marks=True)
@@ -21,15 +21,13 @@ NOT_USED = Look(GREY, marks=True)
 RESIDUAL = Look(PALETTE[1], marks=True)
 
 
-def bench(contents: Contents) -> Section | None:
+def bench(record: BenchRecord) -> Section:
     """Return a table of the experiments and a picture of each: data, law, residuals."""
-    if contents.bench is None:
-        return None
-    experiments = contents.bench.experiments
+    experiments = record.experiments
     rows = [
         (e.name, "; ".join(numbers_in_words(e)), " ".join(remarks_in_words(e))) for e in experiments
     ]
-    flown = is_of_flights(contents.bench)
+    flown = is_of_flights(record)
     columns = ("flight" if flown else "experiment", "gives", "what its checks noticed")
     table = Table(columns, rows, words=columns)
     charts = [
@@ -39,7 +37,7 @@ def bench(contents: Contents) -> Section | None:
     return Section(
         "bench",
         "Flights without a pose" if flown else "Ground measurements",
-        sentences=(agreement_in_words(contents.bench),),
+        sentences=(agreement_in_words(record),),
         tables=(table,),
         charts=charts,
         note="± is one standard error.",

@@ -9,6 +9,7 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse
+from tuner.evaluate.records import Table as RmseTable
 from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.report.chart import (
     FITTED,
@@ -52,7 +53,7 @@ DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 
 def flights(contents: Contents) -> Section | None:
     """Return the RMSE of each flight, and four charts of each; held-out flights first."""
-    result = None if contents.run is None else contents.run.result
+    result = contents.result
     found = [] if result is None else list(result.flights)
     if not found and not contents.traces:
         return None
@@ -84,7 +85,7 @@ def _tables(contents: Contents, result: RunResult) -> list[Table]:
     axes = [f"{axis} [{PER_AXIS[axis][1]}]" for axis in RMSE_UNITS]
     by_axis = [(_title(f), *_pairs(f.rmse_initial, f.rmse_best)) for f in result.flights]
     tables.append(Table(("flight", *axes), by_axis, words=("flight",), fold="RMSE axis by axis"))
-    if laps := _laps(contents):
+    if contents.laps is not None and (laps := _laps(contents.laps)):
         tables.append(Table(("lap", *axes), laps, words=("lap",), fold="RMSE lap by lap"))
     if ahead := [row for flight in result.flights for row in _predictions(flight)]:
         quantities = [
@@ -225,17 +226,15 @@ def _pairs(before: AxesRmse, after: AxesRmse) -> list[Cell | str]:
     return cells
 
 
-def _laps(contents: Contents) -> list[tuple[Cell | str, ...]]:
-    if contents.laps is None:
-        return []
-    by_lap = {(row.flight, row.lap, row.vehicle): row.rmse for row in contents.laps.rows}
+def _laps(table: RmseTable) -> list[tuple[Cell | str, ...]]:
+    by_lap = {(row.flight, row.lap, row.vehicle): row.rmse for row in table.rows}
     return [
         (
             f"{flight}, lap {lap}",
             *_pairs(by_lap[flight, lap, "initial"], by_lap[flight, lap, "best"]),
         )
         for flight, lap in dict.fromkeys(
-            (row.flight, row.lap) for row in contents.laps.rows if row.lap is not None
+            (row.flight, row.lap) for row in table.rows if row.lap is not None
         )
     ]
 

@@ -20,12 +20,12 @@ from tuner.vehicle.selection_table import SelectionRow
 
 def search(contents: Contents) -> Section | None:
     """Return the waterfall of starts and the search's trace."""
-    if contents.run is None or not contents.run.result.flights:
+    if contents.result is None or not contents.result.flights:
         return None
     charts = []
     if contents.search is not None:
         charts = [*_waterfall(contents.search), *_trace(contents.search)]
-    result = contents.run.result.search
+    result = contents.result.search
     how = (
         f"{result.method}: {result.evaluations} Jacobians, {result.iterations} iterations, "
         f"{result.wall_time:.0f} s. {ending_sentence(result.message)}"
@@ -109,11 +109,8 @@ def _trace(record: SearchRecord) -> list[Chart]:
     ]
 
 
-def selection(contents: Contents) -> Section | None:
+def selection(rows: Sequence[SelectionRow]) -> Section:
     """Return the table of the selection and its figure."""
-    rows = () if contents.run is None else contents.run.result.selection
-    if not rows:
-        return None
     shown = [row for row in rows if row.kept or nearly_kept(row)]
     table = [
         (

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuner.design.proposals import proposals_in_words
+from tuner.design.proposals import Proposals, proposals_in_words
 from tuner.report.chart import FITTED, GREY, PALETTE, Bars, Chart, Heat, Line, Look, Panel
-from tuner.report.contents import Contents
 from tuner.report.section import Cell, Section, Table, figures
 from tuner.uncertainty.records import (
     CHI_SQUARE_95,
@@ -16,6 +15,7 @@ from tuner.uncertainty.records import (
     GlobalSensitivity,
     Knowledge,
     Profile,
+    Residual,
 )
 from tuner.uncertainty.verdict_texts import direction_in_words
 
@@ -23,10 +23,9 @@ MIN_DRAWN_SHARE = 1e-4
 """Changes smaller than this share of the present RMSE are drawn as this."""
 
 
-def effects(contents: Contents) -> Section | None:
+def effects(knowledge: Knowledge) -> Section | None:
     """Return heat maps of the change for +1 %."""
-    knowledge = contents.knowledge
-    if knowledge is None or not knowledge.outputs:
+    if not knowledge.outputs:
         return None
     names = [name for name in knowledge.coefficients if name in knowledge.outputs[0].change]
     charts = (_by_signal(knowledge, names), *_over_time(knowledge, names))
@@ -130,11 +129,8 @@ MAX_ANNOTATED = 14
 """Rows up to which a correlation is written into its cell."""
 
 
-def information(contents: Contents) -> Section | None:
+def information(knowledge: Knowledge) -> Section:
     """Return shares, worst directions, correlations, and the debts of what is fixed."""
-    knowledge = contents.knowledge
-    if knowledge is None:
-        return None
     points = [
         Cell(direction_in_words(d), look="failure" if d.null else "") for d in knowledge.directions
     ]
@@ -249,11 +245,8 @@ def _correlation(knowledge: Knowledge) -> Chart:
     )
 
 
-def residuals(contents: Contents) -> Section | None:
+def residuals(known: Sequence[Residual]) -> Section:
     """Return a table of the residuals and their autocorrelation."""
-    if contents.knowledge is None or not contents.knowledge.residuals:
-        return None
-    known = contents.knowledge.residuals
     panels = []
     for number, channel in enumerate(dict.fromkeys(r.channel for r in known)):
         of_channel = [residual for residual in known if residual.channel == channel]
@@ -305,11 +298,8 @@ MAX_CHI_SQUARE = 12.0
 """Of the drawn χ² above the lowest."""
 
 
-def profiles(contents: Contents) -> Section | None:
+def profiles(profiles: Sequence[Profile]) -> Section:
     """Return a chart a profile."""
-    if contents.profiles is None:
-        return None
-    profiles = contents.profiles.profiles
     charts = [_chart(profile) for profile in profiles]
     note = (
         "Each point sets one coefficient to a value and fits all others again, priors left out, in "
@@ -349,11 +339,8 @@ def _chart(profile: Profile) -> Chart:
     )
 
 
-def global_sensitivity(contents: Contents) -> Section | None:
+def global_sensitivity(indices: GlobalSensitivity) -> Section:
     """Return the indices over all and for each channel of each flight."""
-    indices = contents.global_sensitivity
-    if indices is None:
-        return None
     charts = (_over_all(indices), _each(indices))
     crashed = (
         f"; {indices.crashed} of them crashed on some flight and count there as no better than the "
@@ -418,11 +405,8 @@ def _each(indices: GlobalSensitivity) -> Chart:
     )
 
 
-def next_flight(contents: Contents) -> Section | None:
+def next_flight(proposals: Proposals) -> Section:
     """Return the proposals, best first."""
-    proposals = contents.proposals
-    if proposals is None:
-        return None
     points = [Cell(sentence) for sentence in proposals_in_words(proposals)]
     known = (
         "The fitted coefficients are well known, so that it is shown for others as if they were "

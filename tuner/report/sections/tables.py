@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
 
 from tuner.core.phrases import percent
-from tuner.design.proposals import log_in_words
+from tuner.design.proposals import LogProposal, log_in_words
 from tuner.findings.findings import remedy, sentence
 from tuner.report.contents import Contents
 from tuner.report.result_texts import effective_in_words, refits_in_words, rmse_in_words
 from tuner.report.section import Cell, Section, Table, figures, short
-from tuner.uncertainty.records import CONFLICT_SE
+from tuner.result import RunResult
+from tuner.uncertainty.records import CONFLICT_SE, Sources
 from tuner.vehicle import COEFFICIENTS
 
 #: Settings that other sections show.
@@ -29,11 +31,8 @@ def remarks(contents: Contents) -> Section | None:
     return Section("remarks", title, points=points, folded=True) if points else None
 
 
-def refits(contents: Contents) -> Section | None:
+def refits(result: RunResult) -> Section | None:
     """Return a table of the errors by jackknife and bootstrap, where they were asked for."""
-    if contents.run is None:
-        return None
-    result = contents.run.result
     rows: list[tuple[Cell | str, ...]] = [
         (
             name,
@@ -57,12 +56,10 @@ def refits(contents: Contents) -> Section | None:
     )
 
 
-def sources(contents: Contents) -> Section | None:
+def sources(found: Mapping[str, Sources]) -> Section:
     """Return a table of what the ground, the flights and both give."""
-    if contents.run is None or not contents.run.result.sources:
-        return None
     rows: list[tuple[Cell | str, ...]] = []
-    for name, source in contents.run.result.sources.items():
+    for name, source in found.items():
         both = (source.ground, source.flights, source.both)
         errors = (source.ground_error, source.flights_error, source.both_error)
         pairs = [t for v, e in zip(both, errors, strict=True) for t in (figures(v), short(e))]
@@ -90,11 +87,9 @@ def sources(contents: Contents) -> Section | None:
     )
 
 
-def next_log(contents: Contents) -> Section | None:
+def next_log(proposals: Sequence[LogProposal]) -> Section:
     """Return the effects of further signals, or of more samples, on intervals."""
-    if contents.run is None or not contents.run.result.next_log:
-        return None
-    points = [Cell(log_in_words(proposal)) for proposal in contents.run.result.next_log]
+    points = [Cell(log_in_words(proposal)) for proposal in proposals]
     note = (
         "Computed at the fitted coefficients, with the quoted intervals: an added signal is "
         "simulated and weighed with the noise named; what twice the samples of an input would "
@@ -103,12 +98,12 @@ def next_log(contents: Contents) -> Section | None:
     return Section("next_log", "What to log next time", points=points, note=note)
 
 
-def effective(contents: Contents) -> Section | None:
+def effective(result: RunResult) -> Section | None:
     """Return both answers beside each other, and what each term that is lost is worth."""
-    found = None if contents.run is None else contents.run.result.effective
-    if contents.run is None or found is None:
+    found = result.effective
+    if found is None:
         return None
-    physical = {name: row.best for name, row in contents.run.result.coefficients.items()}
+    physical = {name: row.best for name, row in result.coefficients.items()}
     rows = [
         (
             name,
@@ -156,8 +151,8 @@ def provenance(contents: Contents) -> Section:
         (name, str(origin))
         for name, origin in (origins if isinstance(origins, dict) else {}).items()
     ]
-    if contents.run:
-        rows.append(("seed", str(contents.run.result.seed)))
+    if contents.result:
+        rows.append(("seed", str(contents.result.seed)))
     rows += [
         (flight.name, Cell(f"{flight.duration:.1f} s, {flight.path}", f"sha256 {flight.sha256}"))
         for flight in about.flights
