@@ -120,11 +120,10 @@ def _rotors(model: Model) -> list[Rotor]:
     motors = {model.motor_number(motor): motor for motor in model.motors()}
     rotors = []
     for index, (link, turns) in sorted(links.items()):
-        children = motors[index].children
-        numbers = {child.tag: child.number for child in children if child.number is not None}
         radii = [radius.number for disc in link.all("collision") for radius in disc.all("radius")]
         place = model.pose_of_link(link).position
-        rotors.append(Rotor(index, place, turns, numbers, (radii or [0.0])[0] or 0.0))
+        radius = (radii or [0.0])[0] or 0.0
+        rotors.append(Rotor(index, place, turns, motors[index].numbers, radius))
     return rotors
 
 
@@ -225,10 +224,10 @@ def _speeds(
     """Return the rotor speeds in rad/s at zero and at full command; None if unknown."""
     limit = min((r.numbers.get("maxRotVelocity", math.inf) for r in rotors), default=math.inf)
     for channel in model.channels():
-        numbers = {child.tag: child.number for child in channel.children}
+        numbers = channel.numbers
         scaling, zero = numbers.get("input_scaling"), numbers.get("zero_position_armed")
         if scaling is not None and zero is not None:
-            low = (numbers.get("input_offset") or 0.0) * scaling + zero
+            low = numbers.get("input_offset", 0.0) * scaling + zero
             return low, min(low + scaling, limit)
     least, most = parameters.get("SIM_GZ_EC_MIN1"), parameters.get("SIM_GZ_EC_MAX1")
     if most is not None:

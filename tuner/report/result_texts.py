@@ -230,13 +230,11 @@ def _named(flights: Sequence[FlightResult]) -> str:
 
 
 def _clocks(flights: Sequence[FlightResult]) -> str:
-    assumed = [flight.name for flight in flights if flight.clock == "assumed"]
-    fitted = [flight.name for flight in flights if flight.clock == "fitted"]
-    parts = []
-    if fitted:
-        parts.append(f"the clock offset of {listed(fitted)} was fitted")
-    if assumed:
-        parts.append(f"the clock offset of {listed(assumed)} is taken to be zero")
+    parts = [
+        f"the clock offset of {_named(some)} {words}"
+        for clock, words in (("fitted", "was fitted"), ("assumed", "is taken to be zero"))
+        if (some := [flight for flight in flights if flight.clock == clock])
+    ]
     return f" ({'; '.join(parts)})" if parts else ""
 
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import ClassVar
 
 from tuner.core.errors import InputError
-from tuner.service.names import shown
+from tuner.service.words import shown
 
 
 class ServiceError(InputError):

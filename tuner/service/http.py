@@ -80,6 +80,12 @@ def zip_stream(store: ContentStore, files: Sequence[FileRow], folder: str) -> It
             yield block
 
 
+def _require_stored(store: ContentStore, *files: FileRow) -> None:
+    for file in files:
+        if not store.has(file.sha256):
+            raise NotKnownError(file.name, "is gone from the store", "submit the job again")
+
+
 def file_response(store: ContentStore, row: FileRow) -> StreamingResponse:
     """Return a stored file; a report as a page that reaches nothing, the rest to be saved."""
     suffix, base = row.name[row.name.rfind(".") :], row.name.rpartition("/")[2]
@@ -93,8 +99,7 @@ def file_response(store: ContentStore, row: FileRow) -> StreamingResponse:
     else:
         kind = _KINDS.get(suffix, "application/octet-stream")
         headers["content-disposition"] = f'attachment; filename="{file_name(base)}"'
-    if not store.has(row.sha256):
-        raise NotKnownError(row.name, "is gone from the store", "submit the job again")
+    _require_stored(store, row)
 
     async def blocks() -> AsyncIterator[bytes]:
         with store.reading(row.sha256) as file:
@@ -344,9 +349,7 @@ def get_files(service: ServiceOfApp, row: JobOfPath) -> StreamingResponse:
     """Return all files of a job's result as one archive."""
     if not row.files:
         raise NotKnownError(f"job {row.id}", "has no files", "wait until the job is done")
-    for file in row.files:
-        if not service.store.has(file.sha256):
-            raise NotKnownError(file.name, "is gone from the store", "submit the job again")
+    _require_stored(service.store, *row.files)
     headers = {"content-disposition": f'attachment; filename="{row.id}.zip"'}
     blocks = zip_stream(service.store, row.files, row.id)
     return StreamingResponse(blocks, media_type="application/zip", headers=headers)

@@ -17,7 +17,6 @@ from sqlalchemy.orm import Session, selectinload, undefer
 from tuner.core.errors import InputError
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError, TooManyError, unknown_job
-from tuner.service.names import recording_name, shown, stems
 from tuner.service.queue import UNCLAIMED, add_event
 from tuner.service.request import JobRequest, check_request
 from tuner.service.settings import Limits
@@ -31,6 +30,7 @@ from tuner.service.tables import (
     RecordingRow,
     State,
 )
+from tuner.service.words import recording_name, shown, stems
 from tuner.vehicle.registry import mass_factor
 
 PAGE_SIZE = 50

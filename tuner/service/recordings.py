@@ -27,9 +27,9 @@ from tuner.core.errors import InputError
 from tuner.service.database import Database
 from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, full_disk
 from tuner.service.inspection import inspect
-from tuner.service.names import recording_name, shown, shown_name, stems
 from tuner.service.settings import ServiceSettings
 from tuner.service.tables import RecordingRow
+from tuner.service.words import recording_name, shown, shown_name, stems
 
 BUFFER_BYTES = 2**20
 """bytes that are gathered before they are hashed and written"""

@@ -20,7 +20,7 @@ from tuner.core.yaml_document import dump_yaml
 from tuner.core.yaml_section import Section, build, refuse, section_of
 from tuner.options import FILES, FitOptions, Options
 from tuner.recordings.topics import TopicMap
-from tuner.service.names import last_part, recording_name, stems
+from tuner.service.words import last_part, recording_name, stems
 from tuner.vehicle import ControllerFile, VehicleFile
 
 FLIGHTS = "flights"

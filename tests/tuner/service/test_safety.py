@@ -13,10 +13,10 @@ from tests.tuner.service.conftest import LIMITS, ended, listening, submit, uploa
 from tuner.core.errors import InputError
 from tuner.service import app, tokens
 from tuner.service.app import is_loopback, serve
-from tuner.service.names import recording_name
 from tuner.service.safety import COOKIE, RateLimit
 from tuner.service.service import Service
 from tuner.service.web import pages
+from tuner.service.words import recording_name
 
 HOSTILE = '<img src=x onerror="alert(1)">'
 

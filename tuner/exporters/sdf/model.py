@@ -185,14 +185,14 @@ class Model:
         for plugin in self.root.all("plugin"):
             names = _plugin_names(plugin)
             if _CLASSIC_MOTOR in names or _GZ_MOTOR in names:
-                index = self._number_in(plugin, "motorNumber")
+                index = plugin.numbers.get("motorNumber")
                 if index is None or 0 <= index < self.rotors:
                     plugins.append(plugin)
         return plugins
 
     def motor_number(self, motor: Element) -> int | None:
         """Return the number of a motor plugin's rotor; None if a template has none."""
-        index = self._number_in(motor, "motorNumber")
+        index = motor.numbers.get("motorNumber")
         return None if index is None else int(index)
 
     def channels(self) -> list[Element]:
@@ -200,7 +200,7 @@ class Model:
         channels = []
         for parent in self.root.all(_CLASSIC_CHANNELS):
             for channel in parent.children:
-                index = self._number_in(channel, "input_index")
+                index = channel.numbers.get("input_index")
                 kind = channel.find("joint_control_type")
                 drives = kind is None or kind.value.startswith("velocity")
                 if (
@@ -258,10 +258,6 @@ class Model:
         raise ExportError(
             self.path, f"has a pose relative to '{name}'", "give it relative to a link or frame"
         )
-
-    def _number_in(self, element: Element, tag: str) -> float | None:
-        child = element.find(tag)
-        return None if child is None else child.number
 
 
 def _plugin_names(plugin: Element) -> str:
@@ -321,8 +317,7 @@ def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
         inertial = link.find("inertial")
         if inertial is None:
             continue
-        values = {child.tag: child.number for child in reversed(inertial.children)}
-        mass = values.get("mass")
+        mass = inertial.numbers.get("mass")
         if mass is None:
             raise ExportError(
                 model.path,
@@ -330,7 +325,7 @@ def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
                 "write it as one",
             )
         tensor = inertial.find("inertia")
-        given = {c.tag: c.number or 0.0 for c in reversed(tensor.children)} if tensor else {}
+        given = tensor.numbers if tensor else {}
         matrix = np.array(
             [[given.get(f"i{min(a, b)}{max(a, b)}", 0.0) for b in "xyz"] for a in "xyz"]
         )

@@ -70,6 +70,12 @@ class Element:
             return None
         return number if math.isfinite(number) else None
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Tag -> number of the elements directly inside; the first of a tag counts."""
+        children = reversed(self.children)
+        return {child.tag: child.number for child in children if child.number is not None}
+
     def all(self, tag: str) -> Iterator[Element]:
         """Yield every element of a tag inside, at any depth, in the order of the text."""
         for child in self.children:
