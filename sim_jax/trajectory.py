@@ -13,6 +13,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Int
 
@@ -31,7 +32,7 @@ FLIGHT_HEIGHT = 1.0
 
 
 def _number(value: ArrayLike) -> Scalar:
-    return jnp.asarray(value, dtype=float)
+    return jnp.asarray(value, float) if isinstance(value, jax.Array) else np.asarray(value, float)
 
 
 class Shape(eqx.Module):

@@ -268,11 +268,15 @@ def _flights_in(  # noqa: PLR0917 (a piece travels as a tuple)
     model = model_of(vehicle, controller)
     inlet_and_start = reference.inlet, reference.start
     logged, crashes = _run_flights((columns, model, *inlet_and_start), schedule, samples, precision)
+    on_clock = np.array_equal(log_time, clock)
     for segment, crash in enumerate(crashes):
         signals = {
-            name: resample(name, Series(log_time, values[segment]), clock)
+            name: values[segment].copy()
+            if on_clock
+            else resample(name, Series(log_time, values[segment]), clock)
             for name, values in logged.items()
         }
+        signals["attitude"] /= np.linalg.norm(signals["attitude"], axis=1, keepdims=True)
         signals["acceleration"] = _specific_force(clock, signals)
         coefficients = {name: float(column[segment]) for name, column in columns.items()}
         flight = Simulation(

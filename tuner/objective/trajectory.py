@@ -53,7 +53,7 @@ class Published:
             "reference_velocity": points.velocity,
             "reference_acceleration": points.acceleration,
         }
-        return {n: np.asarray(part.stacked(), dtype=np.float64).T for n, part in parts.items()}
+        return {n: np.column_stack([v.x, v.y, v.z]).astype(float) for n, v in parts.items()}
 
 
 def published(settings: TrajectorySettings, *, duration: float, control_rate: float) -> Published:
