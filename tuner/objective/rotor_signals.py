@@ -151,6 +151,8 @@ HIGH_PASS_HZ = 2.0
 """Frequency below which turning is filtered out: drag has a part in it."""
 MIN_CORRELATION = 0.4
 """Least correlation about roll and pitch of an accepted order."""
+LEAST_SHARE = 1e-12
+"""Share of two signals' squares, multiplied, below which a part of them is rounding errors."""
 RESPONSE_LAGS = 40.0
 """Length of a rotor's impulse response, in lags: to the last digit."""
 MIN_LEAD = 0.3
@@ -203,10 +205,20 @@ def motor_order(
     if read is None:
         return None
     _, turning, lagged = read
-    arms = levers(vehicle)
+    arms, size = levers(vehicle), (turning * turning).sum(axis=0)
+    sums = [(turning.T @ x, x.T @ x) for x in lagged]
+
+    def alike(order: tuple[int, ...]) -> list[Array]:
+        own = arms[list(order)]
+        found = []
+        for across, of in sums:
+            torque, whole = np.diagonal(own.T @ of @ own), np.trace(of) * (own * own).sum(axis=0)
+            square = size * np.maximum(torque, LEAST_SHARE * whole) + 1e-300
+            found.append(np.diagonal(across @ own) / np.sqrt(square))
+        return found
+
     correlation_of = {
-        order: max(min(_correlations(turning, x @ arms[list(order)])[:2]) for x in lagged)
-        for order in permutations(range(4))
+        order: max(min(axes[:2]) for axes in alike(order)) for order in permutations(range(4))
     }
     best, second = sorted(correlation_of, key=correlation_of.__getitem__, reverse=True)[:2]
     if (
@@ -214,7 +226,7 @@ def motor_order(
         or correlation_of[second] > correlation_of[best] - MIN_LEAD
     ):
         return None
-    yaw = max((_correlations(turning, x @ arms[list(best)])[2] for x in lagged), key=abs)
+    yaw = max((axes[2] for axes in alike(best)), key=abs)
     return MotorOrder(best, bool(yaw < 0.0) if abs(yaw) > MIN_CORRELATION else None)
 
 
@@ -235,17 +247,24 @@ def lateness(
         return 0.0
     step, turning, lagged = read
     torques, count = [squares @ levers(vehicle) for squares in lagged], len(turning)
-
-    def alike(delay: int) -> float:
-        behind, before = max(0, delay), max(0, -delay)
-        of_lags = (
-            _correlations(turning[before : count - behind], torque[behind : count - before])
-            for torque in torques
-        )
-        return float(max(min(axes[:2]) for axes in of_lags))
-
     most = min(round(MAX_STAMP_ERROR_S / step), count // 4)
-    found = np.array([alike(delay) for delay in range(-most, most + 1)])
+    delays = np.arange(-most, most + 1)
+    behind, before = np.maximum(delays, 0), np.maximum(-delays, 0)
+    length = 1 << (count + most).bit_length()
+    spectrum = np.fft.rfft(turning, length, axis=0).conj()
+
+    def alike(torque: Array) -> Array:
+        products = np.fft.irfft(spectrum * np.fft.rfft(torque, length, axis=0), length, axis=0)
+        of_turning, of_torque = (
+            np.cumsum(np.pad(values, ((1, 0), (0, 0))) ** 2, axis=0) for values in (turning, torque)
+        )
+        size = (of_turning[count - behind] - of_turning[before]) * (
+            of_torque[count - before] - of_torque[behind]
+        )
+        least = LEAST_SHARE * of_turning[-1] * of_torque[-1] + 1e-300
+        return np.asarray((products[delays] / np.sqrt(np.maximum(size, least)))[:, :2].min(axis=1))
+
+    found = np.max([alike(torque) for torque in torques], axis=0)
     best, rival = int(found.argmax()), max(found[most], -found.min())
     clear = found[best] > max(MIN_CORRELATION, rival + MIN_LEAD)
     return float((best - most) * step) if clear and abs(best - most) * step > MAX_DELAY_S else 0.0

@@ -145,6 +145,13 @@ def test_the_order_is_seen_where_a_recording_begins_and_ends_during_a_turn(broad
         assert order.is_right
 
 
+def test_rotors_that_change_speed_alike_show_no_order(broadband, updated):
+    speed = broadband.series["rotor_speed"]
+    alike = Series(speed.time, np.repeat(speed.values[:, :1], 4, axis=1))
+    series = dict(broadband.series) | {"rotor_speed": alike}
+    assert motor_order(series, updated, "rotor_speed", (0.0, broadband.duration)) is None
+
+
 def test_the_order_of_measured_speeds_is_seen_in_how_they_turn_the_vehicle(broadband, updated):
     speed, span = broadband.series["rotor_speed"], (0.0, broadband.duration)
     assert order_findings("a", broadband.series, updated, span, "rotor_speed") == ()
