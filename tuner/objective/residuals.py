@@ -162,8 +162,9 @@ class _Place:
         # A zero-order hold with a ramp before each jump. A stamp well between two jumps does not
         # move with the clock's offset: only stamps near a jump have information on it.
         held = series.at(self.segments, series.below(self.before))
-        held += series.mixed(self.segments, self.place, _ramp)
-        held -= series.mixed(self.segments, self.before, _ramp)
+        if not np.array_equal(self.place, self.before):
+            held += series.mixed(self.segments, self.place, _ramp)
+            held -= series.mixed(self.segments, self.before, _ramp)
         return held
 
     def by_offset(self, series: _Series) -> Array:
