@@ -24,7 +24,7 @@ from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
 from tuner.search.job_flights import read_recordings
 from tuner.search.problem import job_of
-from tuner.terms.search_with_terms import search_with_terms, with_first_terms
+from tuner.terms.selection import search_with_terms, with_first_terms
 from tuner.uncertainty.identifiability import hold_undetermined
 
 INLET: InletName = "actuator"

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from benchmarks.regression import Regression
-from tuner.evaluate.prediction import Predictions, hold_state
-from tuner.evaluate.torque_observer import FedFlight, TorqueObserver
+from tuner.evaluate.prediction import FedFlight, Predictions, TorqueObserver, hold_state
 from tuner.recordings.flight import Flight
 from tuner.vehicle import ControllerFile, VehicleFile
 

@@ -32,16 +32,16 @@ from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
 from tuner.findings.findings import Code, Finding, one_line
-from tuner.job.run import prepare
+from tuner.job.prepare import prepare
 from tuner.objective.battery import VOLTAGE, log_voltage_of
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight
-from tuner.search.explanation import Explanation
+from tuner.search.findings import Explanation
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import refit_and_examine
-from tuner.terms.search_with_terms import search_with_terms
+from tuner.terms.selection import search_with_terms
 from tuner.uncertainty.agreement import flights_disagree
 from tuner.uncertainty.estimates import Estimate, Uncertainty, term_findings
 from tuner.uncertainty.model_error import model_error_findings

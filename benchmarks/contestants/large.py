@@ -18,7 +18,7 @@ from benchmarks.calibration import problem  # noqa: E402
 from benchmarks.simulated_recordings import simulate_like  # noqa: E402
 from tuner.objective.criterion import Point  # noqa: E402
 from tuner.objective.normal_equations import Objective  # noqa: E402
-from tuner.search.levenberg_marquardt import advance, initial_step  # noqa: E402
+from tuner.search.optimisers import advance, initial_step  # noqa: E402
 from tuner.search.progress import criterion_of, initial_progress  # noqa: E402
 from tuner.search.stages import plan  # noqa: E402
 

@@ -232,7 +232,7 @@ def job_script_for(cluster: str | None) -> str:
         )
     with extra():
         _quiet_dask()
-        from tuner.engine.clusters import job_script  # noqa: PLC0415 (slow to import)
+        from tuner.engine.dask_engine import job_script  # noqa: PLC0415 (slow to import)
 
     return job_script(file, file.jobs)
 

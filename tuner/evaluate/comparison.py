@@ -56,7 +56,7 @@ from tuner.objective.space import Space
 from tuner.objective.windows import Window
 from tuner.options import RecordingOptions
 from tuner.search.job_flights import Recording, read_recordings, with_logged_parameters
-from tuner.search.levenberg_marquardt import MAX_STATE_SD
+from tuner.search.optimisers import MAX_STATE_SD
 from tuner.search.problem import limits_of
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import ControllerFile, VehicleFile, check_rotors, read_vehicle

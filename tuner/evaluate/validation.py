@@ -13,10 +13,15 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.prediction import FlightPredictor, Predictions, hold_state
+from tuner.evaluate.prediction import (
+    ROTOR_INLETS,
+    FlightPredictor,
+    Predictions,
+    TorqueObserver,
+    hold_state,
+)
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, Pose
-from tuner.evaluate.torque_observer import ROTOR_INLETS, TorqueObserver
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS

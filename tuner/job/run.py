@@ -34,9 +34,8 @@ from tuner.exporters.effective import Effective, find_effective
 from tuner.exporters.export import export_formats_of_job
 from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.findings.findings import Finding, merge_alike, remedy, sentence
-from tuner.job.accelerations import with_accelerations
-from tuner.job.check import check_information, check_recordings
 from tuner.job.listener import SILENT, Listener
+from tuner.job.prepare import check_information, prepare
 from tuner.job.results import (
     result_of,
     with_errors_of_refits,
@@ -49,17 +48,18 @@ from tuner.report.outcome import WRONG_INPUT_CODES
 from tuner.report.result_texts import export_sentence
 from tuner.result import BEST_FIT_FILE, OF_A_RUN, Run, RunResult, forget, place_for
 from tuner.search.estimation import OnProgress
-from tuner.search.explanation import Explanation
-from tuner.search.findings import late_input_findings, reference_voltage_findings, turning_findings
-from tuner.search.input_lag import with_input_lags
+from tuner.search.findings import (
+    Explanation,
+    reference_voltage_findings,
+    turning_findings,
+)
 from tuner.search.iteration import Iteration
-from tuner.search.job_flights import read_recordings, with_logged_parameters
-from tuner.search.problem import Job, job_of
+from tuner.search.job_flights import with_logged_parameters
+from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Progress
-from tuner.search.rotor_change import cut_at_rotor_changes
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import ExaminedFit, refit_and_examine
-from tuner.terms.search_with_terms import search_with_terms, with_first_terms
+from tuner.terms.selection import search_with_terms
 from tuner.uncertainty.agreement import flights_disagree, ground_conflicts, sources_of
 from tuner.uncertainty.estimates import (
     FLIGHTS_REFUTE,
@@ -207,24 +207,6 @@ def _fit(
         result.write(folder)
     explanation.attempt("page", partial(render, folder), None)
     return result
-
-
-def prepare(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
-    """Return the job of some settings, and the findings before any simulation."""
-    with span("reading"):
-        recordings, left_out = read_recordings(settings)
-    with span("check"):
-        recordings, changed = cut_at_rotor_changes(recordings, settings.vehicle)
-        recordings = with_input_lags(recordings, settings.vehicle)
-        job, regressed = with_accelerations(job_of(settings, recordings))
-        job = with_first_terms(job)
-        return job, (
-            *left_out,
-            *changed,
-            *late_input_findings(job),
-            *regressed,
-            *check_recordings(job),
-        )
 
 
 def _fitted(

@@ -36,8 +36,8 @@ from tuner.search.progress import (
 )
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
+from tuner.uncertainty.identifiability import profile_likelihood
 from tuner.uncertainty.model_error import alternatives_of
-from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.records import Knowledge, Profiles
 from tuner.uncertainty.sensitivity import global_sensitivity
 from tuner.vehicle import check_names, initial_values

@@ -26,9 +26,8 @@ from tuner.objective.normal_equations import (
     sums_at,
 )
 from tuner.objective.segments import CLOCKS
-from tuner.search.cma_es import evolve
 from tuner.search.iteration import Iteration
-from tuner.search.levenberg_marquardt import descend, estimated_states
+from tuner.search.optimisers import descend, estimated_states, evolve
 from tuner.search.progress import (
     Free,
     Iterate,

@@ -31,7 +31,7 @@ from tuner.recordings.loader import reading_key
 from tuner.search.continuation import Undecided, run_stages
 from tuner.search.findings import unmatched, with_end_findings
 from tuner.search.iteration import Iteration, Outcome
-from tuner.search.levenberg_marquardt import MIN_DAMPING
+from tuner.search.optimisers import MIN_DAMPING
 from tuner.search.problem import Job
 from tuner.search.progress import (
     Fitted,

@@ -68,7 +68,7 @@ class Job:
         The user's settings: ``settings`` may start from a regression.
     accelerations
         Estimates by regression of the flights' accelerations, if physical coefficients are taken
-        from it (`tuner.job.accelerations`).
+        from it (`tuner.job.prepare`).
     """
 
     settings: Settings

@@ -6,7 +6,7 @@ from tuner.cli import main
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
 from tuner.engine.cluster_file import ClusterFile, job_script_for, read_cluster
-from tuner.engine.clusters import pod_specification
+from tuner.engine.dask_engine import pod_specification
 
 FOLDER = configs_folder() / "clusters"
 

@@ -113,7 +113,7 @@ def test_both_options_contradict_each_other():
 
 
 def test_no_scheduler_is_one_line(monkeypatch):
-    monkeypatch.setattr("tuner.engine.clusters.ANSWER", 0.5)
+    monkeypatch.setattr("tuner.engine.dask_engine.ANSWER", 0.5)
     with (
         pytest.raises(InputError, match="no scheduler answers"),
         engine_for(None, "tcp://127.0.0.1:1"),

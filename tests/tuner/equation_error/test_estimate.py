@@ -40,7 +40,7 @@ from tuner.equation_error.regression import (
     whitening,
 )
 from tuner.evaluate.simulation_files import write_csv
-from tuner.job.accelerations import of_rigid_body, with_accelerations
+from tuner.job.prepare import of_rigid_body, with_accelerations
 from tuner.recordings.flight import Series
 from tuner.search.inlet_choice import predicts_turning, regressors
 from tuner.search.job_flights import read_recordings
@@ -292,7 +292,7 @@ def test_a_search_begins_with_a_rigid_body(flown, begun, monkeypatch):
         values={**found.values, "inertia_zz": 1.1 * most},
         errors={**found.errors, "inertia_zz": 0.1},
     )
-    monkeypatch.setattr("tuner.job.accelerations.estimate", lambda *_: beyond)
+    monkeypatch.setattr("tuner.job.prepare.estimate", lambda *_: beyond)
     job, _ = with_accelerations(job_of(settings, recordings))
     assert job.settings.vehicle.inertia.zz == pytest.approx(most)
 

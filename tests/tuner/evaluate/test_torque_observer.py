@@ -9,8 +9,7 @@ import pytest
 
 from benchmarks import fast_flights
 from tuner.config import Options, resolve_settings
-from tuner.evaluate.prediction import predict
-from tuner.evaluate.torque_observer import LAGS, TorqueObserver
+from tuner.evaluate.prediction import LAGS, TorqueObserver, predict
 from tuner.recordings.flight import Series
 from tuner.recordings.states import MIN_HALF_WIDTH_S
 from tuner.search.job_flights import read_recordings

@@ -310,7 +310,7 @@ def test_a_missing_flight_writes_nothing(tmp_path):
 
 
 def test_the_check_sees_that_nothing_moves():
-    from tuner.job.check import singular_directions  # noqa: PLC0415
+    from tuner.job.prepare import singular_directions  # noqa: PLC0415
 
     towards = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-9]])
     (direction,) = singular_directions(towards)

@@ -13,7 +13,7 @@ from tuner.config.job import Search
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.evaluate.validation import flights_worse
 from tuner.findings.findings import Code, Finding
-from tuner.job.check import merged_by_flight
+from tuner.job.prepare import merged_by_flight
 from tuner.objective.inlets import INLETS, also_free_by, bypassed_by
 from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.space import space_of

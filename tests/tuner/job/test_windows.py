@@ -12,8 +12,8 @@ from tuner.core.errors import ConfigError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.findings.findings import Code
-from tuner.job.check import check_information, check_recordings
 from tuner.job.listener import Listener
+from tuner.job.prepare import check_information, check_recordings
 from tuner.job.run import run
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.unit_detection import UNIT_PHRASES, UNITS, to_si

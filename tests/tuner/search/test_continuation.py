@@ -11,7 +11,7 @@ import pytest
 from tests.tuner.uncertainty.making import problem
 from tuner.objective.normal_equations import normal_equations, sums_at
 from tuner.objective.segments import OFFSETS
-from tuner.search import continuation, levenberg_marquardt
+from tuner.search import continuation, optimisers
 from tuner.search.continuation import _clocks_that_differ, run_stages
 from tuner.search.progress import Free, criterion_of, initial_progress, point_of
 from tuner.search.stages import schedule_of
@@ -109,7 +109,7 @@ def test_no_point_is_flown_twice_where_clocks_are_looked_at(fit, monkeypatch):
         looked_at.append(_clocks_that_differ(*given))
         return looked_at[-1]
 
-    for module in (continuation, levenberg_marquardt):
+    for module in (continuation, optimisers):
         monkeypatch.setattr(module, "sums_at", recorded)
     monkeypatch.setattr(continuation, "_clocks_that_differ", judged)
     late = {

@@ -13,7 +13,7 @@ from tuner.findings.findings import MAX_FINITE, Code, Finding, one_line
 from tuner.job.listener import Listener
 from tuner.job.run import run
 from tuner.result import read_run
-from tuner.search.explanation import Explanation
+from tuner.search.findings import Explanation
 from tuner.terms import refit_with_disturbances as disturbances
 from tuner.uncertainty.verdict import Verdict
 

@@ -11,7 +11,7 @@ from tuner.objective.criterion import Point
 from tuner.objective.initial_conditions import ROWS, start_sd_of_spin
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import run_stages
-from tuner.search.levenberg_marquardt import MAX_STATE_SD, estimated_states, need_relinearising
+from tuner.search.optimisers import MAX_STATE_SD, estimated_states, need_relinearising
 from tuner.search.progress import Free, criterion_of, initial_progress
 from tuner.search.stages import plan
 

@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from benchmarks import fast_flights
 from tuner.config import Options, resolve_settings
 from tuner.findings.findings import Code
-from tuner.job.check import _motor_orders
+from tuner.job.prepare import _motor_orders
 from tuner.objective.rotor_signals import motor_order, order_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
-from tuner.search.input_lag import Lag, _is_late, input_lag, with_input_lags
 from tuner.search.job_flights import Recording, read_recordings
+from tuner.search.recorded_rotors import Lag, _is_late, input_lag, with_input_lags
 
 RATE = 500.0
 

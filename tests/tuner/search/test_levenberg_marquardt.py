@@ -8,8 +8,8 @@ import pytest
 
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import NormalEquations
-from tuner.search import levenberg_marquardt
-from tuner.search.levenberg_marquardt import MATCHED_RATIO, advance, initial_step
+from tuner.search import optimisers
+from tuner.search.optimisers import MATCHED_RATIO, advance, initial_step
 
 END = np.array([1.0, 1.0])
 START = np.array([-1.2, 1.0])
@@ -33,9 +33,9 @@ def advanced(monkeypatch):
             differentiated.append(points)
         return points
 
-    monkeypatch.setattr(levenberg_marquardt, "sums_at", flown)
+    monkeypatch.setattr(optimisers, "sums_at", flown)
     monkeypatch.setattr(
-        levenberg_marquardt,
+        optimisers,
         "normal_equations",
         lambda _, tried, __, ___: valley(tried.coefficients),
     )
@@ -127,7 +127,7 @@ def ends(last, gain, accepted, worst, *, step_reduction=1.0, tries=1):
         sums=SimpleNamespace(compared=np.array([1000.0])),
     )
     losses = [step.loss] * tries
-    return levenberg_marquardt._has_converged(problem, step, np.array([worst]), losses)
+    return optimisers._has_converged(problem, step, np.array([worst]), losses)
 
 
 @pytest.mark.parametrize("last", [False, True])

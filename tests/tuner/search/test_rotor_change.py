@@ -8,10 +8,10 @@ import pytest
 
 from tuner.config import Options, resolve_settings
 from tuner.findings.findings import Code
-from tuner.job.run import prepare
+from tuner.job.prepare import prepare
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import read_recordings
-from tuner.search.rotor_change import WINDOW_S, cut_at_rotor_changes, rotor_change_of
+from tuner.search.recorded_rotors import WINDOW_S, cut_at_rotor_changes, rotor_change_of
 
 ROOT = Path(__file__).parents[3]
 BROKEN = 20.0

@@ -9,7 +9,7 @@ import pytest
 from tests.tuner.terms.making import BASE, hovering, unfitted_with
 from tuner.config import JobFile
 from tuner.terms.candidates import with_terms
-from tuner.terms.search_with_terms import hover_tilt, with_first_terms, with_terms_selected
+from tuner.terms.selection import hover_tilt, with_first_terms, with_terms_selected
 from tuner.vehicle.selection_table import SelectionCode
 
 MARKERS = {f"marker_{kind}_{axis}" for kind in ("offset", "tilt") for axis in "xyz"}

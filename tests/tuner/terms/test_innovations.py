@@ -16,10 +16,10 @@ from tuner.objective.information import FisherInformation
 from tuner.objective.space import Space, extended, space_of
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
-from tuner.terms import innovations
+from tuner.terms import refit_with_disturbances
 from tuner.terms.candidates import Selected, neutral_values
-from tuner.terms.innovations import LinearisedInnovations
 from tuner.terms.linearisation import linearised_from
+from tuner.terms.refit_with_disturbances import LinearisedInnovations
 from tuner.vehicle import COEFFICIENTS, term_groups
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
@@ -110,7 +110,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch):
         found.update(groups=groups, vector=vector)
         return NOBODY, fitted
 
-    monkeypatch.setattr(innovations, "with_groups", with_groups)
+    monkeypatch.setattr(refit_with_disturbances, "with_groups", with_groups)
 
     def choose(
         innovation: LinearisedInnovations,
@@ -288,7 +288,7 @@ def test_terms_are_judged_with_model_errors_acting(monkeypatch) -> None:
     plain = seen([DRAG], {})
     there = Problem(plain.space)
     wide = SimpleNamespace(objective=there, point=SimpleNamespace(coefficients=plain.vector))
-    monkeypatch.setattr(innovations, "with_free", lambda *_: (NOBODY, wide))
+    monkeypatch.setattr(refit_with_disturbances, "with_free", lambda *_: (NOBODY, wide))
     fitted = cast(Fitted, SimpleNamespace(**vars(plain.fitted), criterion=NOBODY))
     model_errors = SimpleNamespace(applied_to=lambda objective: replace(objective, pushed=True))
     said = LinearisedInnovations.of(plain.selected, fitted, cast(Any, there))

@@ -10,9 +10,9 @@ from typing import Any, cast
 import pytest
 
 from tests.tuner.terms.making import unfitted_with
-from tuner.search.explanation import Explanation
+from tuner.search.findings import Explanation
 from tuner.search.progress import COLOURED_RATIO, Fitted
-from tuner.terms import refit_with_disturbances, search_with_terms
+from tuner.terms import refit_with_disturbances, selection
 from tuner.terms.candidates import Selected
 
 
@@ -30,10 +30,10 @@ def ended_with(thrust: float, monkeypatch: pytest.MonkeyPatch) -> tuple[Selected
         tried.append("terms")
         return Selected(job, fitted)
 
-    monkeypatch.setattr(search_with_terms, "search", lambda *_, **__: end)
-    monkeypatch.setattr(search_with_terms, "point_estimates", lambda *_: ())
-    monkeypatch.setattr(search_with_terms, "with_terms_selected", selecting)
-    found = search_with_terms.search_with_terms(
+    monkeypatch.setattr(selection, "search", lambda *_, **__: end)
+    monkeypatch.setattr(selection, "point_estimates", lambda *_: ())
+    monkeypatch.setattr(selection, "with_terms_selected", selecting)
+    found = selection.search_with_terms(
         job,
         cast(Path, None),
         resume=False,

@@ -12,7 +12,7 @@ from tests.tuner.uncertainty.test_model_error import flown, problem
 from tuner.config import JobFile
 from tuner.objective.criterion import Point
 from tuner.terms.candidates import Selected, with_terms
-from tuner.terms.search_with_terms import GAIN_AXES, refuted_by_commands, with_refuted
+from tuner.terms.selection import GAIN_AXES, refuted_by_commands, with_refuted
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 ROW = SelectionRow(

@@ -9,11 +9,11 @@ from tests.tuner.terms.making import BASE, job_with, unfitted_with
 from tuner.config import JobFile
 from tuner.objective.criterion import units_of
 from tuner.report.result_texts import selection_in_words
-from tuner.terms import search_with_terms as terms
 from tuner.terms import selection
+from tuner.terms import selection as terms
 from tuner.terms.linearisation import LinearisedFit
 from tuner.terms.score import Score
-from tuner.terms.search_with_terms import with_terms_selected
+from tuner.terms.selection import with_terms_selected
 from tuner.uncertainty.estimates import uncertainty_of
 from tuner.uncertainty.examination import examine
 from tuner.vehicle import term_groups

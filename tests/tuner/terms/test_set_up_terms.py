@@ -4,8 +4,8 @@ import pytest
 
 from tests.tuner.terms.making import BASE, job_with
 from tests.tuner.uncertainty.making import problem
-from tuner.terms import search_with_terms
-from tuner.terms.search_with_terms import with_terms_selected
+from tuner.terms import selection
+from tuner.terms.selection import with_terms_selected
 from tuner.uncertainty.examination import examine
 from tuner.vehicle import term_groups
 
@@ -28,11 +28,9 @@ GROUPS = {
 
 def selected(monkeypatch, groups=GROUPS, **given):
     """Return the selection among these terms alone, which makes it cheap."""
-    monkeypatch.setattr(search_with_terms, "candidate_groups", lambda *_: groups)
-    monkeypatch.setattr(search_with_terms, "condition_groups", lambda *_, **__: {})
-    monkeypatch.setattr(
-        search_with_terms, "model_errors_of", lambda *_: None
-    )  # no commands were recorded
+    monkeypatch.setattr(selection, "candidate_groups", lambda *_: groups)
+    monkeypatch.setattr(selection, "condition_groups", lambda *_, **__: {})
+    monkeypatch.setattr(selection, "model_errors_of", lambda *_: None)  # no commands were recorded
     fit = job_with(0.0, seed=0, **given)
     return with_terms_selected(*fit, lambda *_: None, lambda _: None)
 

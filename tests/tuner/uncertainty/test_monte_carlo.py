@@ -9,7 +9,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import Objective
-from tuner.search.levenberg_marquardt import advance, initial_step
+from tuner.search.optimisers import advance, initial_step
 from tuner.uncertainty.estimates import uncertainty_of
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant")

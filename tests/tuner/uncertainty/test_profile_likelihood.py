@@ -16,7 +16,7 @@ from tuner.objective.normal_equations import Objective
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
 from tuner.uncertainty.examination import FullProblem, full_problem_of
-from tuner.uncertainty.profile_likelihood import profile_likelihood
+from tuner.uncertainty.identifiability import profile_likelihood
 from tuner.uncertainty.records import Profile, Profiles
 
 FREE = (
