@@ -190,49 +190,24 @@ class Predictions:
         return int(step)
 
 
-def predict(
-    vehicle: VehicleFile,
-    controller: ControllerFile,
-    flight: Flight,
-    inlet: InletName,
-    *,
-    seconds: float = 0.5,
-    stride: float | None = None,
-    input_late: float = 0.0,
-    observer: TorqueObserver | None = None,
-) -> Predictions:
-    """Predict a flight open loop from many of its recorded states.
+class FlightPredictor:
+    """Predicts a flight open loop from many of its recorded states, with any vehicle.
 
     Parameters
     ----------
-    vehicle, controller
-        The model; the controller gives the rates of the simulation.
     flight, inlet
         The recording and its inlet.
+    stride
+        s from one prediction to the next.
     seconds
         s that each prediction lasts.
-    stride
-        s from one prediction to the next; by default one sample.
     input_late
         s by which the input is stamped later than the recorded state.
-    observer
-        Gives the disturbance torque at the start of a prediction.
 
     Raises
     ------
     RecordingError
         The flight never holds so many s of pose and input.
-    """
-    predictor = FlightPredictor(
-        flight, inlet, seconds=seconds, stride=stride, input_late=input_late
-    )
-    return predictor.predict(vehicle, controller, observer)
-
-
-class FlightPredictor:
-    """Predicts one flight from the same states with any vehicle.
-
-    Parameters, units and errors are those of `predict`.
     """
 
     def __init__(
@@ -240,8 +215,8 @@ class FlightPredictor:
         flight: Flight,
         inlet: InletName,
         *,
+        stride: float,
         seconds: float = 0.5,
-        stride: float | None = None,
         input_late: float = 0.0,
     ) -> None:
         self.flight, self.inlet, self.seconds = flight, inlet, seconds
@@ -250,7 +225,7 @@ class FlightPredictor:
             [flight],
             inlets=[inlet],
             seconds=seconds,
-            stride=1.0 / flight.rate if stride is None else stride,
+            stride=stride,
             free_starts=False,
             input_late={flight.name: input_late},
         )
@@ -270,7 +245,15 @@ class FlightPredictor:
         controller: ControllerFile,
         observer: TorqueObserver | None = None,
     ) -> Predictions:
-        """Return the predictions with a vehicle."""
+        """Return the predictions with a vehicle.
+
+        Parameters
+        ----------
+        vehicle, controller
+            The model; the controller gives the rates of the simulation.
+        observer
+            Gives the disturbance torque at the start of a prediction.
+        """
         motor, schedule = vehicle.motor, schedule_of(controller)
         segments = window_segments(
             [self.flight],

@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.builds import cut, weighed_mass
-from benchmarks.prediction import HELD_OUT, options_for_set
-from benchmarks.regression import Regression
-from benchmarks.without_pose import with_pose
+from benchmarks.prediction import (
+    HELD_OUT,
+    Regression,
+    cut,
+    options_for_set,
+    weighed_mass,
+    with_pose,
+)
 from tuner.core.errors import InputError
 from tuner.evaluate.prediction import hold_state
 from tuner.recordings.loader import InertialFlight

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.prediction import Predictions, hold_state, predict
+from tuner.evaluate.prediction import FlightPredictor, Predictions, hold_state
 from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.recordings.flight import Series
 from tuner.recordings.states import MIN_HALF_WIDTH_S
@@ -14,9 +14,16 @@ from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, with_values
 
 
+def predict(vehicle, flight, inlet, *, stride=0.2, input_late=0.0):
+    predictor = FlightPredictor(flight, inlet, stride=stride, input_late=input_late)
+    return predictor.predict(vehicle, ControllerFile())
+
+
 @pytest.fixture(scope="module")
 def truth(full_flight, updated):
-    return predict(updated, ControllerFile(), full_flight, "rotor_speed", stride=0.2)
+    return FlightPredictor(full_flight, "rotor_speed", stride=0.2).predict(
+        updated, ControllerFile()
+    )
 
 
 def test_the_vehicle_that_flew_predicts_its_flight_better_than_one_that_holds(truth, full_flight):
@@ -41,21 +48,23 @@ def test_the_distances_are_euclidean_and_the_angle_is_geodesic(truth, full_fligh
 
 def test_a_wrong_vehicle_predicts_worse_and_a_late_input_is_put_right(truth, full_flight, updated):
     heavy = with_values(updated, {"motor_constant": 0.9 * updated.aerodynamics.motor_constant})
-    worse = predict(heavy, ControllerFile(), full_flight, "rotor_speed", stride=0.2)
+    worse = predict(heavy, full_flight, "rotor_speed")
     assert worse.mean(0.5)["velocity"] > 5 * truth.mean(0.5)["velocity"]
     speed = full_flight.series["rotor_speed"]
     late = replace(
         full_flight,
         series=dict(full_flight.series) | {"rotor_speed": Series(speed.time + 0.02, speed.values)},
     )
-    off = predict(updated, ControllerFile(), late, "rotor_speed", stride=0.2)
-    right = predict(updated, ControllerFile(), late, "rotor_speed", stride=0.2, input_late=0.02)
+    off = predict(updated, late, "rotor_speed")
+    right = predict(updated, late, "rotor_speed", input_late=0.02)
     assert off.mean(0.5)["body_rate"] > 2 * right.mean(0.5)["body_rate"]
     assert right.mean(0.5) == pytest.approx(truth.mean(0.5), rel=0.02)
 
 
 def test_what_is_followed_is_not_called_predicted(full_flight, updated):
-    followed = predict(updated, ControllerFile(), full_flight, "attitude", stride=1.0)
+    followed = FlightPredictor(full_flight, "attitude", stride=1.0).predict(
+        updated, ControllerFile()
+    )
     assert set(followed.errors) == {"position", "velocity"}
     means = followed.mean(0.5)
     assert means["position"] < 0.05
@@ -69,7 +78,9 @@ def test_what_lies_ahead_is_not_looked_at(truth, full_flight, updated):
         full_flight,
         series=dict(full_flight.series) | {"position": Series(position.time, moved)},
     )
-    elsewhere = predict(updated, ControllerFile(), changed, "rotor_speed", stride=0.2)
+    elsewhere = FlightPredictor(changed, "rotor_speed", stride=0.2).predict(
+        updated, ControllerFile()
+    )
     for name in ("velocity", "attitude", "body_rate"):
         np.testing.assert_allclose(
             elsewhere.errors[name][:, 5], truth.errors[name][:, 5], rtol=1e-9, err_msg=name
@@ -88,7 +99,10 @@ def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
 
     def errors(flight):
         comparison = Comparison([Recording(flight, inlet)], ControllerFile())
-        name, predicted = flight.name, predict(wrong, ControllerFile(), flight, inlet, stride=1.0)
+        name, predicted = (
+            flight.name,
+            predict(wrong, flight, inlet, stride=1.0),
+        )
         return (
             comparison.fly(wrong)[name],
             comparison.fly(wrong, fitted_starts=True)[name],

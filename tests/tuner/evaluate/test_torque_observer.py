@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import fast_flights
 from tuner.config import Options, resolve_settings
-from tuner.evaluate.prediction import LAGS, TorqueObserver, predict
+from tuner.evaluate.prediction import LAGS, FlightPredictor, TorqueObserver
 from tuner.recordings.flight import Series
 from tuner.recordings.states import MIN_HALF_WIDTH_S
 from tuner.search.job_flights import read_recordings
@@ -60,8 +60,8 @@ def test_what_is_known_of_it_predicts_turning_better(flown):
     for recording in recordings:
         if not recording.holdout:
             continue
-        given = (vehicle, controller, recording.flight, recording.inlet)
-        alone, observed = (predict(*given, stride=0.05, observer=of) for of in (None, observer))
+        predictor = FlightPredictor(recording.flight, recording.inlet, stride=0.05)
+        alone, observed = (predictor.predict(vehicle, controller, of) for of in (None, observer))
         for seconds, quantity, most in ((0.05, "body_rate", 0.75), (0.1, "attitude", 0.75)):
             assert observed.mean(seconds)[quantity] < most * alone.mean(seconds)[quantity]
 
@@ -93,8 +93,8 @@ def test_noise_alone_is_not_carried_on(full_flight, updated):
     series = dict(full_flight.series) | {"body_rate": Series(gyro.time, noisy)}
     flight = replace(full_flight, series=series)
     observer = TorqueObserver.of(updated, ControllerFile(), [(flight, "rotor_speed", 0.0)])
-    given = (updated, ControllerFile(), flight, "rotor_speed")
-    alone, observed = (predict(*given, stride=0.2, observer=of) for of in (None, observer))
+    predictor = FlightPredictor(flight, "rotor_speed", stride=0.2)
+    alone, observed = (predictor.predict(updated, ControllerFile(), of) for of in (None, observer))
     for seconds in (0.1, 0.5):
         assert observed.mean(seconds) == pytest.approx(alone.mean(seconds), rel=0.05)
 
