@@ -15,6 +15,7 @@ import datetime
 import importlib
 import time
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.history import updated_history
@@ -22,18 +23,19 @@ from benchmarks.table import Section, sections_of, table, update_bars, update_se
 from benchmarks.timing import ROOT, machine
 from tuner.core import runtime
 
-PARTS = (
-    "throughput",
-    "derivatives",
-    "one_vehicle",
-    "compilation",
-    "job",
-    "reading",
-    "service",
-    "workers",
-    "prediction",
-)
-BY_NAME = ("large", "lab", "calibration", "fast")
+PARTS: Mapping[str, str] = {
+    "throughput": "simulator",
+    "derivatives": "simulator",
+    "one_vehicle": "simulator",
+    "compilation": "simulator",
+    "job": "job",
+    "reading": "reading",
+    "service": "service",
+    "workers": "workers",
+    "prediction": "prediction",
+}
+"""Part -> the module that measures it, by a function of its name or by ``measure``."""
+BY_NAME = {"large": "large", "lab": "lab", "calibration": "calibration", "fast": "fast_flights"}
 """Parts that are measured by name alone: they take as long as all others together."""
 RESULTS = Path(__file__).with_name("RESULTS.md")
 
@@ -71,7 +73,8 @@ def main() -> None:
     target = arguments.out or (RESULTS if whole or arguments.update else None)
     text = before = target.read_text(encoding="utf-8") if target and target.exists() else ""
     for part in arguments.parts or PARTS:
-        section = importlib.import_module(f"benchmarks.{part}").measure()
+        module = importlib.import_module(f"benchmarks.{(PARTS | BY_NAME)[part]}")
+        section: Section = getattr(module, part if hasattr(module, part) else "measure")()
         sections.append(section)
         bars = [" | ".join(bar.row()) for bar in section.bars]
         print(section.markdown(), *bars, sep="\n", flush=True)

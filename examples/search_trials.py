@@ -38,7 +38,7 @@ from tuner.search.job_flights import read_recordings  # noqa: E402
 from tuner.search.problem import Job, job_of  # noqa: E402
 from tuner.search.progress import Fitted  # noqa: E402
 from tuner.uncertainty.estimates import uncertainty_of  # noqa: E402
-from tuner.uncertainty.verdict_texts import direction_in_words, verdict_in_words  # noqa: E402
+from tuner.uncertainty.verdict import direction_in_words, verdict_in_words  # noqa: E402
 from tuner.vehicle import with_values  # noqa: E402 (jax is configured first)
 
 FOLDER = Path(__file__).parents[1] / "reference_flights"

@@ -26,10 +26,18 @@ from numpy.typing import NDArray
 import lanes.control
 import lanes.structural  # noqa: F401 (both fill in rules)
 from lanes.dependence import dependent
-from lanes.digest import UnknownError, digest_of
 from lanes.layout import Argument, Lengths, is_laid_by_loop, module_text
 from lanes.lowering import MAX_COLUMNS
-from lanes.machine import Code, keep_code_in, load_or_make, object_code, optimises, register_bytes
+from lanes.machine import (
+    Code,
+    UnknownError,
+    digest_of,
+    keep_code_in,
+    load_or_make,
+    object_code,
+    optimises,
+    register_bytes,
+)
 from lanes.values import UnsupportedError
 
 __all__ = ["Argument", "Program", "Run", "joined", "keep_code_in", "program_of"]

@@ -18,9 +18,8 @@ from tuner.core.yaml_section import refuse
 from tuner.design.proposals import LogProposal
 from tuner.evaluate.records import AxesRmse, PredictedErrors
 from tuner.findings.findings import Finding, one_line
-from tuner.uncertainty.records import ErrorParts, Sources
-from tuner.uncertainty.verdict import Reason, Verdict
-from tuner.uncertainty.verdict_texts import judgement_in_words
+from tuner.uncertainty.records import Sources
+from tuner.uncertainty.verdict import ErrorParts, Reason, Verdict, judgement_in_words
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle
 from tuner.vehicle.selection_table import SelectionRow
 

@@ -23,7 +23,7 @@ from jax import Array  # noqa: E402
 
 from benchmarks.calibration import reference_job  # noqa: E402
 from benchmarks.case import STEPS, Kernel, factors, fly  # noqa: E402
-from benchmarks.derivatives import FLIGHTS, GRADIENT, JACOBIAN, REVERSED, SAMPLES  # noqa: E402
+from benchmarks.simulator import FLIGHTS, GRADIENT, JACOBIAN, REVERSED, SAMPLES  # noqa: E402
 from benchmarks.timing import answer  # noqa: E402
 from tuner.config import TrajectorySettings  # noqa: E402
 from tuner.core.shipped import configs_folder  # noqa: E402

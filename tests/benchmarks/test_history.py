@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 import pytest
 
 from benchmarks import __main__ as command
-from benchmarks import derivatives, reading
+from benchmarks import reading, simulator
 from benchmarks.history import TITLE, lines_of, updated_history
 from benchmarks.table import Bar, Section, sections_of, update_bars, update_section
 
@@ -84,9 +84,10 @@ def test_the_command_writes_lines_and_keeps_what_it_does_not_measure(tmp_path, m
     kept = Section("Calibration", "Of another day.", ["a"], [["1"]])
     results.write_text(update_section(with_line("# Page\n", [rate(2.0)]), kept), encoding="utf-8")
     monkeypatch.setattr(command, "RESULTS", results)
-    monkeypatch.setattr(command, "PARTS", ("derivatives", "reading"))
+    parts = {name: command.PARTS[name] for name in ("derivatives", "reading")}
+    monkeypatch.setattr(command, "PARTS", parts)
     speed = Section("Derivatives", "Now.", ["a"], [["2"]], [rate(1.0)])
-    monkeypatch.setattr(derivatives, "measure", lambda: speed)
+    monkeypatch.setattr(simulator, "derivatives", lambda: speed)
     monkeypatch.setattr(reading, "measure", lambda: Section("Reading", "Now.", ["a"], [["3"]]))
 
     def run(*words):

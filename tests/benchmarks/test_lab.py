@@ -19,8 +19,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import VOLTAGE
 from tuner.recordings.flight import Series
 from tuner.uncertainty.estimates import Estimate
-from tuner.uncertainty.records import ErrorParts
-from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
+from tuner.uncertainty.verdict import ErrorParts, Reason, ReasonCode, Verdict
 from tuner.vehicle import COEFFICIENTS, term_groups, values_of
 
 SEEDS = range(8)

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lanes import Argument, Program, keep_code_in
-from lanes.digest import UnknownError, digest_of
+from lanes import Argument, Program, keep_code_in, machine
+from lanes.machine import UnknownError, digest_of
 
 
 class _Module(eqx.Module):
@@ -100,8 +100,7 @@ def test_the_digest_follows_the_source(tmp_path, monkeypatch):
     digests = set()
     for text in ("a = 1\n", "a = 2\n"):
         (package / "inside.py").write_text(text)
-        lanes_digest = __import__("lanes.digest", fromlist=["_sources"])
-        lanes_digest._sources.cache_clear()
+        machine._sources.cache_clear()
         digests.add(digest_of((), ("digested",)))
     assert len(digests) == 2
 

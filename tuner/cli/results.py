@@ -109,8 +109,7 @@ def _warnings(result: RunResult) -> list[Text]:
 
 def _coefficients(result: RunResult, room: int) -> list[Text | Table]:
     """Return the fitted coefficients, those least known first where they do not fit."""
-    from tuner.uncertainty.verdict import Verdict
-    from tuner.uncertainty.verdict_texts import half_width_in_words, verdict_in_words
+    from tuner.uncertainty.verdict import Verdict, half_width_in_words, verdict_in_words
 
     fitted = {name: row for name, row in result.coefficients.items() if row.fitted}
     shown = list(fitted)
@@ -198,7 +197,7 @@ def print_sensitivity(result: SensitivityResult, *, verbose: bool = False) -> No
     """Print each coefficient's interval, the next flight, and the folder."""
     from tuner.findings.findings import one_line
     from tuner.report.contents import read_contents
-    from tuner.uncertainty.verdict_texts import direction_in_words
+    from tuner.uncertainty.verdict import direction_in_words
 
     screen, first = console(), ("coefficients", "next_flight")
     _print_sections(read_contents(result.folder), lambda key: verbose or key in first)

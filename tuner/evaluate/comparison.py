@@ -407,7 +407,12 @@ def compare(
         raise InputError("--vehicle", "names no vehicle", "name the vehicles to compare")
     if not isinstance(vehicles, Mapping):
         vehicles = {name: name for name in vehicles}
-    sets = {label: _read_vehicle(named) for label, named in vehicles.items()}
+    sets = {
+        label: named
+        if isinstance(named, VehicleFile)
+        else read_vehicle(find_config("vehicles", named, Path()))
+        for label, named in vehicles.items()
+    }
     recordings, noticed = read_recordings(settings, fits=False)
     for finding in (*logged, *noticed):
         on_message(one_line(finding))
@@ -418,12 +423,6 @@ def compare(
     for path in out:
         write_table(table, path)
     return table, settings
-
-
-def _read_vehicle(named: str | VehicleFile) -> VehicleFile:
-    if isinstance(named, VehicleFile):
-        return named
-    return read_vehicle(find_config("vehicles", named, Path()))
 
 
 def table_of(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Table:

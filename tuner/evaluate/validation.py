@@ -131,14 +131,12 @@ class Validation:
         Of whole flights in the closed loop, else of windows from recorded states.
     fitted_starts
         As ``best``, with fitted starts of windows; flights in windows only.
-    predicted_initial, predicted_best
-        Of open-loop predictions; flights in windows only.
-    predicted_with_observer
-        The same with the fitted vehicle and an observed disturbance torque.
-    predicted_holding
-        Of the prediction that the state stays constant.
+    predicted
+        Predictor -> mean errors of open-loop predictions; flights in windows only. The predictors
+        are the ``initial`` and the fitted (``best``) vehicle, the latter ``with_observer`` of the
+        disturbance torque where rotor signals are fed in, and ``holding``: a constant state.
     worse_than_holding
-        s ahead -> quantities that the fitted vehicle predicts significantly worse than that.
+        s ahead -> quantities that the fitted vehicle predicts significantly worse than holding.
     turning_explained
         Share of the mean squared change of body rate that the fitted vehicle predicts; flights
         in windows only.
@@ -147,10 +145,7 @@ class Validation:
     initial: Mapping[str, FlightErrors]
     best: Mapping[str, FlightErrors]
     fitted_starts: Mapping[str, FlightErrors] = field(default_factory=dict)
-    predicted_initial: dict[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
-    predicted_best: dict[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
-    predicted_with_observer: dict[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
-    predicted_holding: dict[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
+    predicted: dict[str, dict[str, tuple[PredictedErrors, ...]]] = field(default_factory=dict)
     worse_than_holding: dict[str, Mapping[float, tuple[str, ...]]] = field(default_factory=dict)
     turning_explained: dict[str, float] = field(default_factory=dict)
 
@@ -168,37 +163,35 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
     for recording in job.recordings:
         if INLETS[recording.inlet].closed_loop:
             continue
-        name, predictor = (
-            recording.flight.name,
-            FlightPredictor(
-                recording.flight,
-                recording.inlet,
-                seconds=max(HORIZONS_S),
-                stride=STRIDE_S,
-                input_late=recording.input_late,
-            ),
+        name = recording.flight.name
+        predictor = FlightPredictor(
+            recording.flight,
+            recording.inlet,
+            seconds=max(HORIZONS_S),
+            stride=STRIDE_S,
+            input_late=recording.input_late,
         )
-        initial = predictor.predict(job.user_settings.vehicle, controller)
         best = predictor.predict(vehicle, controller)
         held = hold_state(predictor.flight, predictor.begins, predictor.ahead, predictor.recorded)
         held = replace(held, errors={quantity: held.errors[quantity] for quantity in best.errors})
-        validation.predicted_initial[name] = _mean_errors(initial)
-        validation.predicted_best[name] = _mean_errors(best)
-        validation.predicted_holding[name] = _mean_errors(held)
+        predicted = {
+            "initial": predictor.predict(job.user_settings.vehicle, controller),
+            "best": best,
+            "holding": held,
+        }
+        if observer is not None and recording.inlet in ROTOR_INLETS:
+            predicted["with_observer"] = predictor.predict(vehicle, controller, observer)
+        validation.predicted[name] = {
+            kind: tuple(PredictedErrors(seconds=at, **of.mean(at)) for at in HORIZONS_S)
+            for kind, of in predicted.items()
+        }
         validation.worse_than_holding[name] = {
             seconds: best.worse_than(held, seconds) for seconds in HORIZONS_S
         }
-        if observer is not None and recording.inlet in ROTOR_INLETS:
-            observed = predictor.predict(vehicle, controller, observer)
-            validation.predicted_with_observer[name] = _mean_errors(observed)
         if "body_rate" in best.errors:
             explained = 1.0 - _body_rate_mse(best) / _body_rate_mse(held)
             validation.turning_explained[name] = explained
     return validation
-
-
-def _mean_errors(of: Predictions) -> tuple[PredictedErrors, ...]:
-    return tuple(PredictedErrors(seconds=seconds, **of.mean(seconds)) for seconds in HORIZONS_S)
 
 
 def _body_rate_mse(predictions: Predictions) -> float:
@@ -324,8 +317,8 @@ def predicted_worse_than_held(job: Job, validation: Validation) -> tuple[Finding
             continue
         seconds = max(lost)
         best, held = (
-            next(one for one in predicted[name] if one.seconds == seconds)
-            for predicted in (validation.predicted_best, validation.predicted_holding)
+            next(one for one in validation.predicted[name][kind] if one.seconds == seconds)
+            for kind in ("best", "holding")
         )
         numbers = {"soonest": min(lost), "seconds": seconds}
         for quantity in lost[seconds]:

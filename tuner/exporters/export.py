@@ -39,7 +39,7 @@ from tuner.result import (
     Run,
     read_run,
 )
-from tuner.uncertainty.verdict_texts import judgement_in_words
+from tuner.uncertainty.verdict import judgement_in_words
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of
 
 FOLDER = EXPORTS

@@ -55,7 +55,7 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, knowledge_of
-from tuner.uncertainty.records import Knowledge, Sources, write_files
+from tuner.uncertainty.records import Knowledge, Sources
 from tuner.uncertainty.verdict import (
     NOT_EXAMINED,
     NOT_FITTED,
@@ -223,24 +223,6 @@ def _judgements(
     return judgements
 
 
-def with_errors_of_refits(
-    result: RunResult, jackknife: Mapping[str, float], bootstrapped: Mapping[str, float]
-) -> RunResult:
-    """Return a result with the standard errors of refits: coefficient -> error, empty for none."""
-    coefficients = {
-        name: found.model_copy(
-            update={
-                "jackknife_error": jackknife.get(name),
-                "bootstrap_error": bootstrapped.get(name),
-            }
-        )
-        if found.fitted
-        else found
-        for name, found in result.coefficients.items()
-    }
-    return result.model_copy(update={"coefficients": coefficients})
-
-
 def _regressed(
     name: str, initial: float, best: float, error: float, bounds: tuple[float, float]
 ) -> CoefficientResult:
@@ -287,10 +269,10 @@ def _flight(job: Job, fitted: Fitted, recording: Recording, validation: Validati
         input_late=recording.input_late,
         horizon=horizon,
         rmse_fitted_starts=None if met is None else met.rmse,
-        predicted_initial=validation.predicted_initial.get(name, ()),
-        predicted_best=validation.predicted_best.get(name, ()),
-        predicted_with_observer=validation.predicted_with_observer.get(name, ()),
-        predicted_holding=validation.predicted_holding.get(name, ()),
+        **{
+            f"predicted_{kind}": errors
+            for kind, errors in validation.predicted.get(name, {}).items()
+        },
     )
 
 
@@ -360,7 +342,7 @@ ones; s. The publisher takes ten to wind up."""
 def write_knowledge(folder: Path, job: Job, examination: Examination, fitted: Fitted) -> Knowledge:
     """Write the knowledge of each coefficient into a result folder, and return it."""
     knowledge = knowledge_of(examination, job.space, fitted.point)
-    write_files(knowledge, folder)
+    knowledge.write(folder)
     return knowledge
 
 

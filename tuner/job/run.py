@@ -38,7 +38,6 @@ from tuner.job.listener import SILENT, Listener
 from tuner.job.prepare import check_information, prepare
 from tuner.job.results import (
     result_of,
-    with_errors_of_refits,
     write_folder,
     write_knowledge,
     write_next_flight,
@@ -332,7 +331,18 @@ def _with_refits(
     if options.bootstrap is not None:
         with span("bootstrap"):
             bootstrapped = bootstrap(*fit, options.bootstrap, folder, on_iteration)
-    result = with_errors_of_refits(result, jackknife, bootstrapped)
+    coefficients = {
+        name: coefficient.model_copy(
+            update={
+                "jackknife_error": jackknife.get(name),
+                "bootstrap_error": bootstrapped.get(name),
+            }
+        )
+        if coefficient.fitted
+        else coefficient
+        for name, coefficient in result.coefficients.items()
+    }
+    result = result.model_copy(update={"coefficients": coefficients})
     result.write(folder)
     return result
 

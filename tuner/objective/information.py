@@ -169,7 +169,9 @@ class FisherInformation:
             if first.diverged is None
             else np.concatenate([part.diverged for part in parts if part.diverged is not None]),
             pull=first.pull,
-            nuisance_pull=_summed([part.nuisance_pull for part in parts]),
+            nuisance_pull=None
+            if first.nuisance_pull is None
+            else np.sum([part.nuisance_pull for part in parts], axis=0),
         )
 
     def with_resting(self, where: NDArray[np.bool_]) -> FisherInformation:
@@ -278,11 +280,6 @@ def is_refuted(objective: Objective, point: Point, criterion: Criterion) -> bool
     """Return whether the flights contradict a fit, as of `FisherInformation.refuted`."""
     parts = [information_at(*batch) for _, batch in flight_batches(objective, point, criterion)]
     return FisherInformation.joined(parts).refuted
-
-
-def _summed(parts: Sequence[Array | None]) -> Array | None:
-    known = [part for part in parts if part is not None]
-    return np.asarray(np.sum(known, axis=0)) if len(known) == len(parts) else None
 
 
 def with_start_values(space: Space, vector: ArrayLike, names: Collection[str]) -> Array:
@@ -469,10 +466,12 @@ def _nuisance_directions(
     for number in range(flights):
         segments = np.flatnonzero(objective.flight == number)
         first = {segment: _without_start(whole[segment], kept) for segment in segments}
-        together = sum(
-            (_information_along(whole[segment], first[segment]) for segment in segments),
-            np.zeros((kept, kept)),
-        )
+        together = np.zeros((kept, kept))
+        for segment, along_start in first.items():  # the prior of a start included
+            together = together + (
+                along_start @ whole[segment] @ along_start.T
+                + along_start[:, kept:] @ along_start[:, kept:].T
+            )
         projection = _projection(together, offsets_fitted[:, number], count)
         second = np.hstack([np.eye(count), projection])
         prior += projection @ projection.T / OFFSET_SD**2
@@ -516,12 +515,6 @@ def _without_start(whole: Array, kept: int) -> Array:
     """
     of_start = whole[kept:, kept:] + np.eye(len(whole) - kept)
     return np.hstack([np.eye(kept), -np.linalg.solve(of_start, whole[kept:, :kept]).T])
-
-
-def _information_along(whole: Array, along: Array) -> Array:
-    """Return the information along some directions, the prior of a start included."""
-    kept = len(along)
-    return np.asarray(along @ whole @ along.T + along[:, kept:] @ along[:, kept:].T)
 
 
 def _projection(whole: Array, movable: NDArray[np.bool_], count: int) -> Array:

@@ -17,8 +17,7 @@ from tuner.report.result_texts import metres, simulator_lacks
 from tuner.report.section import Cell, Table
 from tuner.result import ExportRecord, FlightResult, RunResult
 from tuner.uncertainty.records import Knowledge
-from tuner.uncertainty.verdict import Verdict
-from tuner.uncertainty.verdict_texts import verdict_in_words
+from tuner.uncertainty.verdict import Verdict, verdict_in_words
 
 MAX_NAMES_LETTERS = 90
 """The names of flights in a sentence take at most so many letters."""

@@ -73,7 +73,8 @@ END_CODES = UNMATCHED_CODES | frozenset(
 def with_end_findings(job: Job, fitted: Fitted) -> Fitted:
     """Return a fit with the findings at its end instead of those of the fits before it."""
     findings = [finding for finding in fitted.findings if finding.code not in END_CODES]
-    findings += end_findings(job, loop_of(fitted.objective), fitted.scales)
+    findings += loop_findings(job, loop_of(fitted.objective), "warning")
+    findings += unmatched_findings(fitted.scales)
     offsets = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
     for number, flight in enumerate(job.fitted):
         for kind, value in zip(OFFSETS, offsets[:, number].tolist(), strict=True):
@@ -84,21 +85,6 @@ def with_end_findings(job: Job, fitted: Fitted) -> Fitted:
             )
             findings.append(Finding(code, "info", flight.name, {unit: value}, (kind,)))
     return replace(fitted, findings=tuple(findings))
-
-
-def end_findings(job: Job, loop: Loop, scales: Scales) -> tuple[Finding, ...]:
-    """Return the findings on set-up and flights at the end of a search.
-
-    Parameters
-    ----------
-    job
-        The problem.
-    loop
-        The loop's choices at the end.
-    scales
-        As of `unmatched`.
-    """
-    return (*loop_findings(job, loop, "warning"), *unmatched_findings(scales))
 
 
 def unmatched_findings(scales: Scales, matched: Collection[str] = ()) -> tuple[Finding, ...]:

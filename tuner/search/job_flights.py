@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -132,7 +132,7 @@ def read_recordings(
     for flight in flights:
         try:
             known = _with_reference(flight, settings)
-            recordings.append(_recording_of(settings, known, flight.name in held_out))
+            recordings.append(recording_of(settings, known, holdout=flight.name in held_out))
         except RecordingError as error:
             left_out.append((flight.name, error))
     none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
@@ -169,29 +169,6 @@ def left_out_finding(name: str, error: RecordingError) -> Finding:
     return Finding(Code.LEFT_OUT, "warning", name, names=(error.what, error.remedy))
 
 
-def recordings_of(
-    settings: Settings, flights: Iterable[Flight], *, holdout: Sequence[str] | None = None
-) -> tuple[Recording, ...]:
-    """Return flights with the inlet, clock offset and holdout of a job's settings.
-
-    Parameters
-    ----------
-    settings, holdout
-        As of `read_recordings`.
-    flights
-        With a reference where one is named.
-
-    Raises
-    ------
-    RecordingError
-        A flight contradicts itself, or lacks signals of its inlet, or has too few of them together.
-    ConfigError
-        The mixer above an inlet cannot fly the vehicle's rotors.
-    """
-    held_out = settings.job.holdout if holdout is None else holdout
-    return tuple(_recording_of(settings, flight, flight.name in held_out) for flight in flights)
-
-
 def with_known(
     recordings: Sequence[Recording], **known: Mapping[str, Any]
 ) -> tuple[Recording, ...]:
@@ -202,7 +179,16 @@ def with_known(
     )
 
 
-def _recording_of(settings: Settings, flight: Flight, holdout: bool) -> Recording:
+def recording_of(settings: Settings, flight: Flight, *, holdout: bool) -> Recording:
+    """Return a flight with the inlet and clock offset of a job's settings.
+
+    Raises
+    ------
+    RecordingError
+        It contradicts itself, or lacks signals of its inlet, or has too few of them together.
+    ConfigError
+        The mixer above an inlet cannot fly the vehicle's rotors.
+    """
     job, flight_settings = settings.job, settings.job.flights.get(flight.name)
     inlet, offset = job.inlet, job.time_offset
     if flight_settings is not None:

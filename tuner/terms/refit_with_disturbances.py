@@ -23,10 +23,13 @@ from tuner.search.findings import UNMATCHED_CODES, Explanation, outlying_flights
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, Free, Progress
 from tuner.terms.candidates import (
+    NEGLIGIBLE_SIZE,
+    Evidence,
     Selected,
     is_lumped,
     names_of,
     prior_presence_of,
+    selection_shifts,
     with_free,
     with_groups,
 )
@@ -37,7 +40,6 @@ from tuner.terms.linearisation import (
     neutral_of,
     vector_after,
 )
-from tuner.terms.model_averaging import NEGLIGIBLE_SIZE, Evidence, selection_shifts
 from tuner.terms.score import ACCEPTED, backward_elimination, score
 from tuner.terms.selection import (
     GAINS_REFUTED,

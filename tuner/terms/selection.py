@@ -58,11 +58,11 @@ from tuner.terms.candidates import (
     offsets_of,
     prior_presence_of,
     reads_recording,
+    selection_shifts,
     with_groups,
     with_terms,
 )
 from tuner.terms.linearisation import LinearisedFit, linearise, predicted_losses, vector_after
-from tuner.terms.model_averaging import selection_shifts
 from tuner.terms.score import Score, backward_elimination, row_of, score
 from tuner.uncertainty.model_error import (
     GAIN_AXES,

@@ -17,8 +17,7 @@ from tuner.objective.information import Change, FisherInformation, information_a
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import Covariance, IndependentErrors, covariance_of, flight_parts
-from tuner.uncertainty.records import ErrorParts
-from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict, judge
+from tuner.uncertainty.verdict import Direction, ErrorParts, Reason, ReasonCode, Verdict, judge
 from tuner.vehicle import COEFFICIENTS, scale_group, term_groups
 
 STEP = "step"

@@ -83,7 +83,7 @@ def examine(
     alternatives
         Source of error -> the problem simulated with it changed, as of `alternatives_of`.
     selection_shifts
-        Coefficient -> its scaled shift by omitted terms (`tuner.terms.model_averaging`).
+        Coefficient -> its scaled shift by omitted terms, as of `tuner.terms.candidates`.
     predictor
         Filter whose innovations are used instead of residuals.
     at_minimum

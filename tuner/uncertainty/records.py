@@ -16,58 +16,6 @@ from tuner.evaluate.records import AxesRmse
 from tuner.uncertainty.verdict import Direction, Reason, Verdict
 
 
-class ErrorParts(Part):
-    """Standard errors of one coefficient, in its unit; the quoted one holds all of them.
-
-    Each is that of a normal distribution with the 95 % interval that is meant, which is wider where
-    few stretches of time or few flights speak.
-
-    Attributes
-    ----------
-    noise
-        Were measurement noise alone in the residuals.
-    residuals
-        With all that is in them: disturbances and what the model lacks.
-    left_out
-        As the estimate moves when flights are left out in turn (parts of them where they are few);
-        None where there are no three.
-    terms
-        As it would move with terms that were tried and not kept, and where errors of measured
-        rotor speeds pass for inertia; for a gain of the rate controller how far off recorded
-        commands put it. None where none was tried.
-    step
-        Its move when the physics step is halved, and for a rotor's lag that it may be off by half
-        of the finest step in which simulators take it, for that of recorded rotor speeds by half of
-        the log's; None where that was not asked.
-    readings
-        How it scatters when the battery's voltmeter is read again, with errors like those that it
-        made; with commands fed in, how far it would move with recorded rotor speeds instead. None
-        where there is neither, or disturbances are estimated.
-    lack
-        How far it would move with the laws that recorded accelerations follow beside the model's;
-        None where none was found.
-    search
-        How far one more linear step would move it: a search ends where its steps gain nothing.
-    limit
-        How far it would move were the rotors' limit, ``max_rotor_velocity``, a quarter off; None
-        where rotor speeds were recorded.
-    astray
-        The standard deviation of its prior, where the fitted vehicle crashes on a fitted flight,
-        or flies most of them otherwise than they were recorded; None where it does not.
-    """
-
-    noise: FiniteOrNone
-    residuals: FiniteOrNone
-    left_out: FiniteOrNone = None
-    terms: FiniteOrNone = None
-    step: FiniteOrNone = None
-    readings: FiniteOrNone = None
-    lack: FiniteOrNone = None
-    search: FiniteOrNone = None
-    limit: FiniteOrNone = None
-    astray: FiniteOrNone = None
-
-
 class Refit(Part):
     """A fit to other flights, and how well it predicts one of them that it leaves out.
 
@@ -337,6 +285,27 @@ class EffectOverTime(Part):
     span: dict[str, tuple[float, float]]
 
 
+SENSITIVITY_FILE = "sensitivity.csv"
+SHARES_FILE = "information_shares.csv"
+MATRICES = ("correlation", "covariance", "information")
+
+COLUMNS = (
+    "coefficient",
+    "fitted",
+    "flight",
+    "channel",
+    "axis",
+    "unit",
+    "rms_change_1pct",
+    "rmse",
+    "rmse_plus_10pct",
+    "rmse_minus_10pct",
+    "half_effect_from",
+    "half_effect_to",
+    "information_share",
+)
+
+
 class Knowledge(ResultFile):
     """The content of ``sensitivity.json``.
 
@@ -375,6 +344,28 @@ class Knowledge(ResultFile):
     covariance: list[list[float]]
     information: list[list[float]]
 
+    def write(self, folder: Path) -> None:
+        """Write ``sensitivity.json`` and, for other programs, tables.
+
+        ``sensitivity.csv`` has one row for each coefficient and axis of a channel of a flight;
+        ``information_share`` is the whole channel's on that flight; half of the coefficient's
+        squared effect on the flight falls between ``half_effect_from`` and ``half_effect_to``, in
+        s. The matrices are square, their first column and first row the names; covariance and
+        information in the coefficients' units.
+        """
+        super().write(folder)
+        share = ("coefficient", "flight", "channel", "share")
+        texts = {
+            SENSITIVITY_FILE: csv_text(COLUMNS, _sensitivity(self)),
+            SHARES_FILE: csv_text(share, _shares(self)),
+        }
+        for name in MATRICES:
+            rows = zip(self.names, getattr(self, name), strict=True)
+            header = ("coefficient", *self.names)
+            texts[f"{name}.csv"] = csv_text(header, ([own, *row] for own, row in rows))
+        for name, text in texts.items():
+            write_text(folder / name, text)
+
     @model_validator(mode="after")
     def _hold_all_of_each_coefficient(self) -> Self:
         outputs = self.outputs
@@ -392,55 +383,6 @@ class Knowledge(ResultFile):
             if any(len(change) != len(effect.time) for change in effect.change.values()):
                 raise refuse(f"lacks an effect over the time of {effect.flight}", "was it edited?")
         return self
-
-
-SENSITIVITY_FILE = "sensitivity.csv"
-SHARES_FILE = "information_shares.csv"
-MATRICES = ("correlation", "covariance", "information")
-
-COLUMNS = (
-    "coefficient",
-    "fitted",
-    "flight",
-    "channel",
-    "axis",
-    "unit",
-    "rms_change_1pct",
-    "rmse",
-    "rmse_plus_10pct",
-    "rmse_minus_10pct",
-    "half_effect_from",
-    "half_effect_to",
-    "information_share",
-)
-
-
-def write_files(knowledge: Knowledge, folder: Path) -> tuple[Path, ...]:
-    """Write everything into a folder, and return the paths.
-
-    ``sensitivity.csv`` has one row for each coefficient and axis of a channel of a flight;
-    ``information_share`` is the whole channel's on that flight; half of the coefficient's squared
-    effect on the flight falls between ``half_effect_from`` and ``half_effect_to``, in s. The
-    matrices are square, their first column and first row the names; covariance and information in
-    the coefficients' units.
-
-    Raises
-    ------
-    OutputError
-        The folder cannot be written to.
-    """
-    knowledge.write(folder)
-    texts = {
-        SENSITIVITY_FILE: csv_text(COLUMNS, _sensitivity(knowledge)),
-        SHARES_FILE: csv_text(("coefficient", "flight", "channel", "share"), _shares(knowledge)),
-    }
-    for name in MATRICES:
-        rows = zip(knowledge.names, getattr(knowledge, name), strict=True)
-        header = ("coefficient", *knowledge.names)
-        texts[f"{name}.csv"] = csv_text(header, ([coefficient, *row] for coefficient, row in rows))
-    for name, text in texts.items():
-        write_text(folder / name, text)
-    return tuple(folder / name for name in texts)
 
 
 def _sensitivity(knowledge: Knowledge) -> Iterable[Sequence[object]]:

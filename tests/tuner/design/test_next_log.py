@@ -7,6 +7,7 @@ import pytest
 
 from tests.tuner.job.test_attitude import settings_of, sparse_log
 from tests.tuner.job.test_windows import job_through
+from tests.tuner.recorded import recordings_of
 from tests.tuner.uncertainty.making import ended
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import errors_of
@@ -15,7 +16,6 @@ from tuner.design.next_log import propose_logs
 from tuner.design.proposals import LogProposal, log_in_words
 from tuner.objective.information import information_at
 from tuner.recordings.flight import Series
-from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.search.progress import criterion_of, initial_progress, point_of
 from tuner.search.stages import WHOLE_LENGTH, Stage

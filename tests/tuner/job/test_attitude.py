@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.job.test_windows import stage_for
+from tests.tuner.recorded import recordings_of
 from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import FlightSettings, Search
 from tuner.findings.findings import Code, one_line
@@ -14,7 +15,7 @@ from tuner.recordings.flight import Series
 from tuner.search import job_flights as recordings
 from tuner.search.estimation import search
 from tuner.search.inlet_choice import choose_inlet
-from tuner.search.job_flights import read_recordings, recordings_of
+from tuner.search.job_flights import read_recordings
 from tuner.search.problem import job_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, values_of, with_values
 

@@ -8,6 +8,7 @@ import pytest
 
 from sim_jax.schedule import Schedule
 from tests.tuner.evaluate.test_rmse import errors
+from tests.tuner.recorded import recordings_of
 from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import Search
 from tuner.core.errors import ConfigError, RecordingError
@@ -23,7 +24,7 @@ from tuner.recordings.flight import Series
 from tuner.recordings.notes import Note, NoteCode
 from tuner.search import job_flights as recordings_module
 from tuner.search.findings import turning_findings
-from tuner.search.job_flights import read_recordings, recordings_of
+from tuner.search.job_flights import read_recordings
 from tuner.vehicle import ControllerFile
 
 

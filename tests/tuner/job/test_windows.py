@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from tests.tuner.recorded import recordings_of
 from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import CoefficientSettings, FlightSettings, Search
 from tuner.core.errors import ConfigError
@@ -18,7 +19,6 @@ from tuner.job.run import run
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.unit_detection import UNIT_PHRASES, UNITS, to_si
 from tuner.search.estimation import search
-from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.search.progress import criterion_of, initial_progress
 from tuner.search.stages import WHOLE_LENGTH, plan

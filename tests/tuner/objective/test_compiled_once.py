@@ -8,14 +8,14 @@ import jax
 import numpy as np
 import pytest
 
-from lanes.digest import digest_of
+from lanes.machine import digest_of
 from lanes.program import _program_of
 from sim_jax.terms import total
+from tests.tuner.recorded import recordings_of
 from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.config import Options, resolve_settings
 from tuner.objective import simulation
 from tuner.recordings.flight import Series
-from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 
 

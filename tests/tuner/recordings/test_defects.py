@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.tuner.recorded import recordings_of
 from tuner.config import Options, resolve_settings
 from tuner.core.errors import RecordingError
 from tuner.recordings.defects import (
@@ -18,7 +19,6 @@ from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
 from tuner.recordings.missions import find_missions
 from tuner.recordings.notes import NoteCode
-from tuner.search.job_flights import recordings_of
 
 
 def _cleaned(signal: str, time: np.ndarray, values: np.ndarray):

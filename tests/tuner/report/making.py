@@ -33,10 +33,16 @@ from tuner.uncertainty.records import (
     Knowledge,
     OutputSensitivity,
     Residual,
-    write_files,
 )
-from tuner.uncertainty.verdict import NOT_FITTED, Direction, Reason, ReasonCode, Verdict, judge
-from tuner.uncertainty.verdict_texts import judgement_in_words
+from tuner.uncertainty.verdict import (
+    NOT_FITTED,
+    Direction,
+    Reason,
+    ReasonCode,
+    Verdict,
+    judge,
+    judgement_in_words,
+)
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of, write_vehicle
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
@@ -77,7 +83,7 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
         ],
     ).write(folder)
     knowledge = _knowledge(vehicle, free, undetermined)
-    write_files(knowledge, folder)
+    knowledge.write(folder)
     _result(vehicle, knowledge, initial, best).write(folder)
 
 

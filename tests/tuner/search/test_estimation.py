@@ -15,13 +15,13 @@ from tuner.objective.space import space_of
 from tuner.search import estimation as module
 from tuner.search.estimation import fingerprint, polished, starting_vectors
 from tuner.search.findings import (
-    end_findings,
     outlying_flights,
     reference_voltage_findings,
     unmatched,
+    unmatched_findings,
 )
 from tuner.search.iteration import Outcome
-from tuner.search.progress import Free, Loop
+from tuner.search.progress import Free
 from tuner.search.stages import plan, remaining_seconds
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.vehicle import ControllerFile
@@ -102,22 +102,14 @@ def test_findings_are_those_of_the_last_polish(fitted, updated, monkeypatch):
 
 
 def test_an_outlying_flight_is_named_and_a_misfit_of_all_is_the_models():
-    job = SimpleNamespace(
-        settings=SimpleNamespace(
-            controller=SimpleNamespace(
-                mixer=SimpleNamespace(saturation_feedback=True),
-                sensing=SimpleNamespace(sees_markers=False),
-            )
-        )
-    )
     one_stray = {"a": {"position": 1.0}, "b": {"position": 1.1}, "c": {"position": 90.0}}
     assert set(unmatched(one_stray)) == outlying_flights(one_stray) == {"c"}
     assert not outlying_flights(one_stray | {"b": {"position": 1.5}})
     assert not outlying_flights({name: one_stray[name] for name in "ac"})
-    (finding,) = end_findings(job, Loop(), one_stray)
+    (finding,) = unmatched_findings(one_stray)
     assert (finding.code, finding.subject) == (Code.FLIGHT_UNMATCHED, "c")
     all_far = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}
-    (finding,) = end_findings(job, Loop(), all_far)
+    (finding,) = unmatched_findings(all_far)
     assert finding.code is Code.MODEL_UNMATCHED
     assert finding.numbers == {"unmatched": 3, "flights": 3, "noise_multiple": 35.0}
 

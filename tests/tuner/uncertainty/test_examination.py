@@ -16,7 +16,7 @@ from tuner.objective.normal_equations import Objective, flight_batches
 from tuner.uncertainty.estimates import flights_refute
 from tuner.uncertainty.examination import Examination, examine, knowledge_of
 from tuner.uncertainty.identifiability import stand_ins_of
-from tuner.uncertainty.records import Knowledge, write_files
+from tuner.uncertainty.records import Knowledge
 from tuner.uncertainty.sensitivity import shortest_half
 from tuner.uncertainty.verdict import ReasonCode, Verdict
 
@@ -207,7 +207,7 @@ def test_half_of_an_effect_is_where_it_is() -> None:
 
 
 def test_files_hold_the_knowledge(knowledge: Knowledge, tmp_path: Path) -> None:
-    write_files(knowledge, tmp_path)
+    knowledge.write(tmp_path)
     assert Knowledge.read(tmp_path) == knowledge
     rows = list(csv.DictReader(io.StringIO((tmp_path / "sensitivity.csv").read_text())))
     assert {row["coefficient"] for row in rows} == set(knowledge.coefficients)

@@ -10,10 +10,11 @@ from tuner.uncertainty.verdict import (
     Reason,
     ReasonCode,
     Verdict,
+    half_width_in_words,
     judge,
     judge_after_holding,
+    reason_in_words,
 )
-from tuner.uncertainty.verdict_texts import half_width_in_words, reason_in_words
 
 KNOWN = Reason(
     code=ReasonCode.INTERVAL,

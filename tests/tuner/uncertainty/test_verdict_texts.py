@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from tuner.uncertainty.records import ErrorParts
-from tuner.uncertainty.verdict import NOT_FITTED, Direction, Reason, ReasonCode, Verdict
-from tuner.uncertainty.verdict_texts import (
+from tuner.uncertainty.verdict import (
+    NOT_FITTED,
+    Direction,
+    ErrorParts,
+    Reason,
+    ReasonCode,
+    Verdict,
     direction_in_words,
     half_width_in_words,
     judgement_in_words,

@@ -11,8 +11,8 @@ from tuner.report.result_texts import calibration_in_words
 from tuner.report.section import Cell, Section, Table, figures, short
 from tuner.result import CoefficientResult
 from tuner.uncertainty.records import CoefficientKnowledge, calibration
-from tuner.uncertainty.verdict import Verdict
-from tuner.uncertainty.verdict_texts import (
+from tuner.uncertainty.verdict import (
+    Verdict,
     half_width_in_words,
     judgement_in_words,
     parts_in_words,

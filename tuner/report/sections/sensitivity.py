@@ -17,7 +17,7 @@ from tuner.uncertainty.records import (
     Profile,
     Residual,
 )
-from tuner.uncertainty.verdict_texts import direction_in_words
+from tuner.uncertainty.verdict import direction_in_words
 
 MIN_DRAWN_SHARE = 1e-4
 """Changes smaller than this share of the present RMSE are drawn as this."""
