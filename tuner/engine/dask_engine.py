@@ -348,7 +348,11 @@ def cluster_of(file: ClusterFile) -> AbstractContextManager[Any]:
     if file.jobs is not None:
         return _jobs(file, file.jobs)
     if file.kubernetes is not None:
-        return _kubernetes(file, file.kubernetes)
+        with extra():
+            from dask_kubernetes.operator import KubeCluster  # noqa: PLC0415 (few need it)
+
+        pods = KubeCluster(custom_cluster_spec=pod_specification(file, file.kubernetes))
+        return contextlib.closing(pods)
     cluster: AbstractContextManager[Any] = LocalCluster(
         n_workers=file.workers,
         threads_per_worker=1,
@@ -427,34 +431,21 @@ def _jobs(file: ClusterFile, jobs: JobQueue, *, submit: bool = True) -> Abstract
     return cluster
 
 
-def _kubernetes(file: ClusterFile, pods: Kubernetes) -> AbstractContextManager[Any]:
-    with extra():
-        from dask_kubernetes.operator import KubeCluster  # noqa: PLC0415 (few need it)
-
-    return contextlib.closing(KubeCluster(custom_cluster_spec=pod_specification(file, pods)))
-
-
 def pod_specification(file: ClusterFile, pods: Kubernetes) -> dict[str, Any]:
     """Return the Dask cluster that dask_kubernetes' operator is asked for."""
     with extra():
         from dask_kubernetes.operator import make_cluster_spec  # noqa: PLC0415 (few need it)
 
+    assert file.memory is not None
+    memory = file.memory.replace(" ", "").removesuffix("B")  # as Kubernetes writes it: 2Gi, 500M
+    each = {"cpu": str(file.cores), "memory": memory}
     specification: dict[str, Any] = make_cluster_spec(
         name=pods.name,
         image=pods.image,
         n_workers=file.workers,
-        resources={
-            "requests": {"cpu": str(file.cores), "memory": _quantity(file)},
-            "limits": {"cpu": str(file.cores), "memory": _quantity(file)},
-        },
+        resources={"requests": each, "limits": each},
         worker_command="dask worker --nthreads 1",
     )
     if pods.namespace is not None:
         specification["metadata"]["namespace"] = pods.namespace
     return specification
-
-
-def _quantity(file: ClusterFile) -> str:
-    """Return the memory as Kubernetes writes it: 2Gi, 500M."""
-    assert file.memory is not None
-    return file.memory.replace(" ", "").removesuffix("B")

@@ -64,7 +64,6 @@ from tuner.uncertainty.verdict import (
     Verdict,
     judge_after_holding,
     judge_by_error,
-    judge_impossible_inertia,
 )
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, write_vehicle
 from tuner.vehicle.selection_table import SelectionRow
@@ -219,7 +218,8 @@ def _judgements(
                     name, *judgements[name], fitted.held[parameter.name]
                 )
     for name in impossible_inertia(job, fitted):
-        judgements[name] = judge_impossible_inertia(values[name])
+        reason = Reason(code=ReasonCode.IMPOSSIBLE_INERTIA, fitted_value=values[name])
+        judgements[name] = Verdict.HELD, reason
     return judgements
 
 

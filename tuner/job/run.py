@@ -107,7 +107,13 @@ def run(
     _check_place(options, settings, place_for(out, resume=resume))
     job, findings = prepare(settings)
     findings = (*logged, *findings)
-    _check_refits(options, job)
+    refits = {
+        "--cross-validate": options.cross_validate and "leaves no flight to fit",
+        "--bootstrap": options.bootstrap is not None and "draws from a single flight",
+    }
+    for option, what in refits.items():
+        if what and len(job.fitted) < 2:
+            raise InputError(option, what, "give two or more")
     explanation = Explanation(listener.on_message)
     _check(findings, explanation, listener, force=options.force)
     with span("check"):
@@ -181,7 +187,10 @@ def _fit(
         return result
 
     physical = Run(folder=folder, result=written(), vehicle=vehicle)
-    _write_simulations(folder, validation, fitted)
+    simulations = {"initial": validation.initial, "best": validation.best}
+    write_traces(folder, simulations)
+    table_of(simulations).write(folder)
+    write_search(folder, fitted)
     find = partial(_effective, physical, job, fitted, listener)
     stops = selected.refuted  # no other answer, and no flight to plan
     effective = None if stops else explanation.attempt("effective coefficients", find, None)
@@ -224,7 +233,7 @@ def _fitted(
     """
     if not resume:
         forget(folder)
-    on_progress = _keeping_best(folder, listener)
+    on_progress = _reporting(listener, folder)
     try:
         found = search_with_terms(
             job,
@@ -298,14 +307,6 @@ def _effective(physical: Run, job: Job, fitted: Fitted, listener: Listener) -> E
     )
 
 
-def _write_simulations(folder: Path, validation: Validation, fitted: Fitted) -> None:
-    """Write each flight's simulations, and the iterations of the search."""
-    simulations = {"initial": validation.initial, "best": validation.best}
-    write_traces(folder, simulations)
-    table_of(simulations).write(folder)
-    write_search(folder, fitted)
-
-
 def _export(folder: Path, settings: Settings, listener: Listener) -> None:
     """Write the exports that the job asks for."""
     today = datetime.date.today()
@@ -358,14 +359,6 @@ def _check_place(options: Options, settings: Settings, folder: Path) -> None:
             raise InputError("--out", what, "name another folder")
 
 
-def _check_refits(options: Options, job: Job) -> None:
-    """Refuse refits to other flights where there is one only."""
-    if len(job.fitted) < 2 and options.cross_validate:
-        raise InputError("--cross-validate", "leaves no flight to fit", "give two or more")
-    if len(job.fitted) < 2 and options.bootstrap is not None:
-        raise InputError("--bootstrap", "draws from a single flight", "give two or more")
-
-
 def _check(
     findings: Sequence[Finding], explanation: Explanation, listener: Listener, *, force: bool
 ) -> None:
@@ -383,25 +376,16 @@ def _check(
         raise InputError(failure.subject, what, f"{to_do}, or use --force")
 
 
-def _reporting(listener: Listener) -> OnProgress:
-    """Return a callback that passes the last iteration on to the listener."""
-
-    def on_progress(_: Job, progress: Progress) -> None:
-        listener.on_iteration(progress.iterations[-1], progress.left)
-
-    return on_progress
-
-
-def _keeping_best(folder: Path, listener: Listener) -> OnProgress:
-    """Return a callback that writes the best vehicle so far, and reports the last iteration."""
-    report = _reporting(listener)
+def _reporting(listener: Listener, folder: Path | None = None) -> OnProgress:
+    """Return a callback that reports the last iteration, and writes the best vehicle so far."""
 
     def on_progress(job: Job, progress: Progress) -> None:
         with suppress(ConfigError):  # a search may pass through impossible inertias
-            best = with_values(
-                job.settings.vehicle, job.space.numbers(progress.best_point.coefficients)
-            )
-            write_vehicle(best, folder / BEST_FIT_FILE, header="Best so far of an unfinished run.")
-        report(job, progress)
+            values = job.space.numbers(progress.best_point.coefficients)
+            if folder is not None:
+                best = with_values(job.settings.vehicle, values)
+                header = "Best so far of an unfinished run."
+                write_vehicle(best, folder / BEST_FIT_FILE, header=header)
+        listener.on_iteration(progress.iterations[-1], progress.left)
 
     return on_progress

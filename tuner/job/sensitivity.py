@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.config import Settings, resolve_settings
+from tuner.config import resolve_settings
 from tuner.core.disk import exists, result_folder
 from tuner.core.errors import InputError, did_you_mean
 from tuner.core.runtime import versions
@@ -137,7 +137,25 @@ def examine_vehicle(
             fitted, alternatives=alternatives_of(fitted.objective, fitted.point), at_minimum=False
         )
         forget(out)
-        _about(settings, job, fitted, command).write(out)
+        about = About(
+            command=command,
+            vehicle=settings.vehicle.name,
+            versions=versions(),
+            settings={
+                "vehicle": settings.vehicle.model_dump(mode="json"),
+                "controller": settings.controller.model_dump(mode="json"),
+                "job": settings.job.model_dump(mode="json"),
+                "origin": dict(settings.origin),
+                "noise": dict(fitted.noise),
+                "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
+            },
+            findings=list(fitted.findings),
+            flights=[
+                Recording(name=f.name, path=str(f.path), sha256=f.sha256, duration=f.duration)
+                for f in job.flights
+            ],
+        )
+        about.write(out)
         knowledge = write_knowledge(out, job, examination, fitted)
         on_message("simulating what could be flown next")
         proposals = write_next_flight(out, job, examination, fitted, room)
@@ -211,24 +229,3 @@ def _ranges(job: Job, examination: Examination, span: float) -> dict[str, tuple[
             min(high, parameter.upper) if upper is None else upper,
         )
     return ranges
-
-
-def _about(settings: Settings, job: Job, fitted: Fitted, command: str) -> About:
-    return About(
-        command=command,
-        vehicle=settings.vehicle.name,
-        versions=versions(),
-        settings={
-            "vehicle": settings.vehicle.model_dump(mode="json"),
-            "controller": settings.controller.model_dump(mode="json"),
-            "job": settings.job.model_dump(mode="json"),
-            "origin": dict(settings.origin),
-            "noise": dict(fitted.noise),
-            "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
-        },
-        findings=list(fitted.findings),
-        flights=[
-            Recording(name=f.name, path=str(f.path), sha256=f.sha256, duration=f.duration)
-            for f in job.flights
-        ],
-    )

@@ -147,7 +147,10 @@ def _resistance(pairs: Sequence[tuple[Series, Series]], *, spikes_count: bool) -
     """
     falls, varied = [np.empty(0)], [np.empty(0)]
     for reading, load in pairs:
-        drawn = np.interp(reading.time, load.time, _charge(load))
+        # a battery declines by the charge that was drawn: the load's integral
+        means = 0.5 * (load.values[1:, 0] + load.values[:-1, 0])
+        charge = np.concatenate([[0.0], np.cumsum(means * np.diff(load.time))])
+        drawn = np.interp(reading.time, load.time, charge)
         trend = _polynomials(drawn, 1 + int(np.ceil(float(np.ptp(reading.time)) / TREND_PERIOD_S)))
         if len(reading.time) < trend.shape[1] + MIN_SPLINE_READINGS:
             continue
@@ -176,12 +179,6 @@ def _smoothed(reading: Series, load: Series | None, resistance: float) -> Voltag
     without = reading.values[:, 0] + np.interp(reading.time, load.time, sag)
     decline = _spline(reading.time, without)(np.clip(load.time, reading.time[0], reading.time[-1]))
     return Voltage(load.time, decline - sag, decline)
-
-
-def _charge(load: Series) -> Numbers:
-    """Return the load's integral (n,): a battery declines by the charge that was drawn."""
-    means = 0.5 * (load.values[1:, 0] + load.values[:-1, 0])
-    return np.concatenate([[0.0], np.cumsum(means * np.diff(load.time))])
 
 
 def _polynomials(span: Numbers, order: int) -> Numbers:

@@ -465,7 +465,13 @@ def _nuisance_directions(
     prior, pull = np.zeros((count, count)), np.zeros(count)
     for number in range(flights):
         segments = np.flatnonzero(objective.flight == number)
-        first = {segment: _without_start(whole[segment], kept) for segment in segments}
+        # how all parameters change when a segment's best start follows the others, starts in
+        # units of their prior's standard deviations
+        first = {}
+        for segment in segments:
+            square = whole[segment][kept:, kept:] + np.eye(whole.shape[-1] - kept)
+            start = -np.linalg.solve(square, whole[segment][kept:, :kept]).T
+            first[segment] = np.hstack([np.eye(kept), start])
         together = np.zeros((kept, kept))
         for segment, along_start in first.items():  # the prior of a start included
             together = together + (
@@ -506,15 +512,6 @@ def _change(
         information[..., number, number] + np.einsum("clbp,lp->clb", beside + across, follow),
         score + np.einsum("clbp,lp->clb", own, follow),
     )
-
-
-def _without_start(whole: Array, kept: int) -> Array:
-    """Return (kept, Q): how all parameters change when a segment's best start follows the others.
-
-    Starts are in units of their prior's standard deviations.
-    """
-    of_start = whole[kept:, kept:] + np.eye(len(whole) - kept)
-    return np.hstack([np.eye(kept), -np.linalg.solve(of_start, whole[kept:, :kept]).T])
 
 
 def _projection(whole: Array, movable: NDArray[np.bool_], count: int) -> Array:

@@ -76,7 +76,9 @@ def channel_noise(flights: Sequence[Flight], channel: str) -> float:
         if series is None or not np.isfinite(series.values).any():
             continue
         if channel == "command":
-            per_flight.append(_step(series) / np.sqrt(12.0))
+            gaps = np.diff(np.unique(series.values[np.isfinite(series.values)]))
+            steps = gaps[gaps > 1e-9]  # between different values of a quantised signal
+            per_flight.append(float(np.min(steps)) / np.sqrt(12.0) if len(steps) else 0.0)
         elif channel == "attitude":
             per_flight.append(2.0 * float(np.nanmedian(white_noise(series)[1:])))
         else:
@@ -97,11 +99,3 @@ def repeat_counts(values: Array) -> Array:
         lengths = np.diff(np.append(begins, len(samples)))
         counts[:, column] = np.repeat(lengths, lengths)
     return counts
-
-
-def _step(series: Series) -> float:
-    """Return the smallest step between different values of a quantised signal."""
-    values = np.unique(series.values[np.isfinite(series.values)])
-    gaps = np.diff(values)
-    gaps = gaps[gaps > 1e-9]
-    return float(np.min(gaps)) if len(gaps) else 0.0

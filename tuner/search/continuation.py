@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.numerics import Array, scaled_inverse, scaled_solve
+from tuner.core.numerics import scaled_inverse, scaled_solve
 from tuner.objective.criterion import OFFSET_UNIT, Point, SegmentSums
 from tuner.objective.normal_equations import (
     Objective,
@@ -240,7 +240,11 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
     left: list[int] = np.flatnonzero((moves >= first) & (moves < first + clocks)).tolist()
     right: list[int] = []
     while left:
-        rises = [_loss_rise(inverse, late, [*right, clock]) for clock in left]
+        tried = [np.array([*right, clock]) for clock in left]
+        rises = [
+            float(0.5 * late[one] @ scaled_solve(inverse[np.ix_(one, one)], late[one]))
+            for one in tried
+        ]
         least = int(np.argmin(rises))
         if rises[least] > CLOCK_LOSS_TOLERANCE * float(loss):
             break
@@ -248,11 +252,6 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
     stay = np.ones(free.offsets.size, bool)
     stay[moves[right] - first] = False
     return stay.reshape(free.offsets.shape)
-
-
-def _loss_rise(inverse: Array, late: Array, clocks: list[int]) -> float:
-    square = inverse[np.ix_(clocks, clocks)]
-    return float(0.5 * late[clocks] @ scaled_solve(square, late[clocks]))
 
 
 def _advanced(problem: StageProblem, progress: Progress, iterate: Iterate) -> Progress:

@@ -249,7 +249,16 @@ def _attempt(
         on_progress(job, replace(progress, left=remaining))
 
     if job.windows is not None and not resume:
-        progress = initial_progress(job.objective, _through_windows(job, starts, free))
+        # flights that do not begin gently are searched in windows first
+        through = run_stages(
+            job.windows,
+            stages_of(job, job.windows)[:-1],
+            initial_progress(job.windows, starts),
+            free=free,
+            undecided={},
+            on_progress=lambda _: None,
+        )
+        progress = initial_progress(job.objective, np.asarray(through.points.coefficients))
     progress = run_stages(
         job.objective,
         stages,
@@ -310,20 +319,6 @@ def stages_of(job: Job, objective: Objective, method: str = "gradient") -> tuple
         robust=settings.robust == "huber",
         steps=settings.max_iterations,
     )
-
-
-def _through_windows(job: Job, starts: Array, free: Free) -> Array:
-    """Return the starts (S, K) after a search in windows, for flights that do not begin gently."""
-    assert job.windows is not None
-    progress = run_stages(
-        job.windows,
-        stages_of(job, job.windows)[:-1],
-        initial_progress(job.windows, starts),
-        free=free,
-        undecided={},
-        on_progress=lambda _: None,
-    )
-    return np.asarray(progress.points.coefficients)
 
 
 def free_offsets(job: Job) -> NDArray[np.bool_]:

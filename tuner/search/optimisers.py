@@ -282,7 +282,9 @@ def descend(problem: StageProblem) -> Iterator[Iterate]:
         step = advance(problem.objective, step, replace(problem.criterion, states=states), free)
         assert step.sums is not None, "a step has sums"
         assert step.best is not None, "and a best point"
-        best, worst = int(np.argmin(step.loss)), _median_worst_channel(problem.objective, step.sums)
+        best, channels = int(np.argmin(step.loss)), root_mean_squares(problem.objective, step.sums)
+        # (S,) the median over flights of the worst channel's RMS, in σ
+        worst = np.median(np.nan_to_num(list(channels.values())).max(axis=0), axis=-1)
         estimated, here = estimated_states(step.best, best, states), _of(step.sums, best)
         found = Iterate(
             points=step.point,
@@ -331,12 +333,6 @@ def _has_converged(
         long = problem.last & ~step.accepted & (step.step_reduction > least)
         ended |= ~long & (losses[-4] - losses[-1] <= least * np.abs(losses[-1]))
     return bool(np.all(ended))
-
-
-def _median_worst_channel(objective: Objective, sums: SegmentSums) -> Array:
-    """Return (S,) the median over flights of the worst channel's RMS, in σ."""
-    channels = list(root_mean_squares(objective, sums).values())
-    return np.asarray(np.median(np.nan_to_num(channels).max(axis=0), axis=-1))
 
 
 def _next_stage_start(problem: StageProblem, step: Step, worst: Array) -> tuple[Point, Array]:

@@ -115,11 +115,6 @@ def prior_presence_of(names: Collection[str]) -> float:
     return PRIOR_PRESENCE_OF_LUMPED if any(row.is_aggregate for row in rows) else PRIOR_PRESENCE
 
 
-def reads_recording(group: str) -> bool:
-    """Return whether a group's law reads a recorded signal: gusts cannot imitate it."""
-    return any(COEFFICIENTS[name].reads for name in term_groups().get(group, ()))
-
-
 def neutral_values(names: Sequence[str]) -> dict[str, float]:
     """Return the neutral value of each coefficient of a term."""
     values = {}

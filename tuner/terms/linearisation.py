@@ -325,8 +325,19 @@ def _with_free_conditions(
             np.arange(count + offsets, len(some)),
         ]
     )
-    beside = [
-        _condition_parameter(name, unit)
+    beside = [  # a unit step is that of a point's offsets
+        Parameter(
+            name=name,
+            ratios={name: 1.0},
+            initial=0.0,
+            lower=-REGISTRY[name].prior_sd,
+            upper=REGISTRY[name].prior_sd,
+            scale="linear",
+            prior_mean=0.0,
+            prior_sd=REGISTRY[name].prior_sd,
+            prior_given=False,
+            unit_step=unit,
+        )
         for name, unit in zip(conditions, units_of(conditions), strict=True)
     ]
     space = Space((*objective.space.parameters, *beside), objective.space.fixed)
@@ -340,23 +351,6 @@ def _with_free_conditions(
         replace(
             jacobian, columns={name: np.asarray(c)[order] for name, c in jacobian.columns.items()}
         ),
-    )
-
-
-def _condition_parameter(name: str, unit: float) -> Parameter:
-    """Return a condition as a parameter whose unit step is that of a point's offsets."""
-    row = REGISTRY[name]
-    return Parameter(
-        name=name,
-        ratios={name: 1.0},
-        initial=0.0,
-        lower=-row.prior_sd,
-        upper=row.prior_sd,
-        scale="linear",
-        prior_mean=0.0,
-        prior_sd=row.prior_sd,
-        prior_given=False,
-        unit_step=unit,
     )
 
 

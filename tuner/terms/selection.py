@@ -57,7 +57,6 @@ from tuner.terms.candidates import (
     neutral_values,
     offsets_of,
     prior_presence_of,
-    reads_recording,
     selection_shifts,
     with_groups,
     with_terms,
@@ -397,7 +396,8 @@ def _start_vector(fitted: Fitted, objective: Objective, start: Array) -> list[fl
 
 def _excludes_gusts(state: LinearisedFit, group: str) -> bool:
     """Return whether no gust can imitate a group: it reads a signal, or only noise is left."""
-    return reads_recording(group) or state.fitted.residuals_at_noise_level
+    reads = any(COEFFICIENTS[name].reads for name in term_groups().get(group, ()))
+    return reads or state.fitted.residuals_at_noise_level
 
 
 MARKER_GROUPS = ("marker_offset", "marker_tilt")

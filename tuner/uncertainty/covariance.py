@@ -248,9 +248,13 @@ class IndependentErrors:
         inverse = information.inverse
         white = np.einsum("cf,cfbpq->pq", information.spread, information.blocks)
         from_flights = np.diag(inverse.sandwiched(white, np.zeros_like(white)))
+        matrix = inverse.sandwiched(white, information.given)
+        # estimated strengths of disturbances take information away, which is negative in the
+        # sandwich: where small residuals leave nothing else, their assumed size is used
+        left = np.diag(matrix) > MIN_SQUARES_RATIO * np.diag(inverse.matrix)
         return IndependentErrors(
             inverse=inverse,
-            matrix=_positive(inverse.sandwiched(white, information.given), inverse.matrix),
+            matrix=np.where(np.outer(left, left), matrix, inverse.matrix),
             from_flights=from_flights,
             disturbance_ratio=_disturbance_ratio(information, inverse.matrix, from_flights),
         )
@@ -276,16 +280,6 @@ class IndependentErrors:
         )
         beyond = np.where(speaks, self.from_flights * (allowed**2 - 1.0), 0.0)
         return np.asarray(np.sqrt(variance + beyond))
-
-
-def _positive(matrix: Array, inverse: Array) -> Array:
-    """Return a covariance (K, K) whose variances are positive.
-
-    Estimated strengths of disturbances take information away, which is negative in the sandwich.
-    Where small residuals leave nothing else, the residuals' assumed size is used.
-    """
-    left = np.diag(matrix) > MIN_SQUARES_RATIO * np.diag(inverse)
-    return np.where(np.outer(left, left), matrix, inverse)
 
 
 def _disturbance_ratio(

@@ -162,8 +162,12 @@ def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:
         ]
         if not direction.null or len(members) < 2:
             continue
-        ranked = sorted(members, key=lambda name: _hold_order(name, direction.moves))
-        stand_ins |= dict.fromkeys(members, ranked[0])
+        ranks = {name: COEFFICIENTS[name].hold_rank for name in members}
+        order = {
+            name: (math.inf if rank is None else rank, -abs(direction.moves[name]))
+            for name, rank in ranks.items()
+        }
+        stand_ins |= dict.fromkeys(members, min(members, key=order.__getitem__))
     return stand_ins | {name: name for name in undetermined if name not in stand_ins}
 
 
@@ -177,11 +181,6 @@ def _narrow_by_noise(uncertainty: Uncertainty) -> frozenset[str]:
         if uncertainty.estimates[name].reason.code is ReasonCode.WIDE_INTERVAL
         and error < MAX_IDENTIFIABLE_ERROR
     )
-
-
-def _hold_order(name: str, moves: Mapping[str, float]) -> tuple[float, float]:
-    rank = COEFFICIENTS[name].hold_rank
-    return math.inf if rank is None else rank, -abs(moves[name])
 
 
 def hold(

@@ -313,12 +313,6 @@ def judge_by_error(
     return verdict, Reason(code=known, half_width=half_width, unit=unit, channel=channel)
 
 
-def judge_impossible_inertia(fitted_value: float) -> tuple[Verdict, Reason]:
-    """Return the judgement on a moment of inertia that was set back, kg m²."""
-    code = ReasonCode.IMPOSSIBLE_INERTIA
-    return Verdict.HELD, Reason(code=code, fitted_value=fitted_value)
-
-
 MAX_LOG_HALF_WIDTH = 100.0
 """Largest half-width of a logarithm's interval: more than any prior leaves."""
 MAX_LOG_QUOTED = math.log(10.0)
