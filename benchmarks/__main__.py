@@ -18,8 +18,14 @@ import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.history import updated_history
-from benchmarks.table import Section, sections_of, table, update_bars, update_section
+from benchmarks.table import (
+    Section,
+    sections_of,
+    table,
+    update_bars,
+    update_section,
+    updated_history,
+)
 from benchmarks.timing import ROOT, machine
 from tuner.core import runtime
 

@@ -25,8 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import binom, norm
 
-from benchmarks.oracle import oracle_error
-from benchmarks.simulated_recordings import simulate_like
+from benchmarks.oracle import oracle_error, simulate_like
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from sim_jax.inlet import ReferenceInlet

@@ -2,7 +2,7 @@
 
 ``TUNE_LAB_SEEDS`` names the seeds, ``0,1,2`` by default: a fit takes some minutes. With
 ``TUNE_LAB_WORKERS`` so many processes take a seed each. Two laboratories of three have an effect
-that a fit may not know (`benchmarks.lab_effects`); ``TUNE_LAB_EFFECT`` names it for all, ``none``
+that a fit may not know (`benchmarks.lab_flights`); ``TUNE_LAB_EFFECT`` names it for all, ``none``
 the right model, ``several`` two or three effects, and both have sections of their own.
 ``TUNE_LAB_KEPT`` names a file that keeps each laboratory as soon as it is fitted, and from which
 the next run with the same effect goes on.
@@ -22,8 +22,19 @@ import jax
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from benchmarks.lab_effects import CHOICE, KNOWN, effect_of
-from benchmarks.lab_flights import METER, RATE, SECONDS, TRAJECTORIES, VOLTS, Lab, drawn, write
+from benchmarks.lab_flights import (
+    CHOICE,
+    KNOWN,
+    METER,
+    RATE,
+    SECONDS,
+    TRAJECTORIES,
+    VOLTS,
+    Lab,
+    drawn,
+    effect_of,
+    write,
+)
 from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure, table
 from sim_jax.schedule import Schedule

@@ -15,7 +15,7 @@ import jax  # noqa: E402 (after the set-up)
 import numpy as np  # noqa: E402
 
 from benchmarks.calibration import problem  # noqa: E402
-from benchmarks.simulated_recordings import simulate_like  # noqa: E402
+from benchmarks.oracle import simulate_like  # noqa: E402
 from tuner.objective.criterion import Point  # noqa: E402
 from tuner.objective.normal_equations import Objective  # noqa: E402
 from tuner.search.optimisers import advance, initial_step  # noqa: E402

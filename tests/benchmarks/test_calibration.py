@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import calibration as cal
 from benchmarks.air import gauss_markov
-from benchmarks.simulated_recordings import simulate_like
+from benchmarks.oracle import simulate_like
 from tuner.search.progress import criterion_of
 from tuner.search.stages import plan
 

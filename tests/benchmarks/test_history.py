@@ -7,8 +7,16 @@ import pytest
 
 from benchmarks import __main__ as command
 from benchmarks import reading, simulator
-from benchmarks.history import TITLE, lines_of, updated_history
-from benchmarks.table import Bar, Section, sections_of, update_bars, update_section
+from benchmarks.table import (
+    TITLE,
+    Bar,
+    Section,
+    lines_of,
+    sections_of,
+    update_bars,
+    update_section,
+    updated_history,
+)
 
 MORNING = datetime(2026, 11, 21, 9, 5, tzinfo=UTC)
 EVENING = datetime(2026, 11, 21, 21, 0, tzinfo=UTC)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from benchmarks import lab as laboratory
-from benchmarks import lab_effects, lab_flights
+from benchmarks import lab_flights
 from benchmarks.lab import Kept, Trial, _rows, _voltages, keep, kept, section
-from benchmarks.lab_effects import KNOWN, UNKNOWN, Effect, effect_of
-from benchmarks.lab_flights import METER, SECONDS, drawn
+from benchmarks.lab_flights import KNOWN, METER, SECONDS, UNKNOWN, Effect, drawn, effect_of
 from sim_jax.constants import GRAVITY
 from sim_jax.schedule import Schedule
 from tuner.findings.findings import Code, Finding
@@ -58,7 +57,7 @@ def test_two_laboratories_of_three_have_an_effect_and_all_effects_are_drawn():
 
 
 def test_several_effects_are_two_or_three_of_them(monkeypatch):
-    monkeypatch.setattr(lab_effects, "CHOICE", "several")
+    monkeypatch.setattr(lab_flights, "CHOICE", "several")
     for seed in SEEDS:
         effect = effect_of(seed, seconds=SECONDS, flights=3, log_rate=100.0)
         names = [part.name for part in effect.each]
@@ -71,7 +70,7 @@ def test_several_effects_are_two_or_three_of_them(monkeypatch):
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_what_no_coefficient_describes_changes_the_recordings(monkeypatch, tmp_path, name):
     """And nothing in them before a rotor is damaged."""
-    monkeypatch.setattr(lab_effects, "CHOICE", name)
+    monkeypatch.setattr(lab_flights, "CHOICE", name)
     monkeypatch.setattr(lab_flights, "PHYSICS", 400)
     monkeypatch.setattr(lab_flights, "SAGS", 1)
     effect = effect_of(0, seconds=SECONDS, flights=3, log_rate=100.0)

@@ -23,7 +23,7 @@ from tuner.options import (
 )
 
 if TYPE_CHECKING:
-    from tuner.evaluate.rmse import FlightErrors
+    from tuner.evaluate.comparison import FlightErrors
 
 
 def inspect(

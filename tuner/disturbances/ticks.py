@@ -15,8 +15,7 @@ from sim_jax.inlet import BodyRateInlet
 from sim_jax.schedule import Schedule
 from tuner.core.numerics import Array
 from tuner.objective.criterion import AnyArray
-from tuner.objective.noise import repeat_counts
-from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured
+from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, repeat_counts
 from tuner.recordings.flight import Flight
 
 SETPOINTS = ("rate_setpoint", "thrust_setpoint")

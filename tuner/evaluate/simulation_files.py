@@ -17,8 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from tuner.core.disk import check_file, whole_file
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array
-from tuner.evaluate.closed_loop import Simulation
-from tuner.evaluate.forces import COMPONENTS
+from tuner.evaluate.closed_loop import COMPONENTS, Simulation
 
 #: Time of the first sample since 1970; fixed, so that the same flight gives the same file.
 EPOCH_NS = 1_577_836_800_000_000_000
@@ -290,7 +289,7 @@ def write_flights(
     simulations
         The flights, with their forces where ``forces`` is given.
     forces
-        A ``.csv`` for force and moment of each term (`tuner.evaluate.forces`).
+        A ``.csv`` for force and moment of each term (`tuner.evaluate.closed_loop`).
 
     Raises
     ------

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tuner.core.numerics import Array
-from tuner.evaluate.comparison import Comparison
+from tuner.evaluate.comparison import Comparison, FlightErrors, Pose
 from tuner.evaluate.prediction import (
     ROTOR_INLETS,
     FlightPredictor,
@@ -21,7 +21,6 @@ from tuner.evaluate.prediction import (
     hold_state,
 )
 from tuner.evaluate.records import PredictedErrors
-from tuner.evaluate.rmse import FlightErrors, Pose
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS

@@ -380,9 +380,9 @@ def _reporting(listener: Listener, folder: Path | None = None) -> OnProgress:
     """Return a callback that reports the last iteration, and writes the best vehicle so far."""
 
     def on_progress(job: Job, progress: Progress) -> None:
-        with suppress(ConfigError):  # a search may pass through impossible inertias
-            values = job.space.numbers(progress.best_point.coefficients)
-            if folder is not None:
+        if folder is not None:
+            with suppress(ConfigError):  # a search may pass through impossible inertias
+                values = job.space.numbers(progress.best_point.coefficients)
                 best = with_values(job.settings.vehicle, values)
                 header = "Best so far of an unfinished run."
                 write_vehicle(best, folder / BEST_FIT_FILE, header=header)

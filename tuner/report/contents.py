@@ -23,7 +23,7 @@ from tuner.search.iteration import Iteration, Outcome
 from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles
 
 if TYPE_CHECKING:
-    from tuner.evaluate.rmse import FlightErrors
+    from tuner.evaluate.comparison import FlightErrors
     from tuner.search.progress import Fitted
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from tuner.evaluate.closed_loop import Simulation
-    from tuner.evaluate.rmse import FlightErrors
+    from tuner.evaluate.comparison import FlightErrors
 
 
 MAX_COLUMNS = 8

@@ -16,11 +16,11 @@ from tuner.equation_error.estimate import Estimate
 from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
 from tuner.objective.initial_conditions import begins_gently
 from tuner.objective.inlets import INLETS, also_free_by, bypassed_by, window_seconds
-from tuner.objective.noise import noise_of
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import (
     Segments,
     cut_windows,
+    noise_of,
     segments_of,
     stamped_earlier,
     window_segments,

@@ -69,7 +69,7 @@ from tuner.uncertainty.model_error import (
     gains_far_off,
     model_errors_of,
 )
-from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle import COEFFICIENTS, term_groups
 from tuner.vehicle.model import with_coefficients
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 

@@ -15,8 +15,7 @@ from tuner.disturbances.ticks import (
     setpoints_on_ticks,
     with_equal_weights,
 )
-from tuner.objective.noise import repeat_counts
-from tuner.objective.segments import Measured
+from tuner.objective.segments import Measured, repeat_counts
 from tuner.recordings.flight import Flight, InitialState, Series
 
 RATE = 400.0

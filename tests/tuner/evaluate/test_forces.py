@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
-from tuner.evaluate.closed_loop import simulate
-from tuner.evaluate.forces import COMPONENTS
+from tuner.evaluate.closed_loop import COMPONENTS, simulate
 from tuner.evaluate.simulation_files import write_flights
 from tuner.vehicle import ControllerFile, with_values
 

@@ -5,8 +5,14 @@ import pytest
 
 from sim_jax.state import AIRBORNE, Limits
 from tuner.config import TrajectorySettings
-from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.rmse import FlightErrors, SignalErrors, laps_of, rmse_of, wrap_degrees
+from tuner.evaluate.comparison import (
+    Comparison,
+    FlightErrors,
+    SignalErrors,
+    laps_of,
+    rmse_of,
+    wrap_degrees,
+)
 from tuner.objective.trajectory import with_named_reference
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import Recording

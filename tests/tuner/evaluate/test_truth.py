@@ -8,7 +8,7 @@ import yaml
 
 from tuner.core.shipped import find_config
 from tuner.evaluate.comparison import Comparison
-from tuner.objective.noise import noise_of
+from tuner.objective.segments import noise_of
 from tuner.recordings.loader import load_flight
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, read_vehicle, with_values

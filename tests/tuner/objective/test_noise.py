@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sim_jax.schedule import Schedule
-from tuner.objective.noise import repeat_counts, white_noise
-from tuner.objective.segments import segments_of
+from tuner.objective.segments import repeat_counts, segments_of, white_noise
 from tuner.recordings.flight import Series
 
 

@@ -9,10 +9,9 @@ import numpy as np
 
 from tuner.core.shipped import find_config
 from tuner.design.proposals import LogProposal
-from tuner.evaluate.comparison import table_of
-from tuner.evaluate.forces import Forces
+from tuner.evaluate.closed_loop import Forces
+from tuner.evaluate.comparison import FlightErrors, SignalErrors, table_of
 from tuner.evaluate.records import PredictedErrors
-from tuner.evaluate.rmse import FlightErrors, SignalErrors
 from tuner.report import write_traces
 from tuner.report.contents import SearchRecord
 from tuner.result import (

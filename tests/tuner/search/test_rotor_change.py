@@ -83,7 +83,7 @@ def test_a_job_uses_a_flight_up_to_the_change(flown, monkeypatch):
     circle, *others = recordings
     assert circle.flight.duration > BROKEN + 5.0
     broken = replace(circle, flight=weakened(circle.flight, settings.vehicle, 0.05))
-    monkeypatch.setattr("tuner.job.run.read_recordings", lambda _: ((broken, *others), ()))
+    monkeypatch.setattr("tuner.job.prepare.read_recordings", lambda _: ((broken, *others), ()))
     job, findings = prepare(settings)
     (finding,) = [finding for finding in findings if finding.code is Code.ROTOR_CHANGED]
     assert (finding.subject, finding.names) == (circle.flight.name, ("front right",))
