@@ -15,7 +15,6 @@ import datetime
 import importlib
 import time
 import tomllib
-from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.table import (
@@ -29,7 +28,7 @@ from benchmarks.table import (
 from benchmarks.timing import ROOT, machine
 from tuner.core import runtime
 
-PARTS: Mapping[str, str] = {
+PARTS: dict[str, str] = {
     "throughput": "simulator",
     "derivatives": "simulator",
     "one_vehicle": "simulator",

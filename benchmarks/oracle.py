@@ -62,9 +62,9 @@ def oracle_error(
         if flown is None:
             continue
         at_truth = flown.start(truth)
-        found = information_at(flown, at_truth, criterion, offsets_fitted=moved).about(free)
-        score = found.score.sum(axis=(0, 1, 2))
-        steps.append(Inverse.of(found.total, found.given).matrix @ score)
+        information = information_at(flown, at_truth, criterion, offsets_fitted=moved).about(free)
+        score = information.score.sum(axis=(0, 1, 2))
+        steps.append(Inverse.of(information.total, information.given).matrix @ score)
     errors = np.sqrt(np.mean(np.square(steps), axis=0))
     return {names[index]: float(error) for index, error in zip(free, errors, strict=True)}
 
@@ -109,8 +109,8 @@ def simulate_like(
         logged = np.moveaxis(np.asarray(channels[channel]), -1, 0)
         read = at_stamps(logged, channel, np.asarray(old.time).T, reading)
         clean = np.moveaxis(read, 0, -1)
-        known = np.asarray(old.weight)
-        noise = random.normal(size=known.shape) / np.where(known > 0.0, known, np.inf)
+        weight = np.asarray(old.weight)
+        noise = random.normal(size=weight.shape) / np.where(weight > 0.0, weight, np.inf)
         noisy = _rotate(clean, noise) if channel == "attitude" else clean + noise
         measured[channel] = Measured(old.time, jnp.asarray(noisy), old.weight)
     segments = replace(objective.segments, measured=measured)

@@ -273,10 +273,10 @@ def contest_of_builds(folder: Path) -> Contest:
 
 def weighed_mass(path: Path) -> float:
     """Return the mass in kg that stands beside a flight."""
-    found = re.search(r"^mass: *([0-9.]+)", path.read_text(encoding="utf-8"), re.MULTILINE)
-    if found is None:
+    match = re.search(r"^mass: *([0-9.]+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+    if match is None:
         raise InputError(path, "holds no mass", "write it as mass: 0.03")
-    return float(found[1])
+    return float(match[1])
 
 
 def _predicted(path: Path, mass: float) -> dict[str, list[Predictions]]:

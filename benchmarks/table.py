@@ -156,9 +156,9 @@ def _same_day(line: Line, other: Line) -> bool:
 
 
 def _is_worse(bar: Bar, lines: Sequence[Line]) -> bool:
-    known = [float(line[bar.what].removesuffix(MARK)) for line in lines if bar.what in line]
-    if not known or bar.measured is None:
+    earlier = [float(line[bar.what].removesuffix(MARK)) for line in lines if bar.what in line]
+    if not earlier or bar.measured is None:
         return False
     if bar.sense == "at least":
-        return bar.measured * MAX_WORSE_RATIO < max(known)
-    return bar.measured > MAX_WORSE_RATIO * min(known)
+        return bar.measured * MAX_WORSE_RATIO < max(earlier)
+    return bar.measured > MAX_WORSE_RATIO * min(earlier)

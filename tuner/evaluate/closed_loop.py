@@ -213,11 +213,11 @@ def fly(
     InputError
         A named file or coefficient does not exist, or the vehicle cannot be flown.
     """
-    given = vars(options)
-    shape = {name: given[name] for name in TrajectorySettings.model_fields if name != "name"}
+    entries = vars(options)
+    shape = {name: entries[name] for name in TrajectorySettings.model_fields if name != "name"}
     plan = build(
         Plan,
-        {name: given[name] for name in Plan.model_fields}
+        {name: entries[name] for name in Plan.model_fields}
         | {"trajectory": {"name": options.trajectory, **shape}},
         "command line",
     )

@@ -458,9 +458,11 @@ class _Group:
             misfit = np.nan_to_num(squares / MISFIT_SCALE**2 + (trial**2).sum(axis=0), nan=np.inf)
             better = misfit <= least
             best, least = np.where(better, trial, best), np.where(better, misfit, least)
-            asked = np.asarray(sums.states)
-            asked = np.clip(np.where(np.isfinite(asked), asked, 0.0), -MAX_STATE_SD, MAX_STATE_SD)
-            trial = np.where(better, asked, 0.5 * (best + trial))
+            estimated = np.asarray(sums.states)
+            estimated = np.clip(
+                np.where(np.isfinite(estimated), estimated, 0.0), -MAX_STATE_SD, MAX_STATE_SD
+            )
+            trial = np.where(better, estimated, 0.5 * (best + trial))
         return best
 
 

@@ -77,10 +77,10 @@ class TorqueObserver:
         """Return the observer of a vehicle fitted to some flights; None without residuals."""
         products = np.zeros((len(LAGS), 3))
         for flight in fitted:
-            found = _residual_acceleration(vehicle, controller, flight)
-            if found is None:
+            residuals = _residual_acceleration(vehicle, controller, flight)
+            if residuals is None:
                 continue
-            part, unseen = found
+            part, unseen = residuals
             lags = range(min(len(unseen), round(MAX_LAG_S / part.step) + 1))
             rows = [np.sum(unseen[lag:] * unseen[: len(unseen) - lag], axis=0) for lag in lags]
             times = np.array(lags) * part.step
@@ -99,10 +99,10 @@ class TorqueObserver:
 
         It is zero if the step before is unknown.
         """
-        found = _residual_acceleration(self.vehicle, self.controller, fed)
-        if found is None:
+        residuals = _residual_acceleration(self.vehicle, self.controller, fed)
+        if residuals is None:
             return None
-        part, unseen = found
+        part, unseen = residuals
         last = np.searchsorted(part.time + 0.5 * part.step, begins + 1e-9) - 1
         torque = np.where(last[:, None] < 0, 0.0, unseen[last])
         inertia = self.vehicle.inertia
@@ -125,10 +125,10 @@ def _residual_acceleration(
     flight, inlet, late = fed
     model = model_of(with_reference_voltage(vehicle, [flight]), controller)
     rate = float(schedule_of(controller).rate_control_rate)
-    found = steps_by_inlet(inlet, model, [(flight, late)], rate)
-    if found is None:
+    by_inlet = steps_by_inlet(inlet, model, [(flight, late)], rate)
+    if by_inlet is None:
         return None
-    (part,) = found[0]
+    (part,) = by_inlet[0]
     (one,) = ModelAccelerations(model, (), (part,)).at(np.zeros(0))
     return part, np.where(part.known[:, None], np.nan_to_num(one.errors[:, 3:]), 0.0)
 
@@ -266,8 +266,8 @@ class FlightPredictor:
         )
         segments = _select(segments, self._whole)
         if observer is not None:
-            known = self.flight, self.inlet, self.input_late
-            segments = replace(segments, disturbance=observer.disturbance(known, self.begins))
+            fed = self.flight, self.inlet, self.input_late
+            segments = replace(segments, disturbance=observer.disturbance(fed, self.begins))
         model = model_of(with_reference_voltage(vehicle, [self.flight]), controller)
         reached = _simulated(model, segments, schedule, self.ahead)
         errors = errors_of(reached, self.recorded, (len(self.ahead), len(self.begins)))

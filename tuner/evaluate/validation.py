@@ -157,8 +157,8 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
         best=comparison.fly(vehicle),
         fitted_starts=comparison.fly(vehicle, fitted_starts=True),
     )
-    known = [(r.flight, r.inlet, r.input_late) for r in job.recordings if not r.holdout]
-    observer = TorqueObserver.of(vehicle, controller, known)
+    fitted_flights = [(r.flight, r.inlet, r.input_late) for r in job.recordings if not r.holdout]
+    observer = TorqueObserver.of(vehicle, controller, fitted_flights)
     for recording in job.recordings:
         if INLETS[recording.inlet].closed_loop:
             continue
@@ -288,7 +288,7 @@ def flights_not_followed(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[
 
 def _beyond_limit(flight: Flight, control: PositionControl, time: Array, position: Array) -> float:
     """Return the share of a flight with position feedback above its limit."""
-    asked = np.zeros_like(position)
+    feedback = np.zeros_like(position)
     for kind, gains, there in (
         ("position", control.kp, position),
         ("velocity", control.kv, np.gradient(position, time, axis=0)),
@@ -297,9 +297,9 @@ def _beyond_limit(flight: Flight, control: PositionControl, time: Array, positio
         if series is None:
             return 0.0
         wanted = [np.interp(time, series.time, column) for column in series.values.T]
-        asked += np.array(gains) * (np.column_stack(wanted) - there)
+        feedback += np.array(gains) * (np.column_stack(wanted) - there)
     limit = control.max_feedback_acceleration
-    return float(np.mean(np.linalg.norm(asked, axis=1) > limit))
+    return float(np.mean(np.linalg.norm(feedback, axis=1) > limit))
 
 
 def predicted_worse_than_held(job: Job, validation: Validation) -> tuple[Finding, ...]:
@@ -311,19 +311,19 @@ def predicted_worse_than_held(job: Job, validation: Validation) -> tuple[Finding
     for recording in job.recordings:
         name = recording.flight.name
         ahead = validation.worse_than_holding.get(name, {})
-        lost = {seconds: names for seconds, names in ahead.items() if names}
-        if not lost:
+        worse = {seconds: names for seconds, names in ahead.items() if names}
+        if not worse:
             continue
-        seconds = max(lost)
+        seconds = max(worse)
         best, held = (
             next(one for one in validation.predicted[name][kind] if one.seconds == seconds)
             for kind in ("best", "holding")
         )
-        numbers = {"soonest": min(lost), "seconds": seconds}
-        for quantity in lost[seconds]:
+        numbers = {"soonest": min(worse), "seconds": seconds}
+        for quantity in worse[seconds]:
             numbers |= {
                 quantity: getattr(best, quantity),
                 f"{quantity}_held": getattr(held, quantity),
             }
-        findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, lost[seconds]))
+        findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, worse[seconds]))
     return tuple(findings)

@@ -86,12 +86,12 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
     plan = read_bench(path)
     if any(place_for(out).glob(CHECKPOINTS)):
         raise InputError("--out", f"{out} holds the result of a fit", "name another folder")
-    given = read_vehicle(find_config("vehicles", plan.vehicle, path.parent))
-    start = given if plan.weighed_mass is None else given.replace(mass=plan.weighed_mass)
+    unmeasured = read_vehicle(find_config("vehicles", plan.vehicle, path.parent))
+    start = unmeasured if plan.weighed_mass is None else unmeasured.replace(mass=plan.weighed_mass)
     measurements, combination, vehicle = _measure_all(path, plan, start)
     return write_measurements(
         out,
-        given,
+        unmeasured,
         vehicle.replace(name=f"{start.name}_bench"),
         measurements,
         combination,
@@ -105,7 +105,7 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
 
 def write_measurements(
     out: Path | None,
-    given: VehicleFile,
+    initial: VehicleFile,
     vehicle: VehicleFile,
     measurements: tuple[Measurement, ...],
     combination: Combination,
@@ -122,7 +122,7 @@ def write_measurements(
     ----------
     out
         The folder; None makes one under ``runs/``.
-    given, vehicle
+    initial, vehicle
         The user's, and with the measured coefficients.
     measurements, combination, findings
         Single measurements, their combination, and findings on both.
@@ -137,8 +137,8 @@ def write_measurements(
         status=Status.CONVERGED,
         seed=0,
         versions=versions(),
-        settings={**settings, "vehicle": given.model_dump(mode="json")},
-        coefficients=_coefficients(given, vehicle, combination, measurements),
+        settings={**settings, "vehicle": initial.model_dump(mode="json")},
+        coefficients=_coefficients(initial, vehicle, combination, measurements),
         flights=(),
         findings=findings,
         search=SearchResult(
@@ -168,7 +168,7 @@ def _measure_all(
     """Return each measurement, their combination, and the measured vehicle."""
     experiments = dict(zip(names_of(plan.experiments), plan.experiments, strict=True))
     spins = {name: spin for name, spin in experiments.items() if isinstance(spin, YawSpin)}
-    known, base, vehicle = known_of(start), path.parent, start
+    nominal, base, vehicle = known_of(start), path.parent, start
     measured = {
         name: measure(name, experiment, start, base)
         for name, experiment in experiments.items()
@@ -176,10 +176,10 @@ def _measure_all(
     }
     for _ in range(MAX_RELINEARISATIONS if spins else 1):
         if measured:
-            vehicle = vehicle_of(path, start, combine(tuple(measured.values()), known))
+            vehicle = vehicle_of(path, start, combine(tuple(measured.values()), nominal))
         measured |= {name: measure(name, spin, vehicle, base) for name, spin in spins.items()}
     measurements = tuple(measured[name] for name in experiments)
-    combination = combine(measurements, known)
+    combination = combine(measurements, nominal)
     return measurements, combination, vehicle_of(path, start, combination)
 
 
@@ -240,7 +240,7 @@ def _coefficients(
         place = places[name]
         resolution = resolution_of(name, start)
         verdict, reason = _judged(name, place, combination, measurements, resolution)
-        known = bool(combination.determined[place])
+        determined = bool(combination.determined[place])
         scaled = float(combination.scaled[place])
         deviation = float(np.sqrt(combination.covariance[place, place]))
         ends = (scaled - Z95 * deviation, scaled + Z95 * deviation)
@@ -250,8 +250,8 @@ def _coefficients(
             value,
             verdict,
             reason,
-            std_error=error_of(name, scaled, deviation) if known else None,
-            ci95=(value_of(name, ends[0]), value_of(name, ends[1])) if known else None,
+            std_error=error_of(name, scaled, deviation) if determined else None,
+            ci95=(value_of(name, ends[0]), value_of(name, ends[1])) if determined else None,
             identifiable=reason.identifiable,
         )
     return coefficients

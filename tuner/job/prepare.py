@@ -236,12 +236,12 @@ def _lift_changes(job: Job) -> Iterator[Finding]:
         for flight in job.flights
         if flight.name in lifts and VOLTAGE in flight.series
     }
-    found = _split_by_lift(lifts)
-    if found is not None and source == "command" and len(volts) == len(lifts):
+    split = _split_by_lift(lifts)
+    if split is not None and source == "command" and len(volts) == len(lifts):
         charged = _split_by_lift({name: lift / volts[name] ** 2 for name, lift in lifts.items()})
-        found = None if charged is None else found
-    if found is not None:
-        odd, more = found
+        split = None if charged is None else split
+    if split is not None:
+        odd, more = split
         names = (source,) if source == "rotor_speed" else (source, "battery")
         yield Finding(Code.LIFTS_OTHERWISE, "warning", ", ".join(odd), {"more": more}, names)
 
@@ -260,14 +260,14 @@ def _split_by_lift(lifts: Mapping[str, float]) -> tuple[list[str], float] | None
 
 def _hover_lift(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
     """Return rotor signal -> lift of a flight near hover, m/s² per (rad/s)² of all rotors."""
-    found: dict[Source, float] = {}
+    lifts: dict[Source, float] = {}
     for source in get_args(Source):
         series = flight.series.get(source)
-        known = None if series is None else np.isfinite(series.values).all(axis=1)
-        if series is None or known is None or known.sum() < MIN_SAMPLES:
+        complete = None if series is None else np.isfinite(series.values).all(axis=1)
+        if series is None or complete is None or complete.sum() < MIN_SAMPLES:
             continue
-        speeds = np.sqrt(squared_speed(vehicle, source, series.values[known]))
-        steps = steps_with(flight, Series(series.time[known], speeds))
+        speeds = np.sqrt(squared_speed(vehicle, source, series.values[complete]))
+        steps = steps_with(flight, Series(series.time[complete], speeds))
         if steps is None:
             continue
         pull = np.nan_to_num(steps.accelerations[:, 2])
@@ -276,8 +276,8 @@ def _hover_lift(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
         hovers = steps.known & slow & (np.abs(smooth / GRAVITY - 1.0) < HOVER_ACCELERATION)
         if hovers.sum() >= MIN_SAMPLES:
             squares = np.square(steps.rotor_speed[hovers]).sum()
-            found[source] = float(pull[hovers].sum() / squares)
-    return found
+            lifts[source] = float(pull[hovers].sum() / squares)
+    return lifts
 
 
 def _motor_orders(job: Job) -> Iterator[Finding]:
@@ -286,12 +286,12 @@ def _motor_orders(job: Job) -> Iterator[Finding]:
         speeds = inlet == "rotor_speed" or "command" not in flight.series
         sources: list[Source] = ["rotor_speed", "command"] if speeds else ["command", "rotor_speed"]
         span, vehicle = (0.0, flight.duration), job.settings.vehicle
-        found = (
+        findings = (
             order_findings(flight.name, flight.series, vehicle, span, source)
             for source in sources
             if {source, "body_rate"} <= set(flight.series)
         )
-        yield from next(filter(None, found), ())
+        yield from next(filter(None, findings), ())
 
 
 def _controllers(job: Job) -> Iterator[Finding]:
@@ -336,12 +336,12 @@ def _spread(flight: Flight, axis: str) -> float:
 
 def _unused_settings(job: Job) -> Iterator[Finding]:
     """Warn of settings of coefficients that are neither free nor candidate terms."""
-    asked = job.user_settings.job
+    job_file = job.user_settings.job
     unused = [
         name
-        for name in asked.coefficients
+        for name in job_file.coefficients
         if name not in job.space.free
-        and (asked.terms == "none" or not COEFFICIENTS[name].is_optional)
+        and (job_file.terms == "none" or not COEFFICIENTS[name].is_optional)
     ]
     if unused:
         yield Finding(Code.SETTINGS_UNUSED, "warning", ", ".join(unused))
@@ -444,53 +444,53 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
         candidates[INFLOW] = (INFLOW,)
     names = [name for group in candidates.values() for name in group]
     effects = neutral_values([n for n in (*names, *TORQUE_GAINS) if COEFFICIENTS[n].is_effect])
-    given = initial_values(settings.vehicle, settings.controller, names)
-    space = extended(job.space, [*names, *TORQUE_GAINS], settings.job, {**given, **effects})
+    initial = initial_values(settings.vehicle, settings.controller, names)
+    space = extended(job.space, [*names, *TORQUE_GAINS], settings.job, {**initial, **effects})
     candidates.pop(ROTOR_INERTIA, None)
-    found = estimate(job.objective.model, space, candidates, *steps)
-    if found.turning >= MIN_TURNING_EXPLAINED:
+    regression = estimate(job.objective.model, space, candidates, *steps)
+    if regression.turning >= MIN_TURNING_EXPLAINED:
         return job, ()
-    regressed = _regressed_job(job, found)
-    return (job, ()) if regressed is None else (regressed, (_finding(found),))
+    regressed = _regressed_job(job, regression)
+    return (job, ()) if regressed is None else (regressed, (_finding(regression),))
 
 
-def _regressed_job(job: Job, found: Estimate) -> Job | None:
+def _regressed_job(job: Job, regression: Estimate) -> Job | None:
     """Return the job with its search's coefficients, start and windows; None for no rigid body."""
-    settings, found = job.settings, of_rigid_body(found)
-    moving = tuple(n for n in found.values if n not in BY_REGRESSION and not moves_rotors(n))
+    settings, regression = job.settings, of_rigid_body(regression)
+    moving = tuple(n for n in regression.values if n not in BY_REGRESSION and not moves_rotors(n))
     try:
-        vehicle = with_values(settings.vehicle, found.values)
+        vehicle = with_values(settings.vehicle, regression.values)
     except ConfigError:
         return None
     search = settings.job.search
-    if search.window is None and found.horizon is not None:
-        search = search.model_copy(update={"window": found.horizon})
+    if search.window is None and regression.horizon is not None:
+        search = search.model_copy(update={"window": regression.horizon})
     changed = settings.job.model_copy(update={"free": moving, "fixed": (), "search": search})
     regressed = job_of(replace(settings, vehicle=vehicle, job=changed), job.recordings)
-    return replace(regressed, user_settings=job.settings, accelerations=found)
+    return replace(regressed, user_settings=job.settings, accelerations=regression)
 
 
-def of_rigid_body(found: Estimate) -> Estimate:
+def of_rigid_body(regression: Estimate) -> Estimate:
     """Return an estimate whose inertia about z is at most a rigid body's, if its error allows that.
 
     Turning about z determines the ratios of the other yaw moments to it; they stay.
     """
-    values = found.values
+    values = regression.values
     if not {*BY_REGRESSION[:3]} <= {*values}:
-        return found
+        return regression
     xx, yy, zz = (values[name] for name in BY_REGRESSION[:3])
-    if not 0.0 < np.log(zz / (xx + yy)) < Z95 * found.errors["inertia_zz"]:
-        return found
+    if not 0.0 < np.log(zz / (xx + yy)) < Z95 * regression.errors["inertia_zz"]:
+        return regression
     within = {name: values[name] * (xx + yy) / zz for name in BY_REGRESSION[2:] if name in values}
-    return replace(found, values={**values, **within})
+    return replace(regression, values={**values, **within})
 
 
-def _finding(found: Estimate) -> Finding:
+def _finding(regression: Estimate) -> Finding:
     """Return the finding on the explained share of turning, and the horizon of its prediction."""
-    shares = np.clip(found.explained[3:], 0.0, 1.0).tolist()
+    shares = np.clip(regression.explained[3:], 0.0, 1.0).tolist()
     numbers = {f"explained_{axis}": share for axis, share in zip("xyz", shares, strict=True)}
-    numbers |= {f"gain_{axis}": found.values.get(f"torque_gain_{axis}", 1.0) for axis in "xyz"}
-    if found.horizon is None:
+    numbers |= {f"gain_{axis}": regression.values.get(f"torque_gain_{axis}", 1.0) for axis in "xyz"}
+    if regression.horizon is None:
         return Finding(Code.TURNING_NOT_PREDICTED, "warning", "moments of inertia", numbers)
-    numbers["seconds"] = found.horizon
+    numbers["seconds"] = regression.horizon
     return Finding(Code.TURNING_REGRESSED, "warning", "moments of inertia", numbers)

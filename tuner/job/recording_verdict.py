@@ -84,10 +84,10 @@ def _cached_verdict(path: Path, settings: Settings) -> Verdict:
     maps = [digest(file) for file in (job.topics,) if file is not None and file.exists()]
     key = (digest(path), path.name, source_version(), *map(repr, (*inputs, *maps)))
 
-    found = load_or_compute(
+    verdict = load_or_compute(
         Verdict, cache_file("verdict", *key), lambda: _computed_verdict(path, settings)
     )
-    return replace(found, path=str(path))
+    return replace(verdict, path=str(path))
 
 
 def _computed_verdict(path: Path, settings: Settings) -> Verdict:

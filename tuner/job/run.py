@@ -147,13 +147,13 @@ def _fit(
     resume: bool,
 ) -> RunResult:
     """Search, validate, and write everything into a folder; findings are of the check before."""
-    found, validation, (selected, fitted, examination) = _fitted(
+    searched, validation, (selected, fitted, examination) = _fitted(
         job, findings, folder, explanation, listener, command=command, resume=resume
     )
     job = selected.job
     explanation.report(fitted.findings)
     vehicle = vehicle_fitted(job, fitted)
-    if job is not found.job or fitted is not found.fitted:
+    if job is not searched.job or fitted is not searched.fitted:
         validation = _validated(job, fitted, vehicle, listener)
     explanation.add(
         (
@@ -235,7 +235,7 @@ def _fitted(
         forget(folder)
     on_progress = _reporting(listener, folder)
     try:
-        found = search_with_terms(
+        searched = search_with_terms(
             job,
             folder,
             resume=resume,
@@ -251,18 +251,20 @@ def _fitted(
             f"Continue the search with --out {folder} --resume."
         )
         raise
-    if found.refuted:
+    if searched.refuted:
         listener.on_doubt(FLIGHTS_REFUTE)
-    vehicle = vehicle_fitted(found.job, found.fitted)
-    validation = _validated(found.job, found.fitted, vehicle, listener)
-    rows = found.rows_after_holding(found.fitted.held)
-    result = result_of(found.job, found.fitted, None, validation, command=command, selection=rows)
+    vehicle = vehicle_fitted(searched.job, searched.fitted)
+    validation = _validated(searched.job, searched.fitted, vehicle, listener)
+    rows = searched.rows_after_holding(searched.fitted.held)
+    result = result_of(
+        searched.job, searched.fitted, None, validation, command=command, selection=rows
+    )
     with span("results"):
-        write_folder(folder, result, vehicle, found.job)
+        write_folder(folder, result, vehicle, searched.job)
     return (
-        found,
+        searched,
         validation,
-        refit_and_examine(found, on_progress, listener.on_message, explanation),
+        refit_and_examine(searched, on_progress, listener.on_message, explanation),
     )
 
 
@@ -278,7 +280,7 @@ def _examination_findings(
     """Keep the findings of an examination; return coefficients by flights and by ground."""
     if examination is None:
         return {}
-    uncertainty, known = examination.uncertainty, examination.known
+    uncertainty, information = examination.uncertainty, examination.known
     explanation.add(
         (
             *flights_refute(uncertainty),
@@ -289,7 +291,7 @@ def _examination_findings(
         )
     )
     sources: dict[str, Sources] = explanation.attempt(
-        "ground measurements", partial(sources_of, fitted, uncertainty, known), {}
+        "ground measurements", partial(sources_of, fitted, uncertainty, information), {}
     )
     explanation.add(ground_conflicts(sources, fitted.objective.space.fixed.get("mass")))
     return sources

@@ -101,7 +101,7 @@ class SensitivityResult:
 
 
 def examine_vehicle(
-    asked: ExaminationOptions,
+    options: ExaminationOptions,
     arena: Sequence[float] | None = None,
     *,
     command: str = "",
@@ -111,7 +111,7 @@ def examine_vehicle(
 
     Parameters
     ----------
-    asked
+    options
         Flights, vehicle, settings of the simulation, and further computations; held-out flights are
         examined like the others.
     arena
@@ -122,14 +122,14 @@ def examine_vehicle(
     InputError
         The input cannot be used; nothing was written.
     """
-    settings, logged = with_logged_parameters(resolve_settings(asked, fits=False))
+    settings, logged = with_logged_parameters(resolve_settings(options, fits=False))
     room = None if arena is None else Arena.of(arena)
-    check_names(asked.profile or (), "--profile")
-    if exists(place_for(asked.out) / RunResult.FILE):
-        raise InputError("--out", f"{asked.out} holds the result of a fit", "name another folder")
+    check_names(options.profile or (), "--profile")
+    if exists(place_for(options.out) / RunResult.FILE):
+        raise InputError("--out", f"{options.out} holds the result of a fit", "name another folder")
     recordings, noticed = read_recordings(settings, holdout=())
     job = job_of(settings, recordings)
-    with result_folder(asked.out) as out:
+    with result_folder(options.out) as out:
         fitted = unfitted(job)
         fitted = replace(fitted, findings=(*logged, *noticed, *fitted.findings))
         on_message("simulating, and differentiating by every coefficient")
@@ -159,14 +159,14 @@ def examine_vehicle(
         knowledge = write_knowledge(out, job, examination, fitted)
         on_message("simulating what could be flown next")
         proposals = write_next_flight(out, job, examination, fitted, room)
-        _write_requested(asked, job, fitted, examination, folder=out, on_message=on_message)
+        _write_requested(options, job, fitted, examination, folder=out, on_message=on_message)
         write_traces(out, {"simulated": comparison_of(job, fitted).fly(settings.vehicle)})
         render(out)
     return SensitivityResult(out, knowledge, proposals, fitted.findings)
 
 
 def _write_requested(
-    asked: ExaminationOptions,
+    options: ExaminationOptions,
     job: Job,
     fitted: Fitted,
     examination: Examination,
@@ -175,21 +175,23 @@ def _write_requested(
     on_message: Callable[[str], None],
 ) -> None:
     """Write the global indices and the profiles that were requested."""
-    if asked.global_ is not None:
-        on_message(f"flying vehicles between the bounds for {asked.global_.capitalize()}'s indices")
+    if options.global_ is not None:
+        on_message(
+            f"flying vehicles between the bounds for {options.global_.capitalize()}'s indices"
+        )
         indices = global_sensitivity(
             fitted.objective,
             fitted.point,
             fitted.criterion,
-            method=asked.global_,
+            method=options.global_,
             flights=[flight.name for flight in job.fitted],
-            bounds=_ranges(job, examination, asked.span / 100.0),
-            samples=asked.samples,
+            bounds=_ranges(job, examination, options.span / 100.0),
+            samples=options.samples,
             seed=job.settings.job.search.seed,
         )
         indices.write(folder)
     profiles = []
-    for name in asked.profile or ():
+    for name in options.profile or ():
         on_message(f"fitting the others again for each value of {name}")
         uncertainty = _uncertainty_with(examination, name)
         profiles.append(

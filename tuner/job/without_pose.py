@@ -68,16 +68,16 @@ def fit_without_pose(
     to_fit = [flight for flight in flights if flight.name not in settings.job.holdout]
     measured, used, unusable = _measured(to_fit, start, listener)
     left_out = (*left_out, *unusable)
-    known = known_of(start)
-    alone = combine(measured, known)
+    nominal = known_of(start)
+    alone = combine(measured, nominal)
     measurements = widen_to_agree(measured, alone.chi_square, alone.degrees_of_freedom)
-    combination = _combined(measurements, known)
+    combination = _combined(measurements, nominal)
     path = Path(used[0].path)
     try:
         vehicle = vehicle_of(path, start, combination)
     except ConfigError:  # an impossible inertia_zz, by moment_constant over inertia_zz
         measurements = tuple(_without_yaw(m) for m in measurements)
-        combination = _combined(measurements, known)
+        combination = _combined(measurements, nominal)
         vehicle = vehicle_of(path, _resized(start, combination), combination)
     return write_measurements(
         out,
@@ -118,13 +118,13 @@ def _measured(
     return measured, used, [left_out_finding(name, error) for name, error in errors]
 
 
-def _combined(measurements: Sequence[Measurement], known: Mapping[str, float]) -> Combination:
+def _combined(measurements: Sequence[Measurement], nominal: Mapping[str, float]) -> Combination:
     """Return the combination of measurements, with the file's curve of rotor speeds held."""
-    combination = combine(measurements, known)
+    combination = combine(measurements, nominal)
     if CURVE not in combination.names:
         return combination
-    held = Measurement("curve", ({CURVE: 1.0},), np.array([known[CURVE]]), np.array([[1e-6]]))
-    scaled = combine((*measurements, held), known).scaled
+    held = Measurement("curve", ({CURVE: 1.0},), np.array([nominal[CURVE]]), np.array([[1e-6]]))
+    scaled = combine((*measurements, held), nominal).scaled
     return combination.model_copy(update={"scaled": scaled})
 
 

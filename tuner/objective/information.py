@@ -171,7 +171,7 @@ class FisherInformation:
             pull=first.pull,
             nuisance_pull=None
             if first.nuisance_pull is None
-            else np.sum([part.nuisance_pull for part in parts], axis=0),
+            else np.sum([p.nuisance_pull for p in parts if p.nuisance_pull is not None], axis=0),
         )
 
     def with_resting(self, where: NDArray[np.bool_]) -> FisherInformation:

@@ -155,12 +155,12 @@ class _Search:
 
             def on_progress(rival: Progress, begin: Progress = begin) -> None:
                 # a checkpoint here resumes with all of them again
-                made = rival.iterations[len(begin.iterations) :]
+                iterations = rival.iterations[len(begin.iterations) :]
                 shown = replace(
                     progress,
-                    iterations=(*progress.iterations, *made),
-                    evaluations=progress.evaluations + len(made),
-                    steps=len(made),
+                    iterations=(*progress.iterations, *iterations),
+                    evaluations=progress.evaluations + len(iterations),
+                    steps=len(iterations),
                     iterate=rival.iterate,
                 )
                 self.on_progress(shown)

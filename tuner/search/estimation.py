@@ -50,17 +50,19 @@ from tuner.search.stages import Stage, plan, remaining_seconds
 
 def fingerprint(job: Job) -> str:
     """Return a digest of everything that a job's numbers depend on."""
-    settings, given = job.settings, job.settings.job
+    settings, job_file = job.settings, job.settings.job
     # a topic map or a side-car may change
     read_by = {
-        flight.path: reading_key(ReadOptions.of(Path(flight.path), given.topics, given.namespace))
+        flight.path: reading_key(
+            ReadOptions.of(Path(flight.path), job_file.topics, job_file.namespace)
+        )
         for flight in job.flights
     }
     parts = {
         "flights": [(flight.name, flight.sha256, *read_by[flight.path]) for flight in job.flights],
         "vehicle": settings.vehicle.model_dump(mode="json"),
         "controller": settings.controller.model_dump(mode="json"),
-        "job": given.model_dump(mode="json"),
+        "job": job_file.model_dump(mode="json"),
     }
     if settings.bench is not None:
         parts["bench"] = [settings.bench.mean.tolist(), settings.bench.information.tolist()]
@@ -202,9 +204,12 @@ def _doubt(job: Job, fitted: Fitted) -> Finding | None:
     losses = np.array([np.inf if end.loss is None else end.loss for end in fitted.outcomes])
     if len(losses) > 2 and (losses < (1.0 + SAME_MINIMUM_TOLERANCE) * losses.min()).sum() < 2:
         return Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": len(losses)})
-    lost = unmatched(fitted.scales)
-    if all(INLETS[inlet].closed_loop for inlet in job.inlets) and len(lost) > len(job.fitted) / 2:
-        numbers = {"far_off": len(lost), "flights": len(job.fitted)}
+    far_off = unmatched(fitted.scales)
+    if (
+        all(INLETS[inlet].closed_loop for inlet in job.inlets)
+        and len(far_off) > len(job.fitted) / 2
+    ):
+        numbers = {"far_off": len(far_off), "flights": len(job.fitted)}
         return Finding(Code.FLIGHTS_FAR_OFF, "info", "search", numbers)
     return None
 
@@ -327,8 +332,8 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     Inputs below the reference have the flight controller's stamps, which are then the simulation's.
     """
     free = np.ones((len(job.objective.of_flight), len(job.fitted)), bool)
-    known = [r.time_offset is not None for r in job.recordings if not r.holdout]
-    free[: len(CLOCKS), known] = False
+    clock_given = [r.time_offset is not None for r in job.recordings if not r.holdout]
+    free[: len(CLOCKS), clock_given] = False
     fed = [not INLETS[inlet].closed_loop for inlet in job.inlets]
     free[CLOCKS.index("flight_controller"), fed] = False
     if job.objective.segments.windowed and job.objective.segments.start_sd is None:

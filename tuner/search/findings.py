@@ -38,12 +38,12 @@ def unmatched(scales: Scales) -> dict[str, dict[str, float]]:
     scales
         Flight -> channel -> residual in multiples of the noise.
     """
-    lost = {}
+    flights = {}
     for flight, channels in scales.items():
         bad = {name: value for name, value in channels.items() if value > UNMATCHED_RATIO}
         if len(bad) > len(channels) / 2:
-            lost[flight] = bad
-    return lost
+            flights[flight] = bad
+    return flights
 
 
 def outlying_flights(scales: Scales) -> frozenset[str]:
@@ -52,9 +52,11 @@ def outlying_flights(scales: Scales) -> frozenset[str]:
     Another vehicle flew them, or something disturbed them alone: the model's errors there are in
     none of the others. Scales are those of `unmatched`.
     """
-    lost = unmatched(scales)
-    others = [max(channels.values()) for name, channels in scales.items() if name not in lost]
-    return frozenset(lost if len(lost) < len(others) and max(others) < COLOURED_RATIO else ())
+    outliers = unmatched(scales)
+    others = [max(channels.values()) for name, channels in scales.items() if name not in outliers]
+    return frozenset(
+        outliers if len(outliers) < len(others) and max(others) < COLOURED_RATIO else ()
+    )
 
 
 UNMATCHED_CODES = frozenset({Code.FLIGHT_UNMATCHED, Code.MODEL_UNMATCHED})
@@ -98,13 +100,13 @@ def unmatched_findings(scales: Scales, matched: Collection[str] = ()) -> tuple[F
         Flights that estimated disturbances explain: a simulated yaw spin in gusts, whose position
         nothing holds, may be far from the recorded one.
     """
-    lost = {name: bad for name, bad in unmatched(scales).items() if name not in matched}
+    flights = {name: bad for name, bad in unmatched(scales).items() if name not in matched}
     typical = float(np.median([_size(channels) for channels in scales.values()]))
-    alone = {name for name in lost if _size(scales[name]) > OUTLIER_RATIO * typical}
+    alone = {name for name in flights if _size(scales[name]) > OUTLIER_RATIO * typical}
     findings = [
-        Finding(Code.FLIGHT_UNMATCHED, "warning", name, lost[name]) for name in sorted(alone)
+        Finding(Code.FLIGHT_UNMATCHED, "warning", name, flights[name]) for name in sorted(alone)
     ]
-    shared = len(set(lost) - alone)
+    shared = len(set(flights) - alone)
     if shared:
         numbers = {"unmatched": shared, "flights": len(scales), "noise_multiple": typical}
         findings.append(Finding(Code.MODEL_UNMATCHED, "warning", "model", numbers))
@@ -153,10 +155,10 @@ def turning_findings(job: Job, explained: Mapping[str, float]) -> tuple[Finding,
     return (Finding(Code.TURNING_UNEXPLAINED, "warning", "moments of inertia", numbers),)
 
 
-def reference_voltage_findings(given: VehicleFile, best: VehicleFile) -> tuple[Finding, ...]:
+def reference_voltage_findings(initial: VehicleFile, best: VehicleFile) -> tuple[Finding, ...]:
     """Return the finding on the reference voltage, where the vehicle file has none."""
     volts = best.battery.reference_voltage
-    if given.battery.reference_voltage or not volts or not best.effects.get("battery_exponent"):
+    if initial.battery.reference_voltage or not volts or not best.effects.get("battery_exponent"):
         return ()
     curve = "input_scaling, zero_position_armed"
     return (Finding(Code.REFERENCE_VOLTAGE, "info", curve, {"volts": volts}),)

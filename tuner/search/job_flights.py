@@ -71,8 +71,8 @@ def with_logged_parameters(settings: Settings) -> tuple[Settings, tuple[Finding,
         return settings, ()
     first, *others = logs.values()
     controller, changes = with_parameters(settings.controller, first)
-    known = [name for name in PARAMETER_OF.values() if name in first]
-    unlike = [name for name in known if any(other.get(name) != first[name] for other in others)]
+    logged = [name for name in PARAMETER_OF.values() if name in first]
+    unlike = [name for name in logged if any(other.get(name) != first[name] for other in others)]
     findings = []
     if changes:
         named = not settings.origin.get("controller", "default").startswith("default")
@@ -131,8 +131,10 @@ def read_recordings(
     held_out = job.holdout if holdout is None else holdout
     for flight in flights:
         try:
-            known = _with_reference(flight, settings)
-            recordings.append(recording_of(settings, known, holdout=flight.name in held_out))
+            with_reference = _with_reference(flight, settings)
+            recordings.append(
+                recording_of(settings, with_reference, holdout=flight.name in held_out)
+            )
         except RecordingError as error:
             left_out.append((flight.name, error))
     none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
@@ -227,10 +229,10 @@ def _with_fitted_inlet(
     """
     job, flight = settings.job, recording.flight
     own = job.flights.get(flight.name)
-    asked = (None if own is None else own.inlet) or job.inlet
+    requested = (None if own is None else own.inlet) or job.inlet
     fitted = {other.inlet for other in recordings if not other.holdout}
     turns = recording.inlet in SIGNAL_OF_INLET and fitted == {"attitude"}
-    if not (recording.holdout and asked == "auto" and turns):
+    if not (recording.holdout and requested == "auto" and turns):
         return recording
     try:
         require_windows(flight, window_seconds(["attitude"], job.search.window), ("attitude",))

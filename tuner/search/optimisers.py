@@ -168,9 +168,9 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
         objective.space
     ):
         plain = sums_at(objective, before.tried, criterion, derivatives=False)
-        found = quadratics(plain)
-        if not any(_accepts(one, at.loss, moves)[0] for one, at in zip(each, found, strict=True)):
-            sums, here = plain, found
+        tried = quadratics(plain)
+        if not any(_accepts(one, at.loss, moves)[0] for one, at in zip(each, tried, strict=True)):
+            sums, here = plain, tried
     if sums is None:
         sums = sums_at(objective, before.tried, criterion)
     here = here or quadratics(sums)
@@ -286,7 +286,7 @@ def descend(problem: StageProblem) -> Iterator[Iterate]:
         # (S,) the median over flights of the worst channel's RMS, in σ
         worst = np.median(np.nan_to_num(list(channels.values())).max(axis=0), axis=-1)
         estimated, here = estimated_states(step.best, best, states), _of(step.sums, best)
-        found = Iterate(
+        iterate = Iterate(
             points=step.point,
             losses=step.loss,
             accepted=step.accepted,
@@ -298,12 +298,12 @@ def descend(problem: StageProblem) -> Iterator[Iterate]:
         if not step.accepted[best] and need_relinearising(estimated, best_about):
             states, best_about, losses = estimated, estimated, []
             step = initial_step(step.point, step.damping)
-            yield found
+            yield iterate
             continue
         if step.accepted[best]:
             states, best_about = estimated, states
-        losses.append(found.losses)
-        yield replace(found, converged=_has_converged(problem, step, worst, losses))
+        losses.append(iterate.losses)
+        yield replace(iterate, converged=_has_converged(problem, step, worst, losses))
 
 
 def _has_converged(

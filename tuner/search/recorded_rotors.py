@@ -126,26 +126,26 @@ def _turning_likelihoods(flight: Flight, vehicle: VehicleFile, at: Sequence[floa
     if steps is None:
         return [0.0] * len(at)
     parts = [with_rotors(steps, Series(rotors.time - late, rotors.values)) for late in at]
-    known = np.all([part.known for part in parts], axis=0)
+    complete = np.all([part.known for part in parts], axis=0)
     order = max(1, round(MEMORY_S / steps.step))
     new = [
         [
-            _innovation_variance(steps.accelerations[:, 3 + axis], columns, known, order)
+            _innovation_variance(steps.accelerations[:, 3 + axis], columns, complete, order)
             for axis, columns in enumerate(regressors(part, vehicle))
         ]
         for part in parts
     ]
-    return [-0.5 * float(known.sum() * np.log(of_axes).sum()) for of_axes in new]
+    return [-0.5 * float(complete.sum() * np.log(of_axes).sum()) for of_axes in new]
 
 
-def _innovation_variance(answer: Array, columns: Array, known: Mask, order: int) -> float:
+def _innovation_variance(answer: Array, columns: Array, complete: Mask, order: int) -> float:
     """Return the mean square of the innovations of a regression's errors."""
     rows = np.column_stack([answer, columns])
-    filtered = rows[known]
+    filtered = rows[complete]
     for _ in range(WHITENING_ROUNDS):
         weights = np.linalg.lstsq(filtered[:, 1:], filtered[:, 0], rcond=None)[0]
-        kernel = whitening_filter(answer - columns @ weights, known, order)
-        filtered = convolved(rows, known, kernel)
+        kernel = whitening_filter(answer - columns @ weights, complete, order)
+        filtered = convolved(rows, complete, kernel)
         if not len(filtered):  # gaps everywhere
             return 1.0
     left, _ = _residual(filtered[:, 1:], filtered[:, 0])
@@ -223,8 +223,8 @@ def _likelihoods(answer: Array, driven: Array, damping: Array, rate: float) -> A
 
     def spectrum(columns: Array) -> Spectrum:
         centred = (columns - columns.mean(axis=0)) * taper
-        found: Spectrum = np.fft.rfft(centred, axis=0)[inside]
-        return found
+        transformed: Spectrum = np.fft.rfft(centred, axis=0)[inside]
+        return transformed
 
     there, moved = _real(spectrum(answer[:, None]))[:, 0], spectrum(driven[:, None])
     others, turn = _real(spectrum(damping)), 2j * np.pi * frequency[inside][:, None]
@@ -336,8 +336,8 @@ def rotor_change_of(flight: Flight, vehicle: VehicleFile) -> RotorChange | None:
         Gives the curve from command to speed, where only commands were recorded.
     """
     source: Source = "rotor_speed" if flight.tells_speeds else "command"
-    known = {"position", "attitude", "body_rate", source} <= set(flight.series)
-    if not known or len(vehicle.rotors) != 4 or flight.duration < 2.0 * MIN_SIDE_S:
+    recorded = {"position", "attitude", "body_rate", source} <= set(flight.series)
+    if not recorded or len(vehicle.rotors) != 4 or flight.duration < 2.0 * MIN_SIDE_S:
         return None
     edges = np.arange(0.0, flight.duration, WINDOW_S)
     shares = _shares(flight, vehicle, source, edges)
@@ -391,19 +391,19 @@ def _motion(flight: Flight, edges: Array) -> Array:
 
 def _step(shares: Array, motion: Array, begins: Array, end: float) -> RotorChange | None:
     """Return the likeliest step of shares (n, 4) at one of the windows' begins (n,), if any."""
-    memory, found = 0.0, None
+    memory, likeliest = 0.0, None
     for _ in range(3):
         steps = list(_steps(shares, motion, begins, end, memory))
         if not steps:
             return None
-        found = max(steps, key=lambda step: step[0])
-        left = shares - motion @ found[2] - (begins >= found[1])[:, None] * found[3]
+        likeliest = max(steps, key=lambda step: step[0])
+        left = shares - motion @ likeliest[2] - (begins >= likeliest[1])[:, None] * likeliest[3]
         before, after = left[:-1], left[1:]
         memory = float(
             np.clip(np.sum(before * after) / max(np.sum(before**2), 1e-300), 0, MAX_AUTOREGRESSION)
         )
-    assert found is not None
-    gain, seconds, _, moved = found
+    assert likeliest is not None
+    gain, seconds, _, moved = likeliest
     rises = moved.max() > -RISE_RATIO * moved.min()
     rotor = int(np.argmax(moved) if rises else np.argmin(moved))
     alone = np.eye(4)[rotor] - 0.25

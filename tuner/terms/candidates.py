@@ -32,13 +32,13 @@ PRIOR_PRESENCE_OF_LUMPED = 0.1
 
 def candidate_groups(job: Job) -> Groups:
     """Return the groups none of whose coefficients is given, free or fixed."""
-    given, groups = values_of(job.settings.vehicle), term_groups()
+    values, groups = values_of(job.settings.vehicle), term_groups()
     taken = {*job.space.free, *job.settings.job.fixed}
     return {
         group: names
         for group, names in groups.items()
         if not taken.intersection(names)
-        and all(given.get(name) in (None, COEFFICIENTS[name].neutral) for name in names)
+        and all(values.get(name) in (None, COEFFICIENTS[name].neutral) for name in names)
     }
 
 
@@ -192,10 +192,10 @@ def with_groups(
 def offsets_of(fitted: Fitted, objective: Objective, *, reset: Collection[str] = ()) -> Array:
     """Return a fit's offsets as rows of another problem of the same flights; some reset to zero."""
     rows = np.asarray(fitted.point.offsets)
-    known = dict(zip(fitted.objective.of_flight, rows, strict=True))
+    by_name = dict(zip(fitted.objective.of_flight, rows, strict=True))
     zeros = np.zeros(rows.shape[1])
-    known |= dict.fromkeys(reset, zeros)
-    return np.stack([known.get(name, zeros) for name in objective.of_flight])
+    by_name |= dict.fromkeys(reset, zeros)
+    return np.stack([by_name.get(name, zeros) for name in objective.of_flight])
 
 
 @dataclass(frozen=True)

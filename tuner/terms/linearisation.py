@@ -121,15 +121,15 @@ class LinearisedLoss:
     def information(self, inside: NDArray[np.bool_] | None = None) -> Array:
         """Return the information (P, P) of some stretches (S,), of all by default."""
         inside = np.ones(len(self.flight), bool) if inside is None else inside
-        known, key = self._informations, inside.tobytes()
-        if key not in known:
+        cache, key = self._informations, inside.tobytes()
+        if key not in cache:
             total = np.zeros((len(self.scaled), len(self.scaled)))
             for number in np.unique(self.flight[inside]):
                 of_flight = inside & (self.flight == number)
                 columns_seen = self.columns[np.argmax(of_flight)]
                 total[np.ix_(columns_seen, columns_seen)] += self.hessian[of_flight].sum(axis=0)
-            known[key] = total
-        return known[key]
+            cache[key] = total
+        return cache[key]
 
     @cached_property
     def _informations(self) -> dict[bytes, Array]:
@@ -471,10 +471,10 @@ def predicted_losses(
 
 def section_loss_ratio(linear: LinearisedLoss, model: Columns) -> float:
     """Return the held-out loss of sections over their loss in the fit to all."""
-    lost = 0.0
+    change = 0.0
     for out in linear.folds(linear.section):
-        lost += float(linear.change_of_loss(linear.step(model, inside=~out))[out].sum())
-    return 1.0 + lost / linear.loss
+        change += float(linear.change_of_loss(linear.step(model, inside=~out))[out].sum())
+    return 1.0 + change / linear.loss
 
 
 def vector_after(space: Space, vector: Array, change: Array) -> Array:

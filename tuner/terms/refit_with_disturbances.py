@@ -77,18 +77,18 @@ def refit_and_examine(
     fit, nor by default where only odd flights are not matched.
     """
     refit = partial(with_disturbances, on_progress=on_progress, on_message=on_message)
-    found, asked = None, selected.job.settings.job.disturbances
-    if not (selected.refuted or (asked == "auto" and outlying_flights(selected.fitted.scales))):
-        found = explanation.attempt("disturbances", partial(refit, selected), None)
-    if found is not None and (
-        refuted := set(refuted_by_commands(*found[:2])).difference(selected.kept)
+    examined, setting = None, selected.job.settings.job.disturbances
+    if not (selected.refuted or (setting == "auto" and outlying_flights(selected.fitted.scales))):
+        examined = explanation.attempt("disturbances", partial(refit, selected), None)
+    if examined is not None and (
+        refuted := set(refuted_by_commands(*examined[:2])).difference(selected.kept)
     ):
         on_message(GAINS_REFUTED.format(listed(sorted(refuted))))
         less = with_refuted(selected, refuted)
-        found = explanation.attempt("disturbances", partial(refit, less), None)
+        examined = explanation.attempt("disturbances", partial(refit, less), None)
     on_message("Examining how well each coefficient is known.")
-    if found is not None:
-        return found
+    if examined is not None:
+        return examined
     job, fitted = selected.job, selected.fitted
     hold = partial(
         hold_undetermined,
@@ -115,8 +115,8 @@ def with_disturbances(
     a lag that the simulated flights lack.
     """
     job, fitted = selected.job, selected.fitted
-    asked = job.settings.job.disturbances
-    wanted = asked == "follow" or (asked == "auto" and candidates_of(job))
+    setting = job.settings.job.disturbances
+    wanted = setting == "follow" or (setting == "auto" and candidates_of(job))
     if fitted.residuals_at_noise_level or not fitted.polished or not wanted:
         return None
     full = full_problem_of(fitted.objective, fitted.point)  # the examination's: compiled once

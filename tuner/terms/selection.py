@@ -144,15 +144,15 @@ class Selection:
         seem to predict. After a fit with all others, each has to.
         """
         scores = self._worth_fitting(state, dropped)
-        return scores if any(found.is_accepted for found in scores.values()) else {}
+        return scores if any(group_score.is_accepted for group_score in scores.values()) else {}
 
     def _worth_fitting(self, state: LinearisedFit, dropped: Reasons) -> dict[str, Score]:
         """Return the groups with a significant gain in the fit, whether they predict or not."""
         return {
-            group: found
+            group: group_score
             for group in self.candidates
             if group not in state.added and group not in dropped
-            if (found := self._score(state, group)).reason in GAINS_IN_FIT
+            if (group_score := self._score(state, group)).reason in GAINS_IN_FIT
         }
 
     def _with_all(self, base: LinearisedFit) -> LinearisedFit | None:
@@ -323,10 +323,10 @@ class Selection:
         groups = dict.fromkeys([*state.added, *self.candidates])
         scores = {group: self._score(state, group) for group in groups}
         rows = [
-            row_of(group, self.candidates[group], found, kept=True)
+            row_of(group, self.candidates[group], group_score, kept=True)
             if group in state.added
-            else row_of(group, self.candidates[group], found, dropped.get(group), kept=False)
-            for group, found in scores.items()
+            else row_of(group, self.candidates[group], group_score, dropped.get(group), kept=False)
+            for group, group_score in scores.items()
         ]
         free = free_groups(self.job.space, self.job.first_terms)
         rows += self._base_rows(state, free, SelectionCode.OPEN_LOOP)
@@ -566,8 +566,8 @@ def refuted_by_commands(selected: Selected, fitted: Fitted) -> tuple[str, ...]:
 
 def with_refuted(selected: Selected, groups: Collection[str]) -> Selected:
     """Return a selection with some groups marked as refuted by recorded commands."""
-    found = {"kept": False, "reason": SelectionCode.REFUTED}
-    rows = (row.model_copy(update=found if row.group in groups else {}) for row in selected.rows)
+    refuted = {"kept": False, "reason": SelectionCode.REFUTED}
+    rows = (row.model_copy(update=refuted if row.group in groups else {}) for row in selected.rows)
     return replace(selected, rows=tuple(rows))
 
 

@@ -80,27 +80,27 @@ def flights_disagree(fitted: Fitted, examination: Examination) -> tuple[Finding,
 def _splits(information: FisherInformation, searched: Sequence[int], flights: int) -> list[Split]:
     """Return all splits in two by the value that each flight needs, the smaller part of each."""
     size = information.score.shape[-1]
-    known, score = np.zeros((flights, size, size)), np.zeros((flights, size))
-    np.add.at(known, information.flight, information.blocks.sum(axis=(0, 2)))
+    blocks, score = np.zeros((flights, size, size)), np.zeros((flights, size))
+    np.add.at(blocks, information.flight, information.blocks.sum(axis=(0, 2)))
     np.add.at(score, information.flight, information.score.sum(axis=(0, 2)))
     inverse = information.inverse.matrix
     to_minimum = -inverse @ information.slope
 
     def split(index: int, some: NDArray[np.intp]) -> Split:
-        across = known[some, :, index].sum(axis=0)
+        across = blocks[some, :, index].sum(axis=0)
         own = across[index] - across @ inverse @ across
         if own <= MIN_OWN_INFORMATION * across[index]:
             return Split(index, np.sort(some), 0.0, np.inf)
         left = score[some, index].sum() + across @ to_minimum
         return Split(index, np.sort(some), float(-left / own), float(own**-0.5))
 
-    found = []
+    splits = []
     for index in searched:
         order = np.argsort([split(index, one).ratio for one in np.arange(flights)[:, None]])
         for part in range(1, flights):
             few = order[:part] if 2 * part <= flights else order[part:]
-            found.append(split(index, few))
-    return found
+            splits.append(split(index, few))
+    return splits
 
 
 def _with_two_values(information: FisherInformation, split: Split) -> FisherInformation:
@@ -149,16 +149,18 @@ def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[s
         index = space.names.index(name)
         estimate = uncertainty.estimates[name]
         ground = float(prior.mean[place])
-        known = bool(moves[index])
+        identified = bool(moves[index])
         spread = float(np.hypot(alone_error[index], ground_error[place]))
         sources[name] = Sources(
             ground=space.from_scaled(index, ground),
             ground_error=_error(space, index, ground, ground_error[place]),
-            flights=space.from_scaled(index, alone[index]) if known else None,
-            flights_error=_error(space, index, alone[index], alone_error[index]) if known else None,
+            flights=space.from_scaled(index, alone[index]) if identified else None,
+            flights_error=_error(space, index, alone[index], alone_error[index])
+            if identified
+            else None,
             both=estimate.value,
             both_error=estimate.std_error,
-            deviation=float(alone[index] - ground) / spread if known else None,
+            deviation=float(alone[index] - ground) / spread if identified else None,
         )
     return sources
 

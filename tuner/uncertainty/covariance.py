@@ -365,7 +365,9 @@ def _ends(information: FisherInformation) -> Array:
 def _cut(information: FisherInformation, seconds: float) -> Stretches:
     blocks = information.blocks.shape[2]
     times = information.begins[:, None] + (np.arange(blocks) + 0.5) * BLOCK_S
-    known, score, *_ = information.in_stretches(np.floor(times / seconds).astype(np.intp))
+    blocks_of_stretches, score, *_ = information.in_stretches(
+        np.floor(times / seconds).astype(np.intp)
+    )
     to_minimum = -information.inverse.matrix @ information.slope
-    flown = np.any(known != 0.0, axis=(1, 2))
-    return Stretches(known[flown], (score + known @ to_minimum)[flown])
+    flown = np.any(blocks_of_stretches != 0.0, axis=(1, 2))
+    return Stretches(blocks_of_stretches[flown], (score + blocks_of_stretches @ to_minimum)[flown])

@@ -151,7 +151,7 @@ def uncertainty_at(
         partner, correlation = _partner(covariance.correlation[index], index, space.names)
         channel, flight = _source(shares[..., index], information.channels, flights)
         half_width = float(Z95 * covariance.error[index])
-        known = Reason(
+        numbers = Reason(
             code=ReasonCode.INTERVAL,
             half_width=half_width,
             unit=None if parameter.scale == "log" else COEFFICIENTS[parameter.name].unit,
@@ -166,7 +166,7 @@ def uncertainty_at(
         )
         judgement = judge(
             parameter.name,
-            known,
+            numbers,
             directions,
             relative_half_width=half_width / reference[index],
             data_error=float(covariance.data_error[index] / reference[index]),
@@ -341,18 +341,20 @@ def term_findings(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ..
     """
     findings = []
     for group in REPORTED_TERMS:
-        known = {
+        identified = {
             name: estimate
             for name in term_groups()[group]
             if name not in fitted.held
             and (estimate := uncertainty.estimates.get(name)) is not None
             and estimate.identifiable
         }
-        neutral = {name: COEFFICIENTS[name].neutral or 0.0 for name in known}
-        if any(not e.ci95[0] <= neutral[name] <= e.ci95[1] for name, e in known.items()):
-            numbers = {name: estimate.value for name, estimate in known.items()}
-            numbers |= {f"{name}_error": estimate.std_error for name, estimate in known.items()}
-            findings.append(Finding(Code.TERM_SHOWS, "warning", group, numbers, tuple(known)))
+        neutral = {name: COEFFICIENTS[name].neutral or 0.0 for name in identified}
+        if any(not e.ci95[0] <= neutral[name] <= e.ci95[1] for name, e in identified.items()):
+            numbers = {name: estimate.value for name, estimate in identified.items()}
+            numbers |= {
+                f"{name}_error": estimate.std_error for name, estimate in identified.items()
+            }
+            findings.append(Finding(Code.TERM_SHOWS, "warning", group, numbers, tuple(identified)))
     return tuple(findings)
 
 
@@ -461,23 +463,23 @@ def left_out(information: FisherInformation) -> Array | None:
         return None
     total, independent = information.total, IndependentErrors.of(information)
     inverse = independent.inverse
-    known = np.diag(inverse.matrix)
+    variance = np.diag(inverse.matrix)
     weights, squares = np.zeros_like(parts.score), np.zeros_like(parts.score)
     for number in range(parts.count):
         others = np.delete(parts.information, number, axis=0).sum(axis=0)
         rest = Inverse.of(others + information.given, information.given)
         without = rest.matrix
-        expected = np.maximum(np.diag(without) - known, 0.0)
-        informative = (expected > MIN_VARIANCE_GROWTH * known) & rest.known
+        expected = np.maximum(np.diag(without) - variance, 0.0)
+        informative = (expected > MIN_VARIANCE_GROWTH * variance) & rest.known
         moved = (without @ parts.score[number]) ** 2
-        weights[number] = np.where(informative, expected / (expected + known), 0.0)
+        weights[number] = np.where(informative, expected / (expected + variance), 0.0)
         squares[number] = np.where(informative, moved / np.where(informative, expected, 1.0), 0.0)
     of_all = np.maximum(weights.sum(axis=0), 1e-300)
     beyond = np.where(weights.any(axis=0), (weights * squares).sum(axis=0) / of_all, 1.0)
     alike = of_all**2 / np.maximum((weights**2).sum(axis=0), 1e-300)
-    given = np.diag(inverse.sandwiched(np.zeros_like(total), information.given))
+    of_priors = np.diag(inverse.sandwiched(np.zeros_like(total), information.given))
     # one degree of freedom is the estimate's own
-    return independent.widened(beyond * np.maximum(known - given, 0.0), alike - 1.0)
+    return independent.widened(beyond * np.maximum(variance - of_priors, 0.0), alike - 1.0)
 
 
 MIN_MOVE_NAMED = 0.3

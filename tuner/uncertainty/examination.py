@@ -195,7 +195,7 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
 
 def _coefficients(examination: Examination, space: Space) -> dict[str, CoefficientKnowledge]:
     uncertainty, steps = examination.uncertainty, examination.sensitivity.steps
-    known = {
+    records = {
         name: _coefficient(name, uncertainty, index, steps[parameter.name] * abs(ratio))
         for index, parameter in enumerate(space.parameters)
         for name, ratio in parameter.ratios.items()
@@ -204,10 +204,10 @@ def _coefficients(examination: Examination, space: Space) -> dict[str, Coefficie
         examination.of_fixed.items(), examination.bias, strict=True
     ):
         bias = dict(zip(uncertainty.names, row.tolist(), strict=True))
-        known[name] = _coefficient(
+        records[name] = _coefficient(
             name, uncertainty_with, len(uncertainty_with.names) - 1, steps[name], bias
         )
-    return known
+    return records
 
 
 def _coefficient(

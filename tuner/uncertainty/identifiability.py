@@ -74,11 +74,13 @@ def hold_undetermined(
     segments = fitted.objective.segments
     predicts = segments.windowed and segments.start_sd is None
     for _ in range(MAX_ROUNDS):
-        found = stand_ins_of(examination.uncertainty)
+        undetermined = stand_ins_of(examination.uncertainty)
         if predicts:
-            traded = {stand_in for name, stand_in in found.items() if name != stand_in}
-            found = {name: stand_in for name, stand_in in found.items() if stand_in in traded}
-        stand_ins = found | dict(fitted.held)
+            traded = {stand_in for name, stand_in in undetermined.items() if name != stand_in}
+            undetermined = {
+                name: stand_in for name, stand_in in undetermined.items() if stand_in in traded
+            }
+        stand_ins = undetermined | dict(fitted.held)
         names = sorted(set(stand_ins.values()))
         if set(names) <= set(fitted.held.values()):
             break
@@ -119,14 +121,14 @@ def _undetermined_terms(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> t
     Those elsewhere may improve predictions.
     """
     settings, held = job.settings.job, set(fitted.held.values())
-    asked = set(settings.free or ())
+    chosen = set(settings.free or ())
     if not isinstance(settings.terms, str):
-        asked.update(name for names in job.first_terms.values() for name in names)
+        chosen.update(name for names in job.first_terms.values() for name in names)
     return tuple(
         name
         for name in uncertainty.names
         if COEFFICIENTS[name].group
-        and name not in held | asked
+        and name not in held | chosen
         and not uncertainty.estimates[name].reason.identifiable
         and uncertainty.estimates[name].reason.bound is not None
     )

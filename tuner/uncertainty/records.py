@@ -370,12 +370,12 @@ class Knowledge(ResultFile):
     def _hold_all_of_each_coefficient(self) -> Self:
         outputs = self.outputs
         for name in {name for output in outputs for name in output.change}:
-            known = self.coefficients.get(name)
-            if known is None or not all(
+            record = self.coefficients.get(name)
+            if record is None or not all(
                 name in output.change
                 and name in output.rmse_up
                 and name in output.rmse_down
-                and output.flight in known.shares.get(output.channel, ())
+                and output.flight in record.shares.get(output.channel, ())
                 for output in outputs
             ):
                 raise refuse(f"lacks a part of what is known of {name}", "was it edited?")
@@ -387,13 +387,13 @@ class Knowledge(ResultFile):
 
 def _sensitivity(knowledge: Knowledge) -> Iterable[Sequence[object]]:
     spans = {flight.flight: flight.span for flight in knowledge.effects_over_time}
-    for name, known in knowledge.coefficients.items():
+    for name, record in knowledge.coefficients.items():
         for output in knowledge.outputs:
             if name not in output.change:
                 continue  # tied to another, whose rows hold for both
             yield [
                 name,
-                int(known.fitted),
+                int(record.fitted),
                 output.flight,
                 output.channel,
                 output.axis,
@@ -403,16 +403,16 @@ def _sensitivity(knowledge: Knowledge) -> Iterable[Sequence[object]]:
                 output.rmse_up[name],
                 output.rmse_down[name],
                 *spans[output.flight][name],
-                known.shares[output.channel][output.flight],
+                record.shares[output.channel][output.flight],
             ]
 
 
 def _shares(knowledge: Knowledge) -> Iterable[Sequence[object]]:
-    for name, known in knowledge.coefficients.items():
-        for channel, flights in known.shares.items():
+    for name, record in knowledge.coefficients.items():
+        for channel, flights in record.shares.items():
             for flight, share in flights.items():
                 yield [name, flight, channel, share]
-        yield [name, "", "prior", known.prior_share]
+        yield [name, "", "prior", record.prior_share]
 
 
 CALIBRATION = Path(__file__).with_name("calibration.json")

@@ -65,11 +65,11 @@ def refits(
             on_iteration(before)
 
     whole = engine.share((job, fitted))
-    found = engine.map(_refit, [(whole, draw) for draw in draws], on_report)
+    outcomes = engine.map(_refit, [(whole, draw) for draw in draws], on_report)
     if engine.at_once > 1:
         for iteration in last.values():
             on_iteration(iteration)
-    return found
+    return outcomes
 
 
 def _refit(task: tuple[Callable[[], tuple[Job, Fitted]], Draw], report: Report) -> Refit:
@@ -133,11 +133,11 @@ def bootstrap(
     drawn = random.integers(len(names), size=(count, len(names)))
     counts = [np.bincount(row, minlength=len(names)) for row in drawn]
     draws = [Draw(f"draw {n}", row.astype(float)) for n, row in enumerate(counts, 1)]
-    found = refits(job, fitted, draws, on_iteration)
-    by_name = coefficients_of(found)
+    outcomes = refits(job, fitted, draws, on_iteration)
+    by_name = coefficients_of(outcomes)
     rows = (
         [number, *row.tolist(), *refit.coefficients.values()]
-        for number, (row, refit) in enumerate(zip(counts, found, strict=True), 1)
+        for number, (row, refit) in enumerate(zip(counts, outcomes, strict=True), 1)
     )
     header = ("refit", *(f"drawn_{name}" for name in names), *by_name)
     write_text(folder / BOOTSTRAP_FILE, csv_text(header, rows))

@@ -210,7 +210,7 @@ NOT_EXAMINED = Reason(code=ReasonCode.NOT_EXAMINED)
 
 def judge(
     name: str,
-    known: Reason,
+    numbers: Reason,
     directions: Sequence[Direction],
     *,
     relative_half_width: float,
@@ -221,7 +221,7 @@ def judge(
 
     Parameters
     ----------
-    known
+    numbers
         All fields of a reason; the returned one keeps those relevant to the verdict.
     directions
         Worst-determined combinations.
@@ -233,11 +233,11 @@ def judge(
     """
 
     def reason(code: ReasonCode, *kept: str, **more: Any) -> Reason:
-        return Reason(code=code, **{n: getattr(known, n) for n in (*kept, "bound")}, **more)
+        return Reason(code=code, **{n: getattr(numbers, n) for n in (*kept, "bound")}, **more)
 
     if refuted:
         return Verdict.NOT_IDENTIFIABLE, reason(ReasonCode.REFUTED, "prior_given")
-    prior_share = known.prior_share or 0.0
+    prior_share = numbers.prior_share or 0.0
     if data_error > MAX_IDENTIFIABLE_ERROR or prior_share > MAX_PRIOR_SHARE:
         for direction in directions:
             if direction.null and name in direction.moves and len(direction.moves) > 1:
@@ -252,11 +252,11 @@ def judge(
             else:
                 why = reason(ReasonCode.PRIOR_DOMINATES, "prior_share", "prior_given")
         return Verdict.NOT_IDENTIFIABLE, why
-    well = relative_half_width < WELL_KNOWN and known.bound is None
+    well = relative_half_width < WELL_KNOWN and numbers.bound is None
     kept = ["half_width", "unit", "channel", "flight"]
-    if not well and known.correlated_with and abs(known.correlation or 0.0) > HIGH_CORRELATION:
+    if not well and numbers.correlated_with and abs(numbers.correlation or 0.0) > HIGH_CORRELATION:
         kept += ["correlated_with", "correlation"]
-    if (known.noise_inflation or 1.0) > HIGH_INFLATION:
+    if (numbers.noise_inflation or 1.0) > HIGH_INFLATION:
         kept.append("noise_inflation")
     verdict = Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN
     return verdict, reason(ReasonCode.INTERVAL, *kept)
@@ -451,7 +451,7 @@ def _source(reason: Reason) -> str:
 def direction_in_words(direction: Direction) -> str:
     """Return one sentence on a combination of coefficients and how well it is determined."""
     moves = direction.moves
-    known = (
+    precision = (
         "is not identifiable"
         if direction.null
         else f"is known to ±{percent(Z95 * direction.error)}"
@@ -460,10 +460,10 @@ def direction_in_words(direction: Direction) -> str:
         group = listed([name for name in moves if name in scale_group()])
         return (
             f"{group} scale together: multiplied by one factor, every motion stays the same; "
-            f"that factor {known}. Weigh the mass and fix it."
+            f"that factor {precision}. Weigh the mass and fix it."
         )
     if len(moves) == 1:
-        return f"{next(iter(moves))} alone: it {known}."
+        return f"{next(iter(moves))} alone: it {precision}."
     rising = [name for name, move in moves.items() if move > 0]
     falling = [name for name, move in moves.items() if move < 0]
     proportion = ", ".join(f"{name} {move:+.0%}" for name, move in moves.items())
@@ -471,4 +471,6 @@ def direction_in_words(direction: Direction) -> str:
         verb = f"trade{'s' if len(rising) == 1 else ''} off against {listed(falling)}"
     else:
         verb = "rise and fall together"
-    return f"{listed(rising)} {verb} (in the proportion {proportion}): their combination {known}."
+    return (
+        f"{listed(rising)} {verb} (in the proportion {proportion}): their combination {precision}."
+    )
