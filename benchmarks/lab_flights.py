@@ -147,7 +147,9 @@ def effect_of(seed: int, *, seconds: float, flights: int, log_rate: float) -> Ef
     kept = _kept(sizes["tachometer_lag"], log_rate)
     values["integral_gain"] = {"integral_gain": sizes.pop("integral_gain")}
     values["gyro_filter"] = {"gyro_cutoff_factor": sizes.pop("gyro_filter")}
-    values["tachometer_lag"] = {"tachometer_lag": kept / (1.0 - kept) / log_rate}
+    late = kept / (1.0 - kept) / log_rate
+    memory = sizes["tachometer_lag"] / late
+    values["tachometer_lag"] = {"tachometer_lag": late, "tachometer_memory": memory}
 
     def one(name: str) -> Effect:
         return replace(drawn, name=name, values=values.get(name, {}), size=sizes.get(name, 0.0))

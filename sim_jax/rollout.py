@@ -106,7 +106,11 @@ def start_simulation(
         lag=_lag(vehicle, schedule),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
         senses=senses,
-        tachometer=None if read_late is None else Tachometer.over(read_late, schedule.step),
+        tachometer=None
+        if read_late is None
+        else Tachometer.over(
+            read_late, schedule.step, vehicle.effects.get("tachometer_memory", 1.0)
+        ),
     )
     return plant, first_state(
         start,

@@ -172,8 +172,10 @@ def filter_gyro(gyro: GyroFilter, memory: GyroMemory, rate: Vec3, sample_rate: f
 
 
 class Tachometer(eqx.Module):
-    """A low-pass of first order on the recorded rotor speeds, exact for speeds that are linear.
+    """A filter of first order on the recorded rotor speeds, exact for speeds that are linear.
 
+    ``(1 + (τ - lag) s) / (1 + τ s)``, its memory ``τ / lag``: 1 of a low-pass, more of one that is
+    computed sample by sample, which passes a part of each change at once, 1/2 of a dead time.
     Below zero its lag is a lead: the law goes on smoothly through zero, where it does nothing.
     """
 
@@ -185,10 +187,10 @@ class Tachometer(eqx.Module):
     """s."""
 
     @staticmethod
-    def over(lag: Scalar, step: float) -> Tachometer:
+    def over(lag: Scalar, step: float, memory: Scalar | float = 1.0) -> Tachometer:
         """Prepare the filter for steps of so many s."""
         acts = lag > MIN_TIME_CONSTANT_S
-        kept = jnp.where(acts, jnp.exp(-step / jnp.where(acts, lag, 1.0)), 0.0)
+        kept = jnp.where(acts, jnp.exp(-step / (memory * jnp.where(acts, lag, 1.0))), 0.0)
         return Tachometer(lag, kept, step)
 
     def reading(self, read: Scalar, before: Scalar, after: Scalar) -> Scalar:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
 
 from sim_jax.environment import Air, Environment
 from sim_jax.motor import Lag, LagSlope, SwitchedLag
@@ -250,23 +251,24 @@ def test_a_second_lag_of_nothing_changes_no_bit_of_a_flight_and_another_delays_i
     assert np.abs(flown(time_constant_second=SECOND) - base).max() > 1.0
 
 
-def read_by(lag):
+def read_by(lag, memory=1.0):
     """Return what tachometers with a lag read after a step of 2.5 ms, rad/s."""
-    return Tachometer.over(lag, 0.0025).reading(*map(jnp.asarray, (590.0, 600.0, 620.0)))
+    return Tachometer.over(lag, 0.0025, memory).reading(*map(jnp.asarray, (590.0, 600.0, 620.0)))
 
 
+@pytest.mark.parametrize("memory", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("lag", [5e-4, 0.008])
-def test_tachometers_read_what_the_differential_equation_says(lag):
-    slope = (620.0 - 600.0) / 0.0025
+def test_tachometers_read_what_the_differential_equation_says(lag, memory):
+    slope, settling = (620.0 - 600.0) / 0.0025, memory * lag
     exact = solve_ivp(
-        lambda time, read: (600.0 + slope * time - read) / lag,
+        lambda time, read: (600.0 + slope * time - read + (settling - lag) * slope) / settling,
         (0.0, 0.0025),
         [590.0],
         rtol=1e-11,
         atol=1e-9,
         method="LSODA",
     ).y[0, -1]
-    np.testing.assert_allclose(read_by(jnp.asarray(lag)), exact, rtol=1e-8)
+    np.testing.assert_allclose(read_by(jnp.asarray(lag), memory), exact, rtol=1e-8)
 
 
 @pytest.mark.parametrize("lag", [-0.002, 0.0, 5e-4, 0.008])
@@ -274,6 +276,23 @@ def test_a_tachometers_derivatives_agree_with_differences_also_where_its_lag_van
     width = 1e-7 if lag else -1e-7  # below zero it leads
     difference = (read_by(jnp.asarray(lag + width)) - read_by(jnp.asarray(lag))) / width
     np.testing.assert_allclose(jax.jacfwd(read_by)(jnp.asarray(lag)), difference, rtol=1e-4)
+
+
+def test_a_longer_memory_reads_as_a_filter_that_is_computed_sample_by_sample():
+    """Four times as closely as a low-pass with the same lag."""
+    rate, constant = 100.0, 0.02
+    kept = np.exp(-1.0 / rate / constant)
+    lag = jnp.asarray(kept / (1.0 - kept) / rate)
+    true = 620.0 + 60.0 * np.sin(8.0 * np.arange(600) / 400.0) ** 3
+    sampled = lfilter([1.0 - kept], [1.0, -kept], true[::4], zi=true[:1] * kept)[0]
+
+    def off(memory):
+        sensor, read = Tachometer.over(lag, 1.0 / 400.0, memory), [jnp.asarray(true[0])]
+        for before, after in zip(*map(jnp.asarray, (true[:-1], true[1:])), strict=True):
+            read.append(sensor.reading(read[-1], before, after))
+        return np.std(np.array(read)[::4][20:] - sampled[20:])
+
+    assert off(constant / float(lag)) < 0.25 * off(1.0)
 
 
 def test_late_tachometers_change_what_is_read_and_no_bit_of_the_flight():

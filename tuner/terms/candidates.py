@@ -289,7 +289,7 @@ def selection_shifts(
     alone = linear.step(model)
     squares = np.zeros(len(linear.scaled))
     for group, presence in groups:
-        evidence = Evidence.of(linear, square, alone, model, group)
+        evidence = Evidence.of(linear, square, alone, model, linear.seen(group))
         squares[model] += evidence.mean_square(presence)
     return np.asarray(np.sqrt(squares))
 

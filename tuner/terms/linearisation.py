@@ -92,6 +92,14 @@ class LinearisedLoss:
         """Return the columns of some names, in their order."""
         return np.array([column for name in names for column in self._by_name[name]], np.intp)
 
+    def seen(self, group: Columns) -> Columns:
+        """Return the columns of a group that the flights see, all if they see none.
+
+        A coefficient that acts only beside another of its group is not seen while that is neutral.
+        """
+        seen = np.diag(self.information())[group] > 0.0
+        return group[seen] if seen.any() else group
+
     def to_neutral(self, gone: Columns) -> Array:
         """Return the change (P,) that leads some columns to their neutral values."""
         change = np.zeros(len(self.scaled))

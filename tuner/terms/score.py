@@ -196,6 +196,9 @@ def score(
     flight predict it, all flights have equal weights, and its values have to differ between flights
     by more than gusts explain (`chance_of_gusts`). A single flight, too, is predicted by sections.
 
+    A coefficient that acts only beside another of its group is not seen where both are neutral: the
+    others are tested without it.
+
     Where only sections, or no flights significantly, support a group, one gust during a manoeuvre
     might imitate it; so it must be significant whichever section is left out. This does not apply
     to laws that read a recorded signal.
@@ -220,6 +223,7 @@ def score(
     min_gain
         Share of the loss below which a gain is no evidence.
     """
+    group = linear.seen(group)
     columns = (model, np.concatenate([model, group]))
     begin = linear.to_neutral(dropped)
     without = linear.to_neutral(_concatenated([dropped, group])) if inside else begin

@@ -22,8 +22,6 @@ from tuner.vehicle import COEFFICIENTS, scale_group, term_groups
 
 STEP = "step"
 """Key of the problem with half the physics step, controllers and log at their own rates."""
-LOGGED = "logged"
-"""Key of the problem with rotor speeds filtered sample by sample."""
 READINGS = "readings"
 """Key of the problems with the battery's voltmeter read again, `VOLTMETER_DRAWS` times."""
 INPUT = "input"
@@ -332,6 +330,8 @@ REPORTED_TERMS = (
     "tachometer_lag",
 )
 """Groups of terms with a finding: a lab can act on them."""
+SHAPES = ("tachometer_memory",)
+"""Coefficients of these that tell how an effect acts, not whether there is one."""
 
 
 def term_findings(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ...]:
@@ -344,7 +344,7 @@ def term_findings(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ..
         identified = {
             name: estimate
             for name in term_groups()[group]
-            if name not in fitted.held
+            if name not in (*fitted.held, *SHAPES)
             and (estimate := uncertainty.estimates.get(name)) is not None
             and estimate.identifiable
         }
@@ -403,8 +403,6 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
     }
     if STEP in moved:
         moved[STEP] = np.hypot(moved[STEP], lags * SIMULATOR_STEP_S / 2.0 / np.sqrt(3.0))
-    if LOGGED in moved:
-        moved[STEP] = np.hypot(moved[STEP], moved[LOGGED])
     if MODEL_ERRORS in moved:
         flew = plausible_share(information, information.changes[MODEL_ERRORS])
         moved[MODEL_ERRORS] = moved[MODEL_ERRORS] * flew

@@ -62,7 +62,6 @@ from tuner.uncertainty.estimates import (
     INPUT,
     LIMIT,
     LIMIT_STEP,
-    LOGGED,
     READINGS,
     STEP,
     VOLTMETER_DRAWS,
@@ -259,7 +258,6 @@ def alternatives_of(
     return {
         STEP: replace(objective, schedule=finer),
         **limited,
-        **_with_sampled_filter(objective),
         **_with_other_readings(objective, point, flights),
     }
 
@@ -303,21 +301,6 @@ def _with_recorded_rotors(objective: Objective, flights: Sequence[Flight]) -> di
     swapped = tuple(map(with_rotors, parts))
     fed = eqx.tree_at(lambda i: i.parts, inlet, swapped) if len(parts) > 1 else swapped[0]
     return {INPUT: replace(objective, segments=replace(segments, inlet=fed))}
-
-
-def _with_sampled_filter(objective: Objective) -> dict[str, Objective]:
-    """Return the problem with rotor speeds filtered sample by sample, if their lag is fitted.
-
-    A filter in discrete time lags by half a period of the log less than one in continuous time with
-    the same time constant, and the log does not show which it was. Between these limits the
-    standard error is the half-width over √3.
-    """
-    speeds = objective.segments.measured.get("rotor_speed")
-    if speeds is None or "tachometer_lag" not in objective.space.names:
-        return {}
-    periods = np.diff(np.asarray(speeds.time), axis=0)
-    lag_error = 0.5 * float(np.median(periods[periods > 0.0])) / np.sqrt(3.0)
-    return {LOGGED: _with_speeds_earlier(objective, lag_error)}
 
 
 def _with_speeds_earlier(objective: Objective, seconds: float) -> Objective:

@@ -71,8 +71,7 @@ class ErrorParts(Part):
         commands put it. None where none was tried.
     step
         Its move when the physics step is halved, and for a rotor's lag that it may be off by half
-        of the finest step in which simulators take it, for that of recorded rotor speeds by half of
-        the log's; None where that was not asked.
+        of the finest step in which simulators take it; None where that was not asked.
     readings
         How it scatters when the battery's voltmeter is read again, with errors like those that it
         made; with commands fed in, how far it would move with recorded rotor speeds instead. None

@@ -178,6 +178,15 @@ SURROUNDING_ROWS = (
         part="tachometer",
         exported_as=_OUTSIDE,
     ),
+    _factor(
+        "tachometer_memory",
+        "time constant of the filter of the recorded rotor speeds over its lag",
+        "1 of a low-pass, more of one that is computed sample by sample, 1/2 of a dead time",
+        group="tachometer_lag",
+        part="tachometer",
+        bounds=8.0,
+        prior_sd=0.5,
+    ),
     # what a recording may get wrong by a constant
     _flight(
         "pose",

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tuner.terms.candidates import selection_shifts
 from tuner.terms.linearisation import LinearisedLoss, section_loss_ratio
 from tuner.terms.score import Score, _Gain, backward_elimination, chance_of_gusts, row_of, score
 from tuner.vehicle.selection_table import SelectionCode
@@ -59,6 +60,21 @@ def moved_to_minimum(linear, free):
         pull=linear.pull + linear.prior @ change,
         loss=linear.loss + linear.change_of_loss(change).sum(),
     )
+
+
+def test_a_coefficient_that_is_not_seen_yet_hides_no_other_of_its_group():
+    linear = linear_fit(0.5)
+    hessian, gradient = linear.hessian.copy(), linear.score.copy()
+    hessian[:, 3], hessian[:, :, 3], gradient[:, 3] = 0.0, 0.0, 0.0
+    linear = replace(linear, hessian=hessian, score=gradient)
+    both = np.array([*FIRST, 3])
+    alone, beside = (score(linear, MODEL, group, candidates=2) for group in (FIRST, both))
+    assert beside == alone
+    assert beside.is_accepted
+    idle = np.array([3])
+    assert score(linear, MODEL, idle, candidates=2).reason is SelectionCode.NO_INFORMATION
+    moves = [selection_shifts(linear, MODEL, [(group, 0.5)]) for group in (FIRST, both)]
+    np.testing.assert_array_equal(*moves)
 
 
 def test_a_term_of_the_truth_earns_its_place():

@@ -58,13 +58,20 @@ def test_none_is_found_where_none_flew(monkeypatch, setpoints):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("value", [0.0, 0.012])
-@pytest.mark.parametrize("name", ["time_constant_second", "tachometer_lag"])
-def test_a_lag_is_found_where_it_flew_and_biases_no_motor(monkeypatch, name, value):
+@pytest.mark.parametrize(
+    ("names", "values"),
+    [
+        (("time_constant_second",), ()),
+        (("time_constant_second",), (0.012,)),
+        (("tachometer_lag", "tachometer_memory"), ()),
+        (("tachometer_lag", "tachometer_memory"), (0.012, 2.0)),
+    ],
+)
+def test_a_lag_is_found_where_it_flew_and_biases_no_motor(monkeypatch, names, values):
     base = ("time_constant_up", "time_constant_down", "actuator_latency", "inertia_xx")
-    effects = {name: value} if value else {}
-    result = selected(monkeypatch, {"lag": (name,)}, effects=effects, base=base)
-    assert [row.kept for row in result.rows] == [value > 0.0]
+    effects = dict(zip(names, values, strict=False))
+    result = selected(monkeypatch, {"lag": names}, effects=effects, base=base)
+    assert [row.kept for row in result.rows] == [bool(values)]
     known = examine(result.fitted, selection_shifts=result.selection_shifts).uncertainty.estimates
     space = problem(base).space
     for coefficient, true in (space.numbers(space.initial) | effects).items():

@@ -167,3 +167,4 @@ def test_terms_that_flights_do_not_identify_have_no_number_in_findings():
     assert found.names == ("gyro_scale_x",)
     assert found.numbers == {"gyro_scale_x": 1.02, "gyro_scale_x_error": 0.001}
     assert not term_findings(fitted, SimpleNamespace(estimates={"gyro_scale_z": unknown}))
+    assert not term_findings(fitted, SimpleNamespace(estimates={"tachometer_memory": known}))

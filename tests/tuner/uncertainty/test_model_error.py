@@ -30,7 +30,6 @@ from tuner.objective.simulation import SETPOINTS
 from tuner.objective.space import space_of
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.search.progress import Fitted
-from tuner.terms.candidates import with_terms
 from tuner.uncertainty.examination import examine
 from tuner.uncertainty.model_error import (
     ModelErrors,
@@ -237,22 +236,6 @@ def test_commands_stand_in_for_tachometers():
         for flight in flights
     ]
     assert model_errors_of(fitted, blind) is None
-
-
-def test_a_loggers_sampled_filter_is_half_a_period_off():
-    objective = problem({"tachometer_lag": 0.008})
-    measured, flights = flown(objective, 0)
-    objective = replace(objective, segments=replace(objective.segments, measured=measured))
-    objective, point = with_terms(
-        objective, making.truth(objective), ("tachometer_lag",), JobFile()
-    )
-    numbers = objective.space.numbers(point.coefficients) | {"tachometer_lag": 0.008}
-    point = Point(objective.space.vector_of(numbers), point.offsets)
-    fitted = fitted_at(objective, point, flights)
-    known = examine(fitted, alternatives=alternatives_of(objective, fitted.point)).uncertainty
-    lag, inertia = (known.estimates[name] for name in ("tachometer_lag", "inertia_xx"))
-    assert lag.parts.step == pytest.approx(0.5 / RATE / np.sqrt(3.0), rel=0.2)
-    assert inertia.parts.step < 0.005 * inertia.value  # the lag takes it up
 
 
 def test_rotors_of_unrecorded_speed_are_known_as_well_as_their_limit():
