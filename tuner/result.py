@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
@@ -11,7 +13,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer, field_validator
 from pydantic_core import from_json
 
-from tuner.core.disk import exists, folder_for, inside, remove_file
+from tuner.core.disk import check_links, exists, folder_for, inside, remove_file
 from tuner.core.errors import InputError, OutputError
 from tuner.core.files import MAX_BYTES, FiniteOrNone, Part, ResultFile, read_bytes
 from tuner.core.yaml_section import refuse
@@ -20,7 +22,7 @@ from tuner.evaluate.records import AxesRmse, PredictedErrors
 from tuner.findings.findings import Finding, one_line
 from tuner.uncertainty.records import Sources
 from tuner.uncertainty.verdict import ErrorParts, Reason, Verdict, judgement_in_words
-from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle
+from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of
 from tuner.vehicle.selection_table import SelectionRow
 
 EXPORTS = "export"
@@ -348,9 +350,10 @@ def place_for(out: Path | None, *, resume: bool = False) -> Path:
     Raises
     ------
     InputError
-        As of `folder_for`, or a file that no run wrote there would be replaced.
+        As of `folder_for` and `check_links`, or a file that no run wrote there would be replaced.
     """
     folder = folder_for(out, resume=resume)
+    check_links(folder)
     theirs = [name for name in (*OF_A_RUN, EXPORTS) if exists(folder / name)]
     if theirs and not _is_of_a_run(folder):
         what = f"holds a {theirs[0]} that is of no run and would be replaced"
@@ -392,11 +395,13 @@ def read_run(folder: str | Path) -> Run:
     Raises
     ------
     InputError
-        It is no result folder, or is of another schema version, or its two files disagree.
+        It is no result folder, or is of another schema version, its two files disagree, or a link
+        leads out of it.
     """
     folder = Path(folder)
     if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "give the result folder of a run")
+    check_links(folder)
     result = RunResult.read(folder, REMEDY)
     effective = result.effective
     for name in (*result.coefficients, *(effective.coefficients if effective else ())):
@@ -404,9 +409,22 @@ def read_run(folder: str | Path) -> Run:
             raise InputError(
                 folder / RunResult.FILE, f"unknown coefficient '{name}'", "was it edited?"
             )
+    best = {name: row.best for name, row in result.coefficients.items()}
     return Run(
         folder=folder,
         result=result,
-        vehicle=read_vehicle(folder / BEST_FIT_FILE),
-        effective=read_vehicle(folder / EFFECTIVE_FILE) if effective else None,
+        vehicle=_vehicle_with(best, folder / BEST_FIT_FILE),
+        effective=_vehicle_with(effective.coefficients, folder / EFFECTIVE_FILE)
+        if effective
+        else None,
     )
+
+
+def _vehicle_with(numbers: Mapping[str, float], path: Path) -> VehicleFile:
+    """Read a vehicle file of a result folder, whose ``result.json`` has these numbers of it."""
+    vehicle = read_vehicle(path)
+    for name, value in values_of(vehicle).items():
+        if not math.isclose(value, numbers.get(name, value), rel_tol=1e-9):
+            what = f"{name} is {value:g}, and {numbers[name]:g} in {RunResult.FILE}"
+            raise InputError(path, what, "was one edited? take both files from one run")
+    return vehicle

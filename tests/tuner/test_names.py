@@ -18,7 +18,7 @@ from tuner.cli import main
 from tuner.config.job import ExportSettings
 from tuner.core import disk
 from tuner.core.disk import file_name, inside
-from tuner.core.errors import OutputError
+from tuner.core.errors import InputError, OutputError
 from tuner.exporters.export import export_formats_of_job
 from tuner.report import render
 from tuner.report.chart import Chart, Panel
@@ -120,5 +120,5 @@ def test_a_page_about_hostile_flights_is_drawn_with_their_names(tmp_path, monkey
     assert "../../evil (held out)" in page or "../../evil: position" in page
     (folder / "plots").rename(folder / "drawn")
     (folder / "plots").symlink_to(tmp_path)
-    with nothing_outside(folder), pytest.raises(OutputError, match="leads out of"):
+    with nothing_outside(folder), pytest.raises(InputError, match="leads out of"):
         render(folder, plots=True)

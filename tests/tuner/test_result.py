@@ -5,7 +5,8 @@ import pytest
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.core.errors import InputError, OutputError
 from tuner.findings.findings import Code, Finding
-from tuner.result import ExportRecord, ExportRecords, forget, read_run
+from tuner.report.contents import read_contents
+from tuner.result import ExportRecord, ExportRecords, forget, place_for, read_run
 
 
 def test_a_result_comes_back_from_its_file_as_it_was(make_run):  # noqa: F811
@@ -69,6 +70,54 @@ def test_what_is_no_result_is_refused_in_one_line(make_run, change, expected):  
         read_run(run.folder)
     assert expected in str(error.value)
     assert str(path) in str(error.value)
+
+
+def changed(run, key, value):
+    path = run.folder / "result.json"
+    content = json.loads(path.read_text())
+    content["coefficients"]["mass"][key] = value
+    path.write_text(json.dumps(content))
+
+
+def test_numbers_that_were_edited_in_one_file_are_no_result(make_run):  # noqa: F811
+    run = make_run()
+    changed(run, "best", 2.0)
+    with pytest.raises(InputError, match=r"best_fit\.yaml: mass is 2\.243, and 2 in result\.json"):
+        read_run(run.folder)
+
+
+@pytest.mark.parametrize("value", ["nan", "2.079", True, float("inf"), 10**400])
+def test_a_number_is_a_finite_number(make_run, value):  # noqa: F811
+    run = make_run()
+    changed(run, "initial", value)
+    with pytest.raises(InputError, match=r"result\.json"):
+        read_run(run.folder)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ('"seed": 0', '"seed": 0, "seed": 1', "has the key 'seed' twice"),
+        ('"duration": 36.0', '"duration": 1e999', "holds 1e999, which is no finite number"),
+        ('"seed": 0', '"seed": ' + "[" * 100_000, "nested too deeply"),
+    ],
+)
+def test_a_file_that_says_two_things_or_no_number_is_refused(make_run, old, new, expected):  # noqa: F811
+    path = make_run().folder / "result.json"
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(InputError, match=expected):
+        read_run(path.parent)
+
+
+@pytest.mark.parametrize("name", ["export", "effective", "report.html", "best_fit.yaml"])
+def test_a_link_that_leads_out_of_a_result_folder_is_not_followed(make_run, tmp_path, name):  # noqa: F811
+    folder, outside = make_run().folder, tmp_path / "outside"
+    outside.mkdir()
+    (folder / name).unlink(missing_ok=True)
+    (folder / name).symlink_to(outside)
+    for use in (read_run, read_contents, place_for):
+        with pytest.raises(InputError, match=f"{name}: is a link that leads out"):
+            use(folder)
 
 
 def test_a_folder_without_a_result_is_named(tmp_path):

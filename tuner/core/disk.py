@@ -59,6 +59,23 @@ def inside(folder: Path, name: str) -> Path:
     raise OutputError(repr(name), f"leads out of {folder}", "name a file inside it")
 
 
+def check_links(folder: Path) -> None:
+    """Refuse a folder that may be of others if a symbolic link in it leads out of it.
+
+    Raises
+    ------
+    InputError
+        One does: what is read or written there would lie elsewhere.
+    """
+    whole = folder.resolve()
+    for place, *names in os.walk(folder):
+        for name in (name for kind in names for name in kind):
+            path = Path(place, name)
+            if path.is_symlink() and not path.resolve().is_relative_to(whole):
+                what = f"is a link that leads out of {folder}"
+                raise InputError(path, what, "put what it leads to in its place, or remove it")
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file in UTF-8 that appears whole or not at all.
 
@@ -90,7 +107,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         unfinished = Path(name)
         try:
             yield unfinished
-            unfinished.chmod(0o644)
+            unfinished.chmod(path.stat().st_mode & 0o777 if path.is_file() else 0o644)
             unfinished.replace(path)
         finally:
             unfinished.unlink(missing_ok=True)
@@ -131,8 +148,11 @@ def check_file(path: Path) -> None:
         It is a folder, or the system refuses.
     """
     with _refusals(path):
-        if _is_regular_file(path) and path.is_dir():
-            raise OSError(errno.EISDIR, "")
+        if _is_regular_file(path):
+            if path.is_dir():
+                raise OSError(errno.EISDIR, "")
+            if not os.access(path, os.W_OK):
+                raise OSError(errno.EACCES, "")
         _check_writable(path.parent)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import io
+import json
 import math
 import stat
 import zlib
@@ -14,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, ClassVar, Self
 from zipfile import BadZipFile
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
-from pydantic_core import from_json
 
 from tuner.core.disk import write_text
 from tuner.core.errors import ConfigError, InputError
@@ -101,6 +101,21 @@ def read_arrays(path: Path, *, remedy: str) -> dict[str, NDArray[Any]]:
         raise InputError(path, f"is damaged ({error})", remedy) from None
 
 
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        twice = next(key for key, _ in pairs if [k for k, _ in pairs].count(key) > 1)
+        raise ValueError(f"it has the key {twice!r} twice")
+    return content
+
+
+def _finite(number: str) -> float:
+    value = float(number)
+    if not math.isfinite(value):
+        raise ValueError(f"it holds {number[:20]}, which is no finite number")
+    return int(number) if number.lstrip("-").isdigit() else value
+
+
 class Part(BaseModel):
     """A part of a JSON file of a result folder; unknown keys are ignored."""
 
@@ -157,7 +172,15 @@ class ResultFile(Part):
         path = folder / cls.FILE
         raw = read_bytes(path, most=MAX_BYTES, remedy=remedy)
         try:
-            content = from_json(raw, allow_inf_nan=False)
+            content = json.loads(
+                raw,
+                object_pairs_hook=_once,
+                parse_int=_finite,
+                parse_float=_finite,
+                parse_constant=_finite,
+            )
+        except RecursionError:
+            raise InputError(path, "is nested too deeply", remedy) from None
         except ValueError as error:
             raise InputError(path, f"is not JSON ({error})", remedy) from None
         version = cls.model_fields["schema_version"].default
@@ -166,7 +189,7 @@ class ResultFile(Part):
             what = "has no schema version" if of_file is None else f"has schema version {of_file}"
             raise InputError(path, f"{what}, and this tune reads version {version}", remedy)
         try:
-            return cls.model_validate(content)
+            return cls.model_validate_json(raw, strict=True)
         except ValidationError as error:
             wrong = config_error(error, path)
             raise InputError(path, wrong.what, wrong.remedy) from None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import JsonValue
 
-from tuner.core.disk import exists, file_name, whole_file
+from tuner.core.disk import check_links, exists, file_name, whole_file
 from tuner.core.errors import InputError
 from tuner.core.files import Part, ResultFile, read_arrays
 from tuner.core.numerics import Array
@@ -71,6 +71,7 @@ def read_contents(folder: str | Path) -> Contents:
     folder = Path(folder)
     if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "give the result folder of a run")
+    check_links(folder)
     run, about = None, About.read_if_any(folder)
     if about is None or (folder / RunResult.FILE).exists():
         run = read_run(folder)

@@ -17,6 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from tuner.core.disk import write_text
+from tuner.core.errors import InputError
 from tuner.design.proposals import proposals_in_words
 from tuner.report.contents import Contents, read_contents
 from tuner.report.outcome import (
@@ -106,16 +107,21 @@ def render(folder: str | Path, *, plots: bool = False) -> Path:
     Raises
     ------
     InputError
-        It is no result folder.
+        It is no result folder, or its files do not go together.
     """
     contents = read_contents(folder)
-    sections = sections_of(contents)
-    charts = [chart for section in sections for chart in section.charts]
-    figures = json.dumps(charts, default=vars, allow_nan=False)
+    path = contents.folder / REPORT_FILE
+    try:
+        sections = sections_of(contents)
+        charts = [chart for section in sections for chart in section.charts]
+        page = _page(contents, sections, json.dumps(charts, default=vars, allow_nan=False))
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        what = f"has files that do not go together ({type(error).__name__}: {error})"
+        remedy = "was one edited? run tune again; report this where none was"
+        raise InputError(contents.folder, what, remedy) from error
     if plots:
         write_plots(charts, contents.folder)
-    path = contents.folder / REPORT_FILE
-    write_text(path, _page(contents, sections, figures))
+    write_text(path, page)
     return path
 
 

@@ -121,9 +121,27 @@ def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
             evaluations=head["evaluations"],
             loop=Loop(**head["loop"]),
         )
+        if _form(progress) != _form(fresh) or progress.stage < 0:
+            raise ValueError("it holds other numbers than a search of this job")
         return progress, float(head["seconds"])
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(path, f"is no checkpoint ({error!r})", "leave --resume out") from None
+
+
+def _form(progress: Progress) -> tuple[object, ...]:
+    """Return shape, type and finiteness of the arrays of a search's state."""
+    scales, states = progress.scales, progress.states
+    finite = [
+        progress.points.coefficients,
+        progress.points.offsets,
+        *map(scales.get, sorted(scales)),
+    ]
+    finite.append(np.zeros(0) if states is None else states)
+    return (
+        sorted(scales),
+        [(a.shape, a.dtype, np.isfinite(a).all()) for a in map(np.asarray, finite)],
+        [(a.shape, a.dtype) for a in (progress.losses, progress.damping)],
+    )
 
 
 CHECKPOINT = "checkpoint.npz"

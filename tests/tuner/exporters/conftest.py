@@ -61,6 +61,7 @@ def make_run(tmp_path):
                 "verdict": "well_known",
                 "reason": {"code": "interval", "half_width": 0.02},
             } | (coefficients or {}).get(name, {})
+        best = with_values(best, {name: row["best"] for name, row in rows.items()})
         usual = {
             "circle": {"split": "fit", "rmse_best": rmse(0.001)},
             "held": {"split": "holdout", "rmse_best": rmse(0.002)},

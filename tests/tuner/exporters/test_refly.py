@@ -75,6 +75,9 @@ def test_the_command_exports_and_says_what_it_did(run, capsys, tmp_path):
 
 def test_the_command_refuses_in_one_line(run, capsys):
     write_vehicle(with_values(run.vehicle, {"mass": 9.0}), run.folder / "best_fit.yaml")
+    rows = run.result.coefficients
+    heavy = rows | {"mass": rows["mass"].model_copy(update={"best": 9.0})}
+    run.result.model_copy(update={"coefficients": heavy}).write(run.folder)
     assert main(["export", str(run.folder), "--format", "yaml"]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1

@@ -42,7 +42,14 @@ from tuner.uncertainty.verdict import (
     judge,
     judgement_in_words,
 )
-from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of, write_vehicle
+from tuner.vehicle import (
+    COEFFICIENTS,
+    VehicleFile,
+    read_vehicle,
+    values_of,
+    with_values,
+    write_vehicle,
+)
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 COMMAND = "tune --flights 'lab/*.bag' </script><b>"
@@ -55,7 +62,6 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
     """Write what a run would write whose flights do not determine one direction."""
     vehicle = read_vehicle(find_config("vehicles", "hovergames", Path()))
     write_vehicle(vehicle, folder / "best_fit.yaml", header="A test's.")
-    write_vehicle(vehicle, folder / "effective.yaml", header="A test's.")
     initial = {name: _errors(0.2) for name in FLIGHTS}
     best = {name: _errors(0.002) for name in FLIGHTS}
     simulations = {"initial": initial, "best": best}
@@ -83,7 +89,11 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
     ).write(folder)
     knowledge = _knowledge(vehicle, free, undetermined)
     knowledge.write(folder)
-    _result(vehicle, knowledge, initial, best).write(folder)
+    result = _result(vehicle, knowledge, initial, best)
+    assert result.effective is not None
+    in_gazebo = with_values(vehicle, result.effective.coefficients)
+    write_vehicle(in_gazebo, folder / "effective.yaml", header="A test's.")
+    result.write(folder)
 
 
 def _errors(size: float) -> FlightErrors:

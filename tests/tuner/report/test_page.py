@@ -151,6 +151,16 @@ def test_a_file_whose_parts_do_not_agree_is_named(tmp_path: Path) -> None:
         render(tmp_path)
 
 
+def test_numbers_that_make_no_figure_are_one_line(tmp_path: Path) -> None:
+    making.write_run(tmp_path, FREE, ROLLING)
+    knowledge = json.loads((tmp_path / "sensitivity.json").read_text())
+    for shares in next(iter(knowledge["coefficients"].values()))["shares"].values():
+        shares.update(dict.fromkeys(shares, 1e308))
+    (tmp_path / "sensitivity.json").write_text(json.dumps(knowledge))
+    with pytest.raises(InputError, match="has files that do not go together"):
+        render(tmp_path)
+
+
 @pytest.mark.parametrize("value", [float("nan"), None])
 def test_an_effect_over_time_that_is_no_number_or_lacks_is_named(tmp_path: Path, value) -> None:
     making.write_run(tmp_path, FREE, ROLLING)

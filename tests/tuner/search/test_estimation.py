@@ -10,10 +10,11 @@ import pytest
 from tests.tuner.uncertainty.making import fitted_of, problem, truth
 from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import Search
+from tuner.core.errors import InputError
 from tuner.findings.findings import Code, Finding, sentence
 from tuner.objective.space import space_of
 from tuner.search import estimation as module
-from tuner.search.estimation import fingerprint, polished, starting_vectors
+from tuner.search.estimation import fingerprint, load, polished, save, starting_vectors
 from tuner.search.findings import (
     outlying_flights,
     reference_voltage_findings,
@@ -21,7 +22,7 @@ from tuner.search.findings import (
     unmatched_findings,
 )
 from tuner.search.iteration import Outcome
-from tuner.search.progress import Free
+from tuner.search.progress import Free, initial_progress
 from tuner.search.stages import plan, remaining_seconds
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.vehicle import ControllerFile
@@ -146,6 +147,31 @@ def test_time_left_falls_to_nothing():
     assert remaining == sorted(remaining, reverse=True)
     assert remaining[-1] == 0.0
     assert np.isnan(remaining_seconds(stages, 0, 0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("coefficients", np.zeros((1, 7))),
+        ("coefficients", np.full((1, 3), np.nan)),
+        ("offsets", np.array([["x"]])),
+        ("scales", np.zeros((1, 1))),
+        ("losses", np.zeros(9)),
+        ("states", np.zeros(4)),
+        ("head", np.frombuffer(b"[" * 100_000, np.uint8)),
+    ],
+)
+def test_a_checkpoint_that_was_changed_is_not_gone_on_from(fitted, tmp_path, name, value):
+    path = tmp_path / "checkpoint.npz"
+    start = initial_progress(fitted.objective, fitted.point.coefficients[None])
+    save(path, "key", start, 2.0)
+    again, seconds = load(path, "key", start)
+    assert (again.points.coefficients == start.points.coefficients).all()
+    assert seconds == 2.0
+    with np.load(path) as arrays:
+        np.savez(path, **(dict(arrays) | {name: value}))
+    with pytest.raises(InputError, match=r"checkpoint\.npz: is no checkpoint"):
+        load(path, "key", start)
 
 
 def test_a_checkpoint_is_of_flights_that_are_read_alike(bag, tmp_path):

@@ -8,6 +8,7 @@ attempts there were, and what the steps came to.
 import fcntl
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -135,7 +136,9 @@ def fit(assignment):
     }
     (result / "result.json").write_text(json.dumps(content))
     vehicle = Path(__file__).parents[3] / "configs" / "vehicles" / "hovergames.yaml"
-    (result / "best_fit.yaml").write_text(vehicle.read_text())
+    text = re.sub("^mass: .*", f"mass: {mass}", vehicle.read_text(), flags=re.MULTILINE)
+    text = re.sub("motor_constant: .*", f"motor_constant: {best}", text)
+    (result / "best_fit.yaml").write_text(text)
     (result / "report.html").write_text("<!doctype html><title>report</title><p>fitted")
     (result / "plots").mkdir(exist_ok=True)
     (result / "plots" / "one.svg").write_text("<svg xmlns='http://www.w3.org/2000/svg'/>")
