@@ -8,10 +8,11 @@ from dataclasses import replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sqlalchemy import event
 
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
 from tuner.core.errors import InputError
-from tuner.service import app, tokens
+from tuner.service import app, jobs, tokens
 from tuner.service.app import is_loopback, serve
 from tuner.service.safety import COOKIE, RateLimit
 from tuner.service.service import Service
@@ -81,6 +82,25 @@ def test_text_of_a_job_is_escaped_on_every_page(client, table, updated):
         assert answer.status_code == 200
         assert "<img" not in answer.text
     assert "onerror=&#34;alert(1)&#34;" in client.get("/jobs").text
+
+
+def test_an_address_tells_the_terminal_of_the_log_nothing(client, monkeypatch, caplog):
+    monkeypatch.setattr(jobs, "cancel", lambda *_: 1 / 0)
+    assert client.post("/api/v1/jobs/a%1B[2J%E2%80%A8/cancel").status_code == 500
+    (record,) = [record for record in caplog.records if record.name == app.__name__]
+    assert record.getMessage().isprintable()
+
+
+def test_a_name_of_no_vehicle_is_not_looked_for(client, service):
+    asked = []
+    event.listen(
+        service.database._reader,
+        "before_cursor_execute",
+        lambda *given: asked.append(given[3]),
+    )
+    assert client.get("/jobs", params={"vehicle": "a\0b"}).status_code == 200
+    assert asked
+    assert not any("\0" in repr(parameters) or "\\x00" in repr(parameters) for parameters in asked)
 
 
 def test_pages_load_nothing_from_elsewhere(client):

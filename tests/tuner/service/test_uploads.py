@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 
 import httpx
 import pytest
+from sqlalchemy import inspect
 
 from tests.tuner.service.conftest import FLIGHTS, LIMITS, listening, submit, upload
 from tuner.config import Options
@@ -115,6 +116,12 @@ def test_a_recording_of_more_topics_than_pages_list_is_refused(monkeypatch, caps
     monkeypatch.setattr(sys, "argv", ["inspection", str(BAG), "1", "1", "1"])
     inspection.main()
     assert json.loads(capsys.readouterr().out)["refused"]["what"] == "holds too many topics to list"
+
+
+def test_lists_of_recordings_leave_their_inspections_where_they_are(client, service, table):
+    upload(client, table.read_bytes())
+    (row,) = recordings.latest(service.database, 5)
+    assert "inspection" in inspect(row).unloaded
 
 
 def test_a_recording_that_takes_too_long_is_stopped(tmp_path, monkeypatch):
