@@ -13,6 +13,7 @@ import yaml
 from tuner.core.disk import exists
 from tuner.core.errors import ConfigError
 from tuner.core.files import read_bytes
+from tuner.core.phrases import printable
 from tuner.core.validation import Place
 
 MAX_BYTES = 1_000_000
@@ -126,8 +127,8 @@ def document_of(raw: bytes, path: Path) -> Document:
 
 
 def commented(text: str) -> str:
-    """Return lines of text as comment lines."""
-    return "".join(f"# {line}".rstrip() + "\n" for line in text.splitlines())
+    """Return lines of text as comment lines, which a terminal or a parser may read."""
+    return "".join(f"# {printable(line)}".rstrip() + "\n" for line in text.splitlines())
 
 
 def dump_yaml(data: object) -> str:

@@ -226,10 +226,10 @@ def fly(
         raise InputError("--duration", what, "fly longer, or write samples at a higher --rate")
     check_names(grid or (), "grid")
     grid = {name: np.atleast_1d(column) for name, column in (grid or {}).items()}
-    shapes = {column.shape for column in grid.values()}
-    if len(shapes) > 1 or any(len(shape) != 1 or shape == (0,) for shape in shapes):
+    kinds = {(column.shape, column.dtype.kind in "iuf") for column in grid.values()}
+    if len(kinds) > 1 or any(len(shape) != 1 or 0 in shape or not real for shape, real in kinds):
         sizes = listed([f"{column.size} of {name}" for name, column in grid.items()])
-        raise InputError("grid", f"holds {sizes}", "give one value of each for every flight")
+        raise InputError("grid", f"holds {sizes}", "give one number of each for every flight")
     vehicle, controller = options.vehicle, options.controller
     if isinstance(vehicle, str):
         vehicle = read_vehicle(find_config("vehicles", vehicle, Path()))

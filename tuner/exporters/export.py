@@ -12,7 +12,7 @@ from pathlib import Path
 from pydantic import JsonValue
 
 from tuner.config.job import ExportSettings
-from tuner.core.disk import check_file, file_name, inside
+from tuner.core.disk import check_file, exists, file_name, inside
 from tuner.core.errors import ExportError, InputError
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse
 from tuner.exporters.draws import draws_of, write_draws
@@ -192,6 +192,8 @@ def export_vehicle(file: Path, options: ExportOptions, *, today: date) -> Export
     beside = file.with_name(f"{file.stem}{target.suffix}")
     if beside.name == file.name:
         beside = file.with_name(f"{file.stem}_exported{target.suffix}")
+    if options.out is None and options.into is None and exists(beside):
+        raise ExportError(beside, "is there already", "name the file to write with --out")
     places = _output_paths(draft, options.out or options.into or beside, options.into)
     gates = (*draft.gates, check_hover(simulator.flown(vehicle), draft.vehicle), *gates_not_run())
     require_gates(file, gates, options.accept, "correct the vehicle file or the model")

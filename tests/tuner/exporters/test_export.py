@@ -8,7 +8,7 @@ import pytest
 from tests.tuner.exporters.conftest import MODELS, as_the_run_says, rmse
 from tuner.config.job import ExportSettings
 from tuner.core import shipped
-from tuner.core.errors import ExportError, InputError
+from tuner.core.errors import ExportError, InputError, OutputError
 from tuner.exporters import export as exporting
 from tuner.exporters.effective import Effective
 from tuner.exporters.export import (
@@ -90,6 +90,27 @@ def test_a_model_is_patched_where_it_is_or_beside(make_run, tmp_path):
     assert model.read_text() == before
     assert exported(make_run(), "sdf", into=model).path == model
     assert model.read_text() == beside.read_text() != before
+
+
+def test_a_model_behind_a_link_keeps_its_link_and_its_rights(make_run, tmp_path):
+    model, link = tmp_path / "quad.sdf", tmp_path / "link.sdf"
+    shutil.copy(MODELS / "quad_x.sdf", model)
+    model.chmod(0o600)
+    link.symlink_to(model)
+    exported(make_run(), "sdf", into=link)
+    assert link.is_symlink()
+    assert "Coefficients by tune" in model.read_text()
+    assert model.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_model_that_may_not_be_written_is_left(make_run, tmp_path, monkeypatch):
+    model = tmp_path / "quad.sdf"
+    shutil.copy(MODELS / "quad_x.sdf", model)
+    before = model.read_text()
+    monkeypatch.setattr("os.access", lambda path, _: path != model)  # root may write anything
+    with pytest.raises(OutputError, match="may not write there"):
+        exported(make_run(), "sdf", into=model)
+    assert model.read_text() == before
 
 
 def test_into_goes_with_sdf_only(make_run, tmp_path):

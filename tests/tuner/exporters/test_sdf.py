@@ -1,5 +1,6 @@
 import difflib
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from tuner.exporters.sdf.spans import (
     parse,
     render,
     set_value,
+    without_comments,
     without_jinja,
 )
 from tuner.exporters.sdf.tags import carried_values, read_values
@@ -586,6 +588,18 @@ def test_edits_that_overlap_are_our_mistake():
 def test_what_is_not_xml_is_refused(text):
     with pytest.raises(ExportError, match="not well-formed"):
         parse(text, PATH)
+
+
+def test_elements_inside_each_other_without_end_are_refused():
+    with pytest.raises(ExportError, match="nested too deeply"):
+        parse("<a>" * 2000 + "</a>" * 2000, PATH)
+
+
+@pytest.mark.parametrize("begun", ["{{", "{%", "{#", "<!--"])
+def test_what_begins_again_and_again_and_never_ends_is_read_once(begun):
+    began = time.process_time()
+    without_comments(without_jinja(begun * 40_000))
+    assert time.process_time() - began < 1.0
 
 
 def test_document_types_are_refused():

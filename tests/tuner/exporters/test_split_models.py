@@ -129,7 +129,17 @@ def test_a_model_that_includes_itself_is_refused(vehicle, tmp_path):
     base = tmp_path / "base" / "model.sdf"
     loop = "<include merge='true'><uri>camera</uri></include></model>"
     base.write_text(base.read_text().replace("</model>", loop))
-    with pytest.raises(ExportError, match="is included in itself"):
+    with pytest.raises(ExportError, match="is included twice, or in itself"):
+        sdf_draft(path, vehicle, "by a test")
+
+
+def test_a_model_of_very_many_files_is_refused(vehicle, tmp_path):
+    for number in range(20):
+        path = tmp_path / f"m{number}" / "model.sdf"
+        path.parent.mkdir()
+        include = f"<include merge='true'><uri>m{number - 1}</uri></include>" if number else ""
+        path.write_text(f"<sdf><model name='m'>{include}</model></sdf>")
+    with pytest.raises(ExportError, match="is one of more than 16 files"):
         sdf_draft(path, vehicle, "by a test")
 
 

@@ -82,6 +82,15 @@ def test_a_vehicle_file_is_exported_without_a_run(kind, tmp_path):
     assert "the exported numbers fly as the run says" in not_run
     hover = next(gate for gate in done.gates if gate.name.startswith("thrust to weight"))
     assert hover.passed
+    with pytest.raises(ExportError, match="is there already"):
+        export_vehicle(tmp_path / "quad.yaml", ExportOptions(kind), today=TODAY)
+
+
+@EVERY
+def test_a_name_with_control_characters_leaves_the_file_readable(kind, vehicle, tmp_path):
+    file = tmp_path / "quad.yaml"
+    write_vehicle(vehicle.replace(name="a\x0bb\x7f"), file)
+    assert export_vehicle(file, ExportOptions(kind), today=TODAY).path.parent == tmp_path
 
 
 def test_a_vehicle_file_goes_into_a_model_that_fits_it(tmp_path, capsys):

@@ -19,7 +19,7 @@ from xml.parsers import expat
 from tuner.core.errors import ExportError
 
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+_COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)
 _TAG = re.compile(r"""(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _FILLER = "J"
 
@@ -115,7 +115,8 @@ def parse(text: str, path: Path, raw: str | None = None) -> Element:
     Raises
     ------
     ExportError
-        It is not well-formed, or declares a document type (entities are not expanded here).
+        It is not well-formed, is nested too deeply, or declares a document type (entities are not
+        expanded here).
     """
     # One byte per character, so that the parser's byte positions are positions in the text.
     plain = re.sub(r"[^\x00-\x7f]", "x", without_comments(text))
@@ -129,6 +130,8 @@ def parse(text: str, path: Path, raw: str | None = None) -> Element:
         element = Element(source, tag, attributes, place, _after_tag(plain, place))
         open_elements[-1].children.append(element)
         open_elements.append(element)
+        if len(open_elements) > MAX_DEPTH:
+            raise ExportError(path, "is nested too deeply", "give a model file")
 
     def end(_: str) -> None:
         element = open_elements.pop()
@@ -203,8 +206,8 @@ def apply_edits(text: str, edits: Iterable[Edit]) -> str:
     return "".join((*pieces, text[place:]))
 
 
-_EXPRESSION = re.compile(r"\{\{.*?\}\}", re.DOTALL)
-_STATEMENT = re.compile(r"\{%.*?%\}|\{#.*?#\}", re.DOTALL)
+_EXPRESSION = re.compile(r"\{\{.*?(?:\}\}|\Z)", re.DOTALL)
+_STATEMENT = re.compile(r"\{%.*?(?:%\}|\Z)|\{#.*?(?:#\}|\Z)", re.DOTALL)
 
 
 def without_jinja(text: str) -> str:
@@ -268,7 +271,10 @@ sys.stdout.buffer.write(text.encode())
 
 MERGED = "merged__"
 """Tag of an include that holds the included model; ``at`` is its pose, ``x y z roll pitch yaw``."""
-MAX_INCLUDE_DEPTH = 8
+MAX_FILES = 16
+"""Of one model."""
+MAX_DEPTH = 40
+"""Elements inside each other in one file."""
 _NAME = re.compile(r"(?:model://)?([A-Za-z0-9_][A-Za-z0-9._-]{0,99})/?")
 
 
@@ -276,7 +282,7 @@ def read_tree(
     path: Path,
     read: Callable[[Path], str],
     prepare: Callable[[str, Path], str],
-    above: tuple[Path, ...] = (),
+    others: list[Path] | None = None,
 ) -> Element:
     """Return the root of a model's file, with included models in their includes.
 
@@ -284,16 +290,21 @@ def read_tree(
     ----------
     prepare
         Text and path -> the XML to parse, with the same positions if it is to be edited.
-    above
-        Files that include this one.
+    others
+        Files of the model that were read before this one, to which it is added.
 
     Raises
     ------
     ExportError
-        A file cannot be read, holds no model, or includes itself.
+        A file cannot be read, holds no model, or is included twice, as in itself.
     """
-    if path in above or len(above) > MAX_INCLUDE_DEPTH:
-        raise ExportError(path, "is included in itself", "take the include out")
+    files = [] if others is None else others
+    if path in files:
+        raise ExportError(path, "is included twice, or in itself", "take the include out")
+    files.append(path)
+    if len(files) > MAX_FILES:
+        what = f"is one of more than {MAX_FILES} files of a model"
+        raise ExportError(path, what, "take includes out")
     raw = read(path)
     root = parse(prepare(raw, path), path, raw)
     if root.first("include") is None:
@@ -301,7 +312,7 @@ def read_tree(
     for include in model_in(root).children:
         file = _included_file(include)
         if file is not None:
-            model = model_in(read_tree(file, read, prepare, (*above, path)))
+            model = model_in(read_tree(file, read, prepare, files))
             include.attributes = {"at": _pose(include) or _pose(model) or "0 0 0 0 0 0"}
             include.tag, include.children = MERGED, [model]
     return root

@@ -12,6 +12,7 @@ import numpy as np
 
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
+from tuner.core.phrases import printable
 from tuner.exporters.external_simulator import flier_of
 from tuner.exporters.simulators import MUJOCO, drag_at_hover, full_thrust, rotor_speed, thrust_at
 from tuner.exporters.target import Draft, Target, differences, read_file, xml_comment
@@ -52,7 +53,7 @@ def mjcf(vehicle: VehicleFile, provenance: str) -> str:
     moments = " ".join(map(_number, (inertia.xx, inertia.yy, inertia.zz)))
     size = " ".join(_number(max(abs(r.position[axis]) for r in vehicle.rotors)) for axis in (0, 1))
     comment = xml_comment(provenance) + _USE
-    return f"""<mujoco model={quoteattr(vehicle.name)}>
+    return f"""<mujoco model={quoteattr(printable(vehicle.name))}>
   <!-- {comment.strip()} -->
   <compiler angle="radian" autolimits="true"/>
   <option timestep="0.0025" integrator="RK4" gravity="0 0 -9.81" density="0" viscosity="0"/>
