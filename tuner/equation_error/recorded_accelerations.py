@@ -14,7 +14,12 @@ from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
 from tuner.config.job import InletName
 from tuner.core.numerics import Array
-from tuner.objective.inlets import MAX_PERIODS, linear_interpolation, zero_order_hold
+from tuner.objective.inlets import (
+    MAX_PERIODS,
+    at_ticks,
+    linear_interpolation,
+    mean_of_hold,
+)
 from tuner.objective.rotor_response import MotorLags, linearised_speeds
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import local_parabolas, states_at
@@ -252,12 +257,16 @@ def directions(model: Model, slopes: Mapping[str, Array], count: int) -> Model:
 
 
 def _held(flight: Flight, recorded: Series, rate: float, every: int) -> Series:
-    """Return a flight's commands, one of ``every``, on the loop's clock or their own if faster."""
-    taken = Series(recorded.time[::every], recorded.values[::every])
-    read = zero_order_hold if taken.rate * MAX_PERIODS > rate else linear_interpolation
+    """Return a flight's commands, one of ``every``, on the loop's clock or their own if faster.
+
+    Each is the mean until the next.
+    """
+    taken, held_at = Series(recorded.time[::every], recorded.values[::every]), rate
     rate = max(rate, recorded.rate)
-    clock = np.arange(int(flight.duration * rate)) / rate
-    return Series(clock, read(taken, clock))
+    edges = np.arange(int(flight.duration * rate) + 1) / rate
+    if taken.rate * MAX_PERIODS > held_at:
+        return Series(edges[:-1], mean_of_hold(at_ticks(taken, held_at), edges))
+    return Series(edges[:-1], linear_interpolation(taken, edges[:-1] + 0.5 / rate))
 
 
 def rows_of(vector: Vec3) -> Array:

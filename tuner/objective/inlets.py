@@ -37,12 +37,39 @@ from tuner.vehicle.coefficient import LoopPart
 
 MAX_PERIODS = 1.5
 """Largest median gap, in periods of a loop, of an output that was recorded in full."""
+MIN_SHARE_SEEN = 0.95
+"""Least share of a loop's runs that a log sees, and of changes that agree with its period."""
+TICKS_S, MAX_PHASES = 0.25, 64
+"""s for which the clocks of a log and a loop keep their phase, and the phases that are tried."""
 
 
 def is_sparse(flights: Sequence[Flight], signal: str, update_rate: float) -> bool:
     """Return whether a signal was recorded less often than it was computed, at a rate in Hz."""
     gaps = np.concatenate([np.diff(flight.series[signal].time) for flight in flights])
     return bool(np.median(gaps) * update_rate > MAX_PERIODS)
+
+
+def at_ticks(series: Series, update_rate: float) -> Series:
+    """Return a held signal (n, k), computed at a rate in Hz, with its changes when the loop ran.
+
+    A log on another clock sees a change up to a sample late, which is noise in what is fed in. The
+    loop ran between two samples, and once a period: that tells when. In step, it ran at the sample.
+    A log that does not see every run, or contradicts the period, keeps its stamps.
+    """
+    period, time = 1.0 / update_rate, series.time
+    if len(time) < 2 or series.rate < MIN_SHARE_SEEN * update_rate:
+        return series
+    rows = np.append(0, 1 + np.flatnonzero(np.any(np.diff(series.values, axis=0) != 0.0, axis=1)))
+    ticks, gaps = time[rows], np.diff(time, prepend=time[0] - period)[rows]
+    for part in np.array_split(np.arange(len(rows)), 1 + int((time[-1] - time[0]) / TICKS_S)):
+        phases = np.unique(np.round(ticks[part] % period, 7))
+        phases = phases[:: 1 + len(phases) // MAX_PHASES]
+        ages = np.maximum((ticks[part] - phases[:, None] + 1e-7) % period - 1e-7, 0.0)
+        seen = ages < gaps[part] - 1e-7
+        best = int(np.argmax(seen.mean(axis=1))) if len(part) else 0
+        if len(part) and seen[best].mean() > MIN_SHARE_SEEN:
+            ticks[part] -= np.where(seen[best], ages[best], 0.0)
+    return Series(ticks, series.values[rows])
 
 
 def zero_order_hold(series: Series, clock: Array) -> Array:
@@ -203,15 +230,15 @@ class RecordedInlet(ABC):
         longest = max(flight.duration for flight in flights)
         steps = int(np.ceil(longest * schedule.physics_rate)) + 2
         clock, rate = np.arange(steps) / schedule.physics_rate, self.update_rate(schedule)
+        recorded = [with_gaps_filled(flight.series[signal]) for flight in flights]
         if rate is None or is_sparse(flights, signal, rate):
-            read, clock = linear_interpolation, clock + mean * 0.5 * schedule.step
-        elif mean:
-            read, clock = mean_of_hold, np.append(clock, steps / schedule.physics_rate)
+            clock = clock + mean * 0.5 * schedule.step
+            tables = [linear_interpolation(series, clock) for series in recorded]
         else:
-            read = zero_order_hold
-        table = np.stack(
-            [read(with_gaps_filled(flight.series[signal]), clock) for flight in flights], axis=-1
-        )
+            read = mean_of_hold if mean else zero_order_hold
+            clock = np.append(clock, steps / schedule.physics_rate) if mean else clock
+            tables = [read(at_ticks(series, rate), clock) for series in recorded]
+        table = np.stack(tables, axis=-1)
         return [np.asarray(table[:, column]) for column in range(table.shape[1])]
 
 

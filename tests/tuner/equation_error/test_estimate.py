@@ -404,6 +404,19 @@ def test_rotor_speeds_that_are_stamped_late_are_taken_on_time(flown):
         assert taken.rotor_speed[np.argmin(np.abs(taken.time - time))] == pytest.approx(row)
 
 
+@pytest.mark.parametrize(("rate", "held_for"), [(160.0, 0.0), (500.0, 0.5 / 400.0)])
+def test_commands_act_on_time_at_any_rate_of_their_log(flown, rate, held_for):
+    """A ramp of a 400 Hz loop: a log that sees every run tells when each began."""
+    flight, model = flown[2][0].flight, job_of(flown[1], flown[2]).objective.model
+    time = np.arange(0.0, flight.duration, 1.0 / rate)
+    sent = np.floor(400.0 * time + 1e-6) / 400.0 if held_for else time
+    ramp = {**flight.series, "command": Series(time, np.tile(0.01 * sent[:, None], 4))}
+    _, ((commands,), _) = read_commands(model, [(replace(flight, series=ramp), 0.0)], 400.0)
+    step = commands.time[1] - commands.time[0]
+    late = commands.time + 0.5 * step - 100.0 * commands.values[:, 0]
+    assert np.mean(late[400:800]) == pytest.approx(held_for, abs=1e-5)
+
+
 def test_steps_in_a_gap_of_the_commands_are_unknown(flown):
     flight = flown[2][0].flight
     part, clock = steps_of(flight), np.arange(0.0, flight.duration, 0.01)

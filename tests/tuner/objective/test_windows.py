@@ -9,7 +9,13 @@ from sim_jax.inlet import ActuatorInlet
 from sim_jax.schedule import Schedule
 from tuner.core.errors import RecordingError
 from tuner.objective.initial_conditions import ROWS
-from tuner.objective.inlets import INLETS, linear_interpolation, mean_of_hold, zero_order_hold
+from tuner.objective.inlets import (
+    INLETS,
+    at_ticks,
+    linear_interpolation,
+    mean_of_hold,
+    zero_order_hold,
+)
 from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.windows import windows_of
 from tuner.recordings.flight import Series
@@ -98,6 +104,23 @@ def test_commands_act_on_time_at_any_rate_of_their_log(flight, rate):
     held_for = 0.0 if rate < 0.5 * schedule.rate_control_rate else 0.5 / rate
     late = middle - np.asarray(inlet.command[0])[800:1600, 0]
     assert np.mean(late) == pytest.approx(held_for, abs=1e-6)
+
+
+@pytest.mark.parametrize("rate", [437.3, 601.0])
+def test_a_log_on_another_clock_tells_when_the_loop_ran(rate):
+    ran = Series(np.arange(1250) / 250.0, np.random.default_rng(0).normal(size=(1250, 4)))
+    clock, edges = np.arange(0.0012, 4.9, 1.0 / rate), np.arange(100, 4800) / 1000.0
+    logged = Series(clock, zero_order_hold(ran, clock))
+    error, left = (
+        np.std(mean_of_hold(series, edges) - mean_of_hold(ran, edges))
+        for series in (logged, at_ticks(logged, 250.0))
+    )
+    assert left < 0.3 * error
+    in_step = at_ticks(Series(ran.time, np.repeat(ran.values[::2], 2, axis=0)), 125.0)
+    np.testing.assert_allclose(in_step.time, ran.time[::2], atol=1e-9)
+    assert at_ticks(logged, 1.1 * rate) is logged  # it does not see every run
+    of_another = at_ticks(logged, 237.0)
+    assert np.isin(of_another.time, clock).mean() > 0.9
 
 
 def test_the_actuator_inlet_holds_recorded_commands(flight):
