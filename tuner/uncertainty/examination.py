@@ -130,8 +130,14 @@ def examine(
             len(full_problem.fitted),
         )
     gains = {} if model_errors is None else model_errors.gains
-    if selection_shifts or gains:
-        moves = np.array([selection_shifts.get(name, 0.0) for name in objective.space.names])
+    shapes = sampling_shifts(objective, point)
+    if selection_shifts or gains or shapes:
+        moves = np.array(
+            [
+                np.hypot(selection_shifts.get(name, 0.0), shapes.get(name, 0.0))
+                for name in objective.space.names
+            ]
+        )
         apart = np.array([gains.get(name, 0.0) for name in objective.space.names]) * reference
         information = replace(information, selection_shifts=np.hypot(moves, apart))
     searched = set(full_problem.fitted) - set(fitted.held.values())
@@ -155,6 +161,25 @@ def examine(
         information=information,
         model_errors=model_errors,
     )
+
+
+def sampling_shifts(objective: Objective, point: Point) -> dict[str, float]:
+    """Return by how much the shape of the tachometers' filter may be off, scaled; empty without it.
+
+    A filter that a logger computes sample by sample does not see what is between its samples. Its
+    time constant is known to half a sampling period, and the standard error of a value between two
+    limits is their half-width over √3.
+    """
+    numbers, speeds = (
+        objective.space.numbers(point.coefficients),
+        objective.segments.measured.get("rotor_speed"),
+    )
+    if speeds is None or "tachometer_memory" not in numbers:
+        return {}
+    constant = float(numbers["tachometer_memory"] * numbers["tachometer_lag"])
+    periods = np.diff(np.asarray(speeds.time), axis=0)
+    half = 0.5 * float(np.median(periods[periods > 0.0])) / np.sqrt(3.0)
+    return {"tachometer_memory": half / constant} if constant > 0.0 else {}
 
 
 def _bias(full_problem: FullProblem, information: FisherInformation, reference: Array) -> Array:

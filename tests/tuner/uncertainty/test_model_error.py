@@ -30,6 +30,7 @@ from tuner.objective.simulation import SETPOINTS
 from tuner.objective.space import space_of
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.search.progress import Fitted
+from tuner.terms.candidates import with_terms
 from tuner.uncertainty.examination import examine
 from tuner.uncertainty.model_error import (
     ModelErrors,
@@ -236,6 +237,20 @@ def test_commands_stand_in_for_tachometers():
         for flight in flights
     ]
     assert model_errors_of(fitted, blind) is None
+
+
+def test_the_shape_of_a_tachometers_filter_is_known_to_half_a_sampling_period():
+    names = ("tachometer_lag", "tachometer_memory")
+    objective = problem({"tachometer_lag": 0.008})
+    measured, flights = flown(objective, 0)
+    objective = replace(objective, segments=replace(objective.segments, measured=measured))
+    objective, point = with_terms(objective, making.truth(objective), names, JobFile())
+    numbers = objective.space.numbers(point.coefficients) | {"tachometer_lag": 0.008}
+    point = Point(objective.space.vector_of(numbers), point.offsets)
+    known = examine(fitted_at(objective, point, flights)).uncertainty.estimates
+    half = 0.5 / RATE / 0.008 / np.sqrt(3.0)
+    assert known["tachometer_memory"].parts.terms == pytest.approx(half, rel=1e-6)
+    assert not known["inertia_xx"].parts.terms
 
 
 def test_rotors_of_unrecorded_speed_are_known_as_well_as_their_limit():
