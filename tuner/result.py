@@ -27,6 +27,8 @@ from tuner.vehicle.selection_table import SelectionRow
 
 EXPORTS = "export"
 """Folder of a result folder, for its exports."""
+EFFECTIVE, PLOTS = "effective", "plots"
+"""Folders of a result folder: vehicles for other simulators, and figures."""
 BEST_FIT_FILE = "best_fit.yaml"
 EFFECTIVE_FILE = "effective.yaml"
 CHECKPOINTS = "checkpoint*.npz"
@@ -42,6 +44,8 @@ OF_A_RUN = (
     ),
 )  # fmt: skip
 """Files of a result folder beside checkpoints: those that one run or another writes there."""
+IN_FOLDER = (*OF_A_RUN, EXPORTS, EFFECTIVE, PLOTS)
+"""Files and folders of a result folder."""
 REMEDY = "give the result folder of a finished run, made by this version of tune (or run it again)"
 
 
@@ -353,7 +357,7 @@ def place_for(out: Path | None, *, resume: bool = False) -> Path:
         As of `folder_for` and `check_links`, or a file that no run wrote there would be replaced.
     """
     folder = folder_for(out, resume=resume)
-    check_links(folder)
+    check_links(folder, IN_FOLDER)
     theirs = [name for name in (*OF_A_RUN, EXPORTS) if exists(folder / name)]
     if theirs and not _is_of_a_run(folder):
         what = f"holds a {theirs[0]} that is of no run and would be replaced"
@@ -401,7 +405,7 @@ def read_run(folder: str | Path) -> Run:
     folder = Path(folder)
     if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "give the result folder of a run")
-    check_links(folder)
+    check_links(folder, IN_FOLDER)
     result = RunResult.read(folder, REMEDY)
     effective = result.effective
     for name in (*result.coefficients, *(effective.coefficients if effective else ())):

@@ -59,8 +59,8 @@ def inside(folder: Path, name: str) -> Path:
     raise OutputError(repr(name), f"leads out of {folder}", "name a file inside it")
 
 
-def check_links(folder: Path) -> None:
-    """Refuse a folder that may be of others if a symbolic link in it leads out of it.
+def check_links(folder: Path, names: Iterable[str]) -> None:
+    """Refuse a folder of others if a symbolic link among some files and folders leads out of it.
 
     Raises
     ------
@@ -68,12 +68,16 @@ def check_links(folder: Path) -> None:
         One does: what is read or written there would lie elsewhere.
     """
     whole = folder.resolve()
-    for place, *names in os.walk(folder):
-        for name in (name for kind in names for name in kind):
-            path = Path(place, name)
-            if path.is_symlink() and not path.resolve().is_relative_to(whole):
-                what = f"is a link that leads out of {folder}"
-                raise InputError(path, what, "put what it leads to in its place, or remove it")
+    for path in (path for name in names for path in _with_all_in(folder / name)):
+        if path.is_symlink() and not path.resolve().is_relative_to(whole):
+            what = f"is a link that leads out of {folder}"
+            raise InputError(path, what, "put what it leads to in its place, or remove it")
+
+
+def _with_all_in(path: Path) -> Iterator[Path]:
+    yield path  # before the walk, which would follow a link
+    for place, *kinds in os.walk(path):
+        yield from (Path(place, name) for names in kinds for name in names)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -29,7 +29,7 @@ from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.records import AxesRmse
 from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
 from tuner.objective.criterion import Point, units_of
-from tuner.result import EffectiveResult, LostTerm, PoseRmse, Run, RunResult
+from tuner.result import EFFECTIVE, EffectiveResult, LostTerm, PoseRmse, Run, RunResult
 from tuner.search.continuation import run_stages
 from tuner.search.estimation import stages_of
 from tuner.search.job_flights import (
@@ -61,8 +61,6 @@ MIN_TOLERANCE = 1e-4
 quarter off: a model without a term has a long valley, in which each step gains half of that."""
 OTHER_LAWS = "other laws"
 """The group of differences that have no coefficient."""
-FOLDER = "effective"
-"""The result folder's folder of effective vehicles."""
 
 RunInputs = tuple[Settings, Sequence[Recording]]
 """A run's settings, with the fitted controller, and its recordings. Clocks and conditions of each
@@ -424,10 +422,10 @@ def cached_effective(run: Run, simulator: Simulator) -> Effective | None:
     OutputError
         It cannot be cached.
     """
-    vehicle_file = run.folder / FOLDER / f"{simulator.name}.yaml"
+    vehicle_file = run.folder / EFFECTIVE / f"{simulator.name}.yaml"
 
     class Kept(EffectiveFile):
-        FILE = f"{FOLDER}/{simulator.name}.json"
+        FILE = f"{EFFECTIVE}/{simulator.name}.json"
 
     known = f"{values_of(run.vehicle)} {run.result.settings.get('job')} {installed()}"
     key = hashlib.sha256(known.encode()).hexdigest()

@@ -18,7 +18,7 @@ from tuner.design.proposals import Proposals
 from tuner.evaluate.records import Table
 from tuner.findings.findings import Finding
 from tuner.ground.bench_json import BenchRecord
-from tuner.result import ExportRecord, ExportRecords, Run, RunResult, read_run
+from tuner.result import IN_FOLDER, ExportRecord, ExportRecords, Run, RunResult, read_run
 from tuner.search.iteration import Iteration, Outcome
 from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles
 
@@ -71,7 +71,7 @@ def read_contents(folder: str | Path) -> Contents:
     folder = Path(folder)
     if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "give the result folder of a run")
-    check_links(folder)
+    check_links(folder, IN_FOLDER)
     run, about = None, About.read_if_any(folder)
     if about is None or (folder / RunResult.FILE).exists():
         run = read_run(folder)

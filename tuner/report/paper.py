@@ -26,6 +26,7 @@ from tuner.report.chart import (
     Panel,
     rounded,
 )
+from tuner.result import PLOTS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,7 +84,6 @@ def comparison_figure(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Chart:
     return Chart("comparison", title, panels, x_title="time [s]", height=120 + 160 * len(panels))
 
 
-PLOTS = "plots"
 SUFFIXES = (".png", ".svg", ".pdf")
 """Of files with a figure."""
 WIDTH = 6.3
