@@ -168,7 +168,8 @@ class MotorOrder:
     rotors
         For each recorded column the number, from 0, of the rotor that it drives.
     reversed_spins
-        Whether all rotors spin against the vehicle file; None where yaw does not show it.
+        Whether all rotors spin against the vehicle file; None where yaw does not show it. Both
+        halves of a recording have to say so: rotors fall behind where a spin in yaw begins.
     """
 
     rotors: tuple[int, ...]
@@ -226,8 +227,14 @@ def motor_order(
         or correlation_of[second] > correlation_of[best] - MIN_LEAD
     ):
         return None
-    yaw = max((axes[2] for axes in alike(best)), key=abs)
-    return MotorOrder(best, bool(yaw < 0.0) if abs(yaw) > MIN_CORRELATION else None)
+    torques, count = [x @ arms[list(best)] for x in lagged], len(turning)
+    parts = (slice(None), slice(0, count // 2), slice(count // 2, count))
+    yaws = [
+        max((_correlations(turning[part], x[part])[2] for x in torques), key=abs) for part in parts
+    ]
+    if max(yaws) < -MIN_CORRELATION:
+        return MotorOrder(best, reversed_spins=True)
+    return MotorOrder(best, False if yaws[0] > MIN_CORRELATION else None)
 
 
 def lateness(

@@ -145,6 +145,22 @@ def test_the_order_is_seen_where_a_recording_begins_and_ends_during_a_turn(broad
         assert order.is_right
 
 
+def test_spins_are_reversed_where_both_halves_of_a_recording_say_so(broadband, updated):
+    rate, span = broadband.series["body_rate"], (0.0, broadband.duration)
+    early = rate.time < 0.5 * broadband.duration
+
+    def is_reversed(factor):
+        yaw = np.stack([np.ones(len(early)), np.ones(len(early)), factor], axis=1)
+        series = {**broadband.series, "body_rate": Series(rate.time, rate.values * yaw)}
+        order = motor_order(series, updated, "rotor_speed", span)
+        assert order is not None
+        return bool(order.reversed_spins)
+
+    assert is_reversed(np.full(len(early), -1.0))
+    assert not is_reversed(np.where(early, -9.0, 1.0))
+    assert not is_reversed(np.where(early, 1.0, -9.0))
+
+
 def test_rotors_that_change_speed_alike_show_no_order(broadband, updated):
     speed = broadband.series["rotor_speed"]
     alike = Series(speed.time, np.repeat(speed.values[:, :1], 4, axis=1))
