@@ -20,7 +20,7 @@ from sim_jax.environment import Air
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
-from sim_jax.sensing import GyroFilter, GyroMemory, filter_gyro, look_back
+from sim_jax.sensing import MAX_CUTOFF, GyroFilter, GyroMemory, filter_gyro, look_back
 from sim_jax.terms.total import total_wrench
 from sim_jax.trajectory import Circle, publish
 from sim_jax.vehicle import PerRotor, Rotor, Vehicle
@@ -308,6 +308,15 @@ def test_gyro_filters() -> None:
     cutoffs = jnp.asarray(40.0), jnp.asarray(20.0)
     assert_derivatives(run, *cutoffs, STILL, STILL, tolerance=1e-5)
     assert_derivatives(run, *cutoffs, vec(0.5, -1, 2), vec(0.6, -0.8, 2), tolerance=1e-5)
+
+
+def test_a_gyro_filter_stays_below_half_of_its_rate() -> None:
+    highest, beyond = (
+        GyroFilter.at(Filters(jnp.asarray(cutoff), None), 400.0)
+        for cutoff in (400.0 * MAX_CUTOFF, 600.0)
+    )
+    assert (beyond.b0, beyond.a1, beyond.a2) == (highest.b0, highest.a1, highest.a2)
+    assert abs(float(jnp.asarray(beyond.a2))) < 1.0
 
 
 def test_delay_line_between_and_at_whole_steps() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
+from sim_jax.sensing import MAX_CUTOFF
 from tuner.config import JobFile
 from tuner.config.job import CoefficientSettings
 from tuner.core.errors import ConfigError
@@ -24,8 +25,6 @@ MIN_SLOPE = 1e-150
 START_MARGIN = 0.05
 """A start on a bound is moved inside by this share of the range."""
 CUTOFF = "gyro_cutoff"
-MAX_CUTOFF_SHARE = 0.99
-"""Largest cut-off of a gyro filter, as a share of the rate loop's Nyquist frequency."""
 
 
 class Space:
@@ -221,7 +220,7 @@ def _with_filter_bounded(
     _, upper = COEFFICIENTS[CUTOFF].limits(values[CUTOFF])
     if given.upper is not None or upper < half:
         return job
-    changed = given.replace(upper=MAX_CUTOFF_SHARE * half)
+    changed = given.replace(upper=MAX_CUTOFF * controller.rate.rate)
     return job.replace(coefficients={**job.coefficients, CUTOFF: changed})
 
 
