@@ -12,6 +12,7 @@ from __future__ import annotations
 import gc
 import logging
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -57,6 +58,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_collection_finish() -> None:
     """Have no search for garbage look through all that the tests have imported."""
     gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def short_proposals() -> Iterator[None]:
+    """Have jobs propose flights of eight seconds and more: those of most tests take six."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tuner.job.results.SHORTEST", 8.0)
+        yield
 
 
 @pytest.fixture
