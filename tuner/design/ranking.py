@@ -51,6 +51,8 @@ MIN_RADIUS_M = 0.5
 """A smaller shape is not proposed."""
 MAX_ACCELERATION = 9.0
 """m/s². A reference with more, some 45° of tilt, is not proposed."""
+LANES = 8
+"""Candidates simulated at a time, or as many as there are recorded flights."""
 MAX_SAMPLE_RATE_HZ = 100.0
 """Candidates are compared at this rate; their weights represent more samples."""
 
@@ -235,10 +237,10 @@ def rank_next_flights(
         Of the fit, with the weights of the recorded residuals.
     """
     full_problem, found = examination.full_problem, candidates(arena)
-    flights, at_once = [*found.values()], full_problem.objective.segments.count
+    flights, at_once = [*found.values()], max(full_problem.objective.segments.count, LANES)
     kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
     gains, flown = [], []
-    for first in range(0, len(flights), at_once):  # the memory of so many is had
+    for first in range(0, len(flights), at_once):
         some = flights[first : first + at_once]
         objective = candidate_problem(full_problem.objective, some, seconds=seconds)
         point = objective.start(full_problem.point.coefficients)

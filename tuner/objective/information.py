@@ -373,8 +373,10 @@ def information_at(
         time = np.asarray(objective.segments.measured[channel].time)
         for segment, scale in enumerate(scales[number]):
             error = residuals[..., segment] / scale
-            changes = [o[channel][..., segment] / scale - error for o in alternatives.values()]
-            rows = np.stack([*(columns[..., segment] / scale), *changes], axis=-1)
+            rows = np.empty((*error.shape, every))
+            np.divide(np.moveaxis(columns[..., segment], 0, -1), scale, out=rows[..., :size])
+            for place, changed in enumerate(alternatives.values(), size):
+                rows[..., place] = changed[channel][..., segment] / scale - error
             robust = huber_weights(error, criterion.huber)
             stretch = np.minimum((time[:, segment] / BLOCK_S).astype(int), blocks - 1)
             for index in range(blocks):
