@@ -24,6 +24,7 @@ from tuner.core.numerics import Array as Numbers
 from tuner.core.numerics import robust_sd
 from tuner.objective.battery import log_voltage_of
 from tuner.objective.initial_conditions import (
+    SPIN_ROWS,
     is_at_rest,
     recent_command,
     start_of,
@@ -186,9 +187,9 @@ class Segments(eqx.Module):
     disturbance: Disturbance | None = None
     """Known forces and moments of disturbances."""
     start_sd: Float[Array, "L F"] | None = None
-    """Prior standard deviations of the free rows of a start; None if none is free."""
+    """Prior standard deviations of rows of a start; None where starts are as recorded."""
     free_rows: tuple[int, ...] = eqx.field(static=True, default=())
-    """The L free rows of a start (`tuner.objective.initial_conditions`)."""
+    """The L rows of a start (`tuner.objective.initial_conditions`) that may be free."""
 
     @property
     def windowed(self) -> bool:
@@ -258,7 +259,7 @@ def segments_of(
         resting=np.asarray([is_at_rest(flight.initial) for flight in flights]),
         log_voltage=log_voltage_of(flights, [Window(flight, 0.0) for flight in flights], schedule),
         start_sd=np.stack(list(start_sd.values())) if start_sd else None,
-        free_rows=tuple(start_sd),
+        free_rows=SPIN_ROWS,
     )
 
 
@@ -345,11 +346,8 @@ def window_segments(
     cut = [piece.flight for piece in pieces]
     start = start_of([flight.initial for flight in cut], resting=False)
     recorded = [INLETS[inlets[piece.number]] for piece in pieces]
-    start_sd, free_rows = None, np.arange(0)
-    if free_starts:
-        of_all = np.stack([start_sd_of(inlet.ignores) for inlet in recorded], axis=-1)
-        free_rows = np.flatnonzero(of_all.any(axis=1))
-        start_sd = np.asarray(of_all[free_rows])
+    of_all = np.stack([start_sd_of(inlet.ignores) for inlet in recorded], axis=-1)
+    free_rows = np.flatnonzero(of_all.any(axis=1))
     compared = {
         channel: sigma
         for channel, sigma in noise.items()
@@ -372,7 +370,7 @@ def window_segments(
             [piece.window for piece in pieces],
             schedule,
         ),
-        start_sd=start_sd,
+        start_sd=of_all[free_rows] if free_starts else None,
         free_rows=tuple(free_rows.tolist()),
     )
 

@@ -24,7 +24,7 @@ from lanes import Argument, program_of
 from sim_jax.environment import Air, Environment
 from sim_jax.frames import gyro_of, markers_of
 from sim_jax.geometry import Vec3
-from sim_jax.inlet import Inlet, ReferenceInlet
+from sim_jax.inlet import Inlet
 from sim_jax.numeric import Array as JaxArray
 from sim_jax.plant import Sample
 from sim_jax.rigid_body import Motion
@@ -39,7 +39,6 @@ from tuner.core.numerics import Array
 from tuner.objective.battery import relative_log_voltage
 from tuner.objective.initial_conditions import (
     ROWS,
-    SPIN_ROWS,
     trimmed,
     with_all_rows,
     with_change,
@@ -137,12 +136,12 @@ def fly(
     logged = tuple(sorted(names if moves else {*LOGGED, *names}))
     coefficients = {**coefficients_in(model), **coefficients}
     own = not moves or any(np.ndim(value) for value in coefficients.values())
-    if segments.start_sd is None and isinstance(segments.inlet, ReferenceInlet):
-        # as flights with a spin have it: one program serves both
-        nothing = np.zeros((len(SPIN_ROWS), segments.count))
-        segments = replace(segments, start_sd=nothing, free_rows=SPIN_ROWS)
+    none = np.zeros((len(segments.free_rows), segments.count))
+    if segments.start_sd is None and segments.free_rows:
+        # as if they were free: one program serves both
+        segments = replace(segments, start_sd=none)
     if segments.start_sd is not None and states is None:
-        states = np.zeros((len(segments.free_rows), segments.count))
+        states = none
     given = _Given(
         model=model,
         coefficients={name: np.asarray(value, float) for name, value in coefficients.items()},

@@ -13,7 +13,8 @@ from lanes.program import _program_of
 from sim_jax.terms import total
 from tests.tuner.recorded import recordings_of
 from tests.tuner.uncertainty.making import criterion_of, problem
-from tuner.config import Options, resolve_settings
+from tuner.config import JobFile, Options, resolve_settings
+from tuner.config.job import Search
 from tuner.objective import simulation
 from tuner.recordings.flight import Series
 from tuner.search.problem import job_of
@@ -57,6 +58,18 @@ def test_a_flight_of_another_length_is_the_same_program(flight, updated):
     assert whole.samples != part.samples
     built(whole)
     assert built(part) == 0
+
+
+def test_windows_from_recorded_and_from_free_starts_are_the_same_program(full_flight, updated):
+    settings = resolve_settings(Options(flights=(str(full_flight.path),), vehicle=updated))
+    windows = JobFile(free=("motor_constant",), inlet="actuator", search=Search(window=0.5))
+    settings = replace(settings, job=windows)
+    recorded = job_of(settings, recordings_of(settings, [full_flight])).objective
+    assert recorded.segments.start_sd is None
+    sd = np.ones((len(recorded.segments.free_rows), recorded.segments.count))
+    free = replace(recorded, segments=replace(recorded.segments, start_sd=sd))
+    built(recorded)
+    assert built(free) == 0
 
 
 def test_programs_of_flights_are_kept_for_other_processes():

@@ -21,6 +21,7 @@ from sim_jax.state import AIRBORNE, hover
 from tuner.config import JobFile
 from tuner.core.shipped import find_config
 from tuner.objective.criterion import Criterion, Point
+from tuner.objective.initial_conditions import SPIN_ROWS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.space import space_of
@@ -76,7 +77,7 @@ def problem(
         lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (2,)),
         hover(model.vehicle, resting_parameters),
     )
-    segments = Segments(references(), start, _sensors(), jnp.arange(2))
+    segments = Segments(references(), start, _sensors(), jnp.arange(2), free_rows=SPIN_ROWS)
     objective = Objective(model, segments, space, schedule, samples, AIRBORNE)
     exact = with_data(objective, truth(objective))
     if seed is None:
