@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,25 @@ def test_mcap_without_chunks_and_summary(tmp_path: Path, short: Path, circle: Fl
     with Reader(short) as reader:
         count = reader.message_count
     assert (damage.cause, damage.salvaged, damage.bytes_lost) == (Cause.END_MISSING, count, 0)
+    end = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 0, 0) + content[:8]
+    path.write_bytes(b"".join(parts) + end)  # closed, which is all that a writer must do
+    assert not load_flight(path).damage
+
+
+def test_mcap_without_indexes(tmp_path: Path, short: Path, circle: Flight) -> None:
+    folder = making.to_ros2(short, tmp_path / "circle", StoragePlugin.MCAP)
+    (whole,) = folder.glob("*.mcap")
+    content = whole.read_bytes()
+    kept = [
+        content[8:-8][begin - 9 : end]
+        for op, begin, end in records(content[8:-8], 0)
+        if op not in (0x07, 0x08)
+    ]
+    path = tmp_path / "bare.mcap"
+    path.write_bytes(content[:8] + b"".join(kept) + content[:8])
+    got = load_flight(path)
+    assert_same(got, circle)
+    assert not got.damage
 
 
 @pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])

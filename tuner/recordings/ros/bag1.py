@@ -1,4 +1,4 @@
-"""The ROS 1 bag container: read by its index, or from the front without one.
+"""The ROS 1 bag container.
 
 rosbags raises on a bag without its end or its index; here 14,002 of 28,007 messages of the shipped
 circle bag cut in half are salvaged, and all of one that was never closed. rosbags unpacks any size
@@ -12,10 +12,8 @@ from __future__ import annotations
 import contextlib
 import re
 import struct
-from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +26,10 @@ from tuner.recordings.recording import NS_PER_SECOND
 from tuner.recordings.ros.container import (
     Chunk,
     ChunkedFile,
+    ChunkIndex,
     Connection,
     Content,
     DamagedError,
-    Entries,
     FileBytes,
     Record,
     RecordContent,
@@ -39,7 +37,7 @@ from tuner.recordings.ros.container import (
 )
 from tuner.recordings.ros.messages import Block, Bytes, Index
 
-MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+MESSAGE, INDEX, CHUNK, CONNECTION = 2, 4, 5, 7
 
 #: Record headers are some dozens of bytes; a connection's data hold its definition.
 MAX_HEADER_BYTES = 1 << 16
@@ -50,6 +48,7 @@ MAX_RECORD_BYTES = 1 << 24
 class Bag1(ChunkedFile):
     """A ROS 1 bag; the position of a chunk is that of its data."""
 
+    ENTRY_BYTES = 12
     aligned: bool = False
 
     def __post_init__(self) -> None:
@@ -59,44 +58,9 @@ class Bag1(ChunkedFile):
                 reason = "is empty" if not magic else "is no ROS 1 bag of version 2.0"
                 raise RecordingError(self.path, reason, "give the recording itself")
             data = FileBytes(stream)
-            try:
-                self._read_index(data, len(magic))
-            except DamagedError as err:
-                self._walk(data, len(magic), err.cause)
+            self._read(data, len(magic), len(data), _known_damage(data, len(magic)))
         if not self.connections:
             raise RecordingError(self.path, "holds no messages", "record it again")
-
-    def _count_lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int:
-        return sum(chunk.held.get(number, 0) for chunk in chunks for number in wanted)
-
-    def _read_index(self, data: FileBytes, first: int) -> None:
-        """Read connections and chunks from the end of the bag."""
-        header, _, _ = _record(data, first, BAG)
-        at = _number(header, b"index_pos", 8)
-        connections = _number(header, b"conn_count", 4)
-        chunks = _number(header, b"chunk_count", 4)
-        if at == 0:
-            raise DamagedError("it has no index", Cause.NOT_CLOSED)
-        if at >= len(data) or connections > len(data) // 20 or chunks > len(data) // 20:
-            raise DamagedError("its end is missing", Cause.END_MISSING)
-        for _ in range(connections):
-            header, content, at = _whole_record(data, at, CONNECTION)
-            known = _connection(header, content)
-            self.connections[known.id] = known
-        counts: Counter[int] = Counter()
-        for _ in range(chunks):
-            header, content, at = _whole_record(data, at, CHUNK_INFO)
-            position, info = _chunk_info(header, content)
-            self._chunks.append(replace(_chunk(*_record(data, position, CHUNK)), **info))
-            counts.update(info["held"])
-        self._set_counts(counts)
-
-    def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
-        entries, at = {}, chunk.position + chunk.length
-        for _ in chunk.held:
-            header, content, at = _whole_record(data, at, INDEX)
-            entries[_number(header, b"conn", 4)] = _entries(content)
-        return entries
 
     def _records(self, data: Content, at: int) -> Iterator[Record]:
         with contextlib.suppress(DamagedError):
@@ -106,6 +70,8 @@ class Bag1(ChunkedFile):
                 kind = header.get(b"op")
                 if kind == bytes([CHUNK]):
                     found = _chunk(header, begin, min(end, len(data)))
+                elif kind == bytes([INDEX]):
+                    found = ChunkIndex(_number(header, b"conn", 4), begin, end)
                 elif kind == bytes([MESSAGE]):
                     found = _number(header, b"conn", 4), _time(header.get(b"time", b""))
                 elif kind == bytes([CONNECTION]) and end <= min(
@@ -115,6 +81,10 @@ class Bag1(ChunkedFile):
                     self.connections.setdefault(known.id, known)
                 yield at, end, found
                 at = end
+
+    def _entries(self, content: bytes) -> tuple[Index, Index]:
+        entries = np.frombuffer(content, dtype="<u4").reshape(-1, 3).astype(np.int64)
+        return entries[:, 0] * NS_PER_SECOND + entries[:, 1], entries[:, 2]
 
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
         length = len(content)
@@ -133,24 +103,23 @@ Header = dict[bytes, bytes]
 """Of a record: name -> value."""
 
 
-def _record(data: Content, at: int, op: int | None = None) -> tuple[Header, int, int]:
+def _record(data: Content, at: int) -> tuple[Header, int, int]:
     """Return a record's header, and where its data begin and end, perhaps after the file's end."""
     begin = at + 8 + _length(data, at)
     if begin > at + 8 + MAX_HEADER_BYTES:
         raise DamagedError("a record header is absurdly long")
-    header, size = _header(data[at + 4 : begin - 4]), _length(data, begin - 4)
-    if op is not None and header.get(b"op") != bytes([op]):
-        raise DamagedError("its index points nowhere")
-    return header, begin, begin + size
+    return _header(data[at + 4 : begin - 4]), begin, begin + _length(data, begin - 4)
 
 
-def _whole_record(data: Content, at: int, op: int) -> tuple[Header, bytes, int]:
-    """Return the header and the data of a record, and where the next begins."""
-    header, begin, end = _record(data, at, op)
-    content = data[begin : min(end, begin + MAX_RECORD_BYTES)]
-    if len(content) < end - begin:
-        raise DamagedError("a record is absurdly long")
-    return header, content, end
+def _known_damage(data: FileBytes, first: int) -> Cause | None:
+    """Return the damage that the bag's first record shows, by the place of the bag's end."""
+    try:
+        at = _number(_record(data, first)[0], b"index_pos", 8)
+    except DamagedError:
+        return Cause.INDEX_DAMAGED
+    if at == 0:
+        return Cause.NOT_CLOSED
+    return Cause.END_MISSING if at >= len(data) else None
 
 
 def _length(data: Content, at: int) -> int:
@@ -200,27 +169,10 @@ def _connection(header: Header, data: bytes) -> Connection:
     return Connection(_number(header, b"conn", 4), "/" + topic.strip("/"), kind, definition, 0)
 
 
-def _chunk_info(header: Header, data: bytes) -> tuple[int, dict[str, Any]]:
-    """Return a chunk's position, and its messages, start and end, from the index."""
-    if len(data) % 8:
-        raise DamagedError("a chunk's entry in the index makes no sense")
-    start, end = (_time(header.get(name, b"")) * 1e-9 for name in (b"start_time", b"end_time"))
-    held = dict(struct.iter_unpack("<II", data))
-    return _number(header, b"chunk_pos", 8), {"held": held, "start": start, "end": end}
-
-
 def _chunk(header: Header, begin: int, end: int) -> Chunk:
     compression = header.get(b"compression", b"").decode(errors="replace")
     size = _number(header, b"size", 4)
     return Chunk(begin, end - begin, compression=compression, size=size)
-
-
-def _entries(content: bytes) -> tuple[Index, Index]:
-    """Return the times and offsets of one connection's messages from its index."""
-    if len(content) % 12:
-        raise DamagedError("an index makes no sense")
-    entries = np.frombuffer(content, dtype="<u4").reshape(-1, 3).astype(np.int64)
-    return entries[:, 0] * NS_PER_SECOND + entries[:, 1], entries[:, 2]
 
 
 def _is_of(content: Bytes, connection: int, header: Index, size: Index) -> NDArray[np.bool_]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import io
 import sys
@@ -11,7 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 from rosbags.interfaces import MessageDefinition
@@ -85,17 +84,7 @@ class Container(ABC):
 
 
 class DamagedError(Exception):
-    """The container is damaged here.
-
-    Parameters
-    ----------
-    cause
-        The damage of the recording, if the error makes its index unusable.
-    """
-
-    def __init__(self, text: str, cause: Cause = Cause.INDEX_DAMAGED) -> None:
-        super().__init__(text)
-        self.cause = cause
+    """The container is damaged here."""
 
 
 def unpack(compression: str, packed: bytes, size: int) -> bytes:
@@ -158,23 +147,22 @@ class Chunk:
     ----------
     position, length
         Of its data in the file, in bytes.
-    held
-        Connection -> its number of messages in the chunk, or another mark of their presence.
-    start, end
-        s since 1970 of the first and the last message; None without an index.
     compression, size
         The compression of its data, and their unpacked bytes.
+    held
+        Connection -> its number of messages in the chunk.
+    indexes
+        Connection -> begin and end of its messages' times and offsets after the chunk.
     entries
-        Its messages, if the chunk was walked; else they are in its index.
+        Its messages, if the chunk was walked.
     """
 
     position: int
     length: int
-    held: Mapping[int, int] = field(default_factory=dict)
-    start: float | None = None
-    end: float | None = None
     compression: str = ""
     size: int = 0
+    held: dict[int, int] = field(default_factory=dict)
+    indexes: dict[int, tuple[int, int]] = field(default_factory=dict)
     entries: Entries = field(default_factory=dict)
 
     @property
@@ -185,33 +173,44 @@ class Chunk:
     def holding(self, rows: Mapping[int, Sequence[tuple[int, int]]]) -> Chunk:
         """Return the chunk with the messages of a walk: connection -> times and offsets."""
         tables = {number: np.array(held, dtype=np.int64).T for number, held in rows.items()}
-        last = max((int(time.max()) for time, _ in tables.values()), default=None)
-        return replace(
-            self,
-            held={number: len(held) for number, held in rows.items()},
-            end=None if last is None else last * 1e-9,
-            entries={number: (time, offset) for number, (time, offset) in tables.items()},
-        )
+        entries = {number: (time, offset) for number, (time, offset) in tables.items()}
+        return replace(self, held={n: len(held) for n, held in rows.items()}, entries=entries)
 
 
-RecordContent = Chunk | tuple[int, int] | None
-"""A chunk, a message (its connection, and ns), or another record."""
+@dataclass(frozen=True)
+class ChunkIndex:
+    """The place of the times and offsets of a connection's messages in the chunk before."""
+
+    connection: int
+    begin: int
+    end: int
+
+
+RecordContent = Chunk | ChunkIndex | tuple[int, int] | None
+"""A chunk, an index after it, a message (its connection, and ns), or another record."""
 Record = tuple[int, int, RecordContent]
 """Begin, end and content of a record."""
 
 
 @dataclass
 class ChunkedFile(Container):
-    """A container of chunks: read by its indexes, or walked from the front without them.
+    """A container of chunks, each with an index after it, read from the front.
 
-    Messages outside of chunks become chunks of some thousands.
+    Chunks without an index, and all of a damaged file, are walked message by message. Messages
+    outside of chunks become chunks of some thousands.
+
+    Attributes
+    ----------
+    ENTRY_BYTES
+        Size of a message's entry in an index.
     """
 
+    ENTRY_BYTES: ClassVar[int]
     _chunks: list[Chunk] = field(default_factory=list)
 
     @abstractmethod
-    def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
-        """Return the messages of a chunk from the index after it."""
+    def _entries(self, content: bytes) -> tuple[Index, Index]:
+        """Return the times and offsets of one connection's messages from its index."""
 
     @abstractmethod
     def _records(self, data: Content, at: int) -> Iterator[Record]:
@@ -223,10 +222,6 @@ class ChunkedFile(Container):
     @abstractmethod
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
         """Return the payloads of a connection's messages from the offsets of their records."""
-
-    def _count_lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int | None:  # noqa: ARG002
-        """Return how many wanted messages some chunks held; None if unknown."""
-        return None
 
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
         """Yield the messages of some connections, chunk by chunk."""
@@ -241,29 +236,34 @@ class ChunkedFile(Container):
                     lost.append(chunk)
                     continue
                 yield from located
+            indexes = [self._index(data, chunk).values() for chunk in lost]
         if lost:
+            times = [time * 1e-9 for index in indexes for time, _ in index if len(time)]
             self.damage.append(
                 Damage(
                     Cause.CHUNKS_DAMAGED,
-                    lost=self._count_lost(lost, wanted),
+                    lost=sum(chunk.held.get(number, 0) for chunk in lost for number in wanted),
                     bytes_lost=sum(chunk.length for chunk in lost),
                     occurrences=len(lost),
-                    start=min((chunk.start for chunk in lost if chunk.start), default=None),
-                    end=max((chunk.end for chunk in lost if chunk.end), default=None),
+                    start=min((float(time.min()) for time in times), default=None),
+                    end=max((float(time.max()) for time in times), default=None),
                 )
             )
 
     def _locate(self, data: FileBytes, chunk: Chunk, wanted: list[int]) -> list[tuple[int, Block]]:
         """Return the blocks of a chunk, by the index after it or by a walk."""
-        try:
-            entries = chunk.entries or self._index(data, chunk)
-        except DamagedError:
-            entries = self._walked(data, chunk)[0].entries
+        entries = chunk.entries or self._index(data, chunk) or self._walked(data, chunk)[0].entries
         if chunk.packed or chunk.length < 4 * MAX_READ_GAP_BYTES:
             content = np.frombuffer(_unpacked(data, chunk), dtype=np.uint8)
         else:  # only the wanted pieces of one that may hold images unpacked
             content, entries = read_wanted(data, chunk, entries, wanted)
         return [(n, self._block(content, n, *entries[n])) for n in entries if n in wanted]
+
+    def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
+        """Return the messages of a chunk from the index after it; none if it is damaged."""
+        if any((end - begin) % self.ENTRY_BYTES for begin, end in chunk.indexes.values()):
+            return {}
+        return {n: self._entries(data[begin:end]) for n, (begin, end) in chunk.indexes.items()}
 
     def _walked(self, data: FileBytes, chunk: Chunk) -> tuple[Chunk, int]:
         """Return a chunk with the messages of a walk, and its number of damaged bytes."""
@@ -276,11 +276,44 @@ class ChunkedFile(Container):
             read = end
         return chunk.holding(rows), len(content) - read
 
-    def _walk(self, data: FileBytes, first: int, cause: Cause) -> None:
-        """Read connections and chunks from the front, count messages, and note the damage."""
-        self._chunks, self.connections = [], {}
+    def _read(self, data: FileBytes, first: int, last: int, cause: Cause | None) -> None:
+        """Read connections and chunks, count messages, and note the damage.
+
+        Parameters
+        ----------
+        first, last
+            Where the records begin and end.
+        cause
+            Known damage of the file.
+        """
+        lost = last - self._scan(data, first)
+        whole = cause is None and lost == 0 and bool(self.connections)
+        for place, chunk in enumerate(self._chunks):
+            if chunk.entries or (whole and chunk.held):
+                continue
+            try:
+                self._chunks[place], missed = self._walked(data, chunk)
+                lost += 0 if chunk.packed else missed  # of the file, not unpacked
+            except DamagedError:
+                self._chunks[place] = replace(chunk, held={})
+                lost += chunk.length
+        counts: Counter[int] = Counter()
+        for chunk in self._chunks:
+            counts.update(chunk.held)
+        self.connections = {
+            number: replace(known, count=counts[number])
+            for number, known in self.connections.items()
+        }
+        if lost or cause is not None:
+            times = [time.max() for chunk in self._chunks for time, _ in chunk.entries.values()]
+            start = max(times) * 1e-9 if times else None
+            cause, salvaged = cause or Cause.INDEX_DAMAGED, sum(counts.values())
+            self.damage.append(Damage(cause, salvaged=salvaged, bytes_lost=lost, start=start))
+
+    def _scan(self, data: FileBytes, first: int) -> int:
+        """Read connections, chunks and their indexes; return where the last record ends."""
         loose: dict[int, list[tuple[int, int]]] = {}
-        reached, lost = first, 0
+        reached = first
         for at, end, found in self._records(data, first):
             if end > len(data) and not isinstance(found, Chunk):
                 break
@@ -291,31 +324,16 @@ class ChunkedFile(Container):
                 loose = {}
             if isinstance(found, tuple):
                 loose.setdefault(found[0], []).append((found[1], at))
-            elif found is not None:
-                chunk, missed = found, found.length
-                with contextlib.suppress(DamagedError):
-                    chunk, missed = self._walked(data, chunk)
-                self._chunks.append(chunk)
-                lost += 0 if chunk.packed else missed  # of the file, not unpacked
+            elif isinstance(found, Chunk):
+                self._chunks.append(found)
+            elif found is not None and self._chunks:
+                number, size = found.connection, found.end - found.begin
+                self._chunks[-1].indexes[number] = found.begin, found.end
+                self._chunks[-1].held[number] = size // self.ENTRY_BYTES
             reached = min(end, len(data))
         if loose:
             self._chunks.append(Chunk(0, reached).holding(loose))
-        counts: Counter[int] = Counter()
-        for chunk in self._chunks:
-            counts.update(chunk.held)
-        start = max((chunk.end for chunk in self._chunks if chunk.end is not None), default=None)
-        self._set_counts(counts)
-        lost += len(data) - reached
-        self.damage.append(
-            Damage(cause, salvaged=sum(counts.values()), bytes_lost=lost, start=start)
-        )
-
-    def _set_counts(self, counts: Mapping[int, int]) -> None:
-        """Set the number of messages of each connection."""
-        self.connections = {
-            number: replace(known, count=counts.get(number, 0))
-            for number, known in self.connections.items()
-        }
+        return reached
 
 
 def _unpacked(data: FileBytes, chunk: Chunk) -> bytes:

@@ -1,4 +1,4 @@
-"""The MCAP container of ROS 2: read by its summary, or from the front without one.
+"""The MCAP container of ROS 2.
 
 rosbags and the mcap package's indexed reader raise on a file without its end; here 14,697 messages
 of the shipped circle flight cut in half are salvaged. The mcap package's stream reader finds as
@@ -23,10 +23,10 @@ from tuner.recordings.ros.container import (
     MAX_CHUNK_BYTES,
     Chunk,
     ChunkedFile,
+    ChunkIndex,
     Connection,
     Content,
     DamagedError,
-    Entries,
     FileBytes,
     Record,
     RecordContent,
@@ -35,9 +35,7 @@ from tuner.recordings.ros.container import (
 from tuner.recordings.ros.messages import Block, Bytes, Index
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, CHUNK_INDEX, STATISTICS, DATA_END = (
-    0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x0B, 0x0F,
-)  # fmt: skip
+SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX = 0x03, 0x04, 0x05, 0x06, 0x07
 
 #: Bytes of a message record before its payload: op, length, channel, sequence, two times.
 MESSAGE_HEAD_BYTES = 9 + 22
@@ -56,9 +54,10 @@ _FORMATS = {
 class Mcap(ChunkedFile):
     """An MCAP file with ROS messages.
 
-    The ``held`` of its chunks is the position of the index of a channel's messages.
+    Its summary repeats schemas and channels.
     """
 
+    ENTRY_BYTES = 16
     _schemas: dict[int, tuple[str, MessageDefinition]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -66,46 +65,24 @@ class Mcap(ChunkedFile):
             data = FileBytes(stream)
             if data[0 : len(MAGIC)] != MAGIC:
                 raise RecordingError(self.path, "is no MCAP file", "give the recording itself")
-            try:
-                self._read_summary(data)
-            except DamagedError as err:
-                self._walk(data, len(MAGIC), err.cause)
+            closed = data[len(data) - len(MAGIC) : len(data)] == MAGIC
+            last = len(data) - closed * len(MAGIC)
+            self._read(data, len(MAGIC), last, None if closed else Cause.END_MISSING)
         if not self.connections:
             raise RecordingError(self.path, "holds no ROS messages", "record it again")
-
-    def _read_summary(self, data: FileBytes) -> None:
-        """Read channels and chunks from the end of the file."""
-        end = max(0, len(data) - 37)
-        footer = data[end : len(data)]
-        if len(footer) != 37 or footer[-8:] != MAGIC or footer[:9] != b"\x02\x14" + bytes(7):
-            raise DamagedError("its end is missing", Cause.END_MISSING)
-        (start,) = struct.unpack_from("<Q", footer, 9)
-        if not 0 < start <= end:
-            raise DamagedError("it has no summary", Cause.NOT_CLOSED)
-        if end - start > MAX_CHUNK_BYTES:
-            raise DamagedError("its summary is absurdly long")
-        counts: dict[int, int] = {}
-        summary = data[start:end]
-        for op, begin, behind in records(summary, 0):
-            content = summary[begin:behind]
-            if op == CHUNK_INDEX:
-                self._chunks.append(_chunk_index(content, len(data)))
-            elif op == STATISTICS:
-                counts = _counts(content)
-            else:
-                self._read_definitions(op, content)
-        if not self._chunks or not self.connections:
-            raise DamagedError("its summary names no chunks")
-        self._set_counts(counts)
 
     def _records(self, data: Content, at: int) -> Iterator[Record]:
         for op, begin, end in records(data, at):
             found: RecordContent = None
             whole = end <= len(data)
-            if op in (0, FOOTER, DATA_END):
+            if op == 0:
                 return
             if op == CHUNK:
                 found = _chunk(data, begin, min(end, len(data)))
+            elif op == INDEX and whole:  # a channel, and the length of the entries
+                found = ChunkIndex(
+                    int.from_bytes(data[begin : begin + 2], "little"), begin + 6, end
+                )
             elif op == MESSAGE and whole and end - begin >= _HEAD.size + 8:
                 number, _, time = _HEAD.unpack(data[begin : begin + _HEAD.size])
                 found = number, time
@@ -138,8 +115,9 @@ class Mcap(ChunkedFile):
         except (struct.error, ValueError):
             raise DamagedError("a channel makes no sense") from None
 
-    def _index(self, data: FileBytes, chunk: Chunk) -> Entries:
-        return {number: _entries(data, at, number) for number, at in chunk.held.items()}
+    def _entries(self, content: bytes) -> tuple[Index, Index]:
+        entries = np.frombuffer(content, dtype="<i8").reshape(-1, 2)
+        return entries[:, 0].copy(), entries[:, 1].copy()
 
     def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
         inside = (offset >= 0) & (offset + MESSAGE_HEAD_BYTES <= len(content))
@@ -176,39 +154,3 @@ def _chunk(data: Content, begin: int, end: int) -> Chunk:
         return Chunk(begin, end - begin)
     first = begin + at + 8
     return Chunk(first, min(length, max(0, end - first)), compression=compression, size=size)
-
-
-def _chunk_index(content: bytes, size: int) -> Chunk:
-    """Return a chunk from its entry in the summary of a file of `size` bytes."""
-    try:
-        start, end, position, length, indexes = struct.unpack_from("<QQQQI", content)
-        held = dict(struct.iter_unpack("<HQ", content[36 : 36 + indexes]))
-        compression, at = _string(content, 36 + indexes + 8)
-        packed, unpacked = struct.unpack_from("<QQ", content, at)
-    except (struct.error, ValueError):
-        raise DamagedError("its summary makes no sense") from None
-    behind = position + length
-    if behind > size or packed > length or any(at >= size for at in held.values()):
-        raise DamagedError("its summary points nowhere")
-    return Chunk(behind - packed, packed, held, start * 1e-9, end * 1e-9, compression, unpacked)
-
-
-def _counts(content: bytes) -> dict[int, int]:
-    if len(content) < 46 or (len(content) - 46) % 10:
-        raise DamagedError("its statistics make no sense")
-    return dict(struct.iter_unpack("<HQ", content[46:]))
-
-
-def _entries(data: FileBytes, at: int, number: int) -> tuple[Index, Index]:
-    """Read the times and offsets of one channel's messages in a chunk."""
-    head = data[at : at + 15]
-    if len(head) != 15:
-        raise DamagedError("an index is missing")
-    op, _, channel, length = struct.unpack("<BQHI", head)
-    if op != INDEX or channel != number or length > MAX_CHUNK_BYTES // 8 or length % 16:
-        raise DamagedError("an index makes no sense")
-    content = data[at + 15 : at + 15 + length]
-    if len(content) != length:
-        raise DamagedError("an index is cut")
-    entries = np.frombuffer(content, dtype="<i8").reshape(-1, 2)
-    return entries[:, 0].copy(), entries[:, 1].copy()
