@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import isfinite
@@ -101,6 +102,8 @@ class Panel:
     equal: bool = False
     levels: Sequence[tuple[float, str]] = ()
     """Horizontal lines and what they mean."""
+    x_labels: Sequence[str] = ()
+    """Of the places 0, 1, … along the x axis, in place of numbers."""
 
 
 @dataclass(frozen=True)
@@ -145,3 +148,8 @@ def _size(mark: Line | Bars | Heat) -> int:
 def rounded(values: NDArray[np.float64], digits: int) -> list[float | None]:
     """Return a curve for the page, None where it is not finite."""
     return [round(v, digits) if isfinite(v) else None for v in np.asarray(values, float).tolist()]
+
+
+def charts_json(charts: Sequence[Chart]) -> str:
+    """Return charts as the page's script reads them; without ``<``, so that no element ends."""
+    return json.dumps(charts, default=vars, allow_nan=False).replace("<", "\\u003c")

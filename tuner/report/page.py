@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
@@ -19,6 +18,7 @@ from markupsafe import Markup
 from tuner.core.disk import write_text
 from tuner.core.errors import InputError
 from tuner.design.proposals import proposals_in_words
+from tuner.report.chart import charts_json
 from tuner.report.contents import Contents, read_contents
 from tuner.report.outcome import (
     examination_in_words,
@@ -114,7 +114,7 @@ def render(folder: str | Path, *, plots: bool = False) -> Path:
     try:
         sections = sections_of(contents)
         charts = [chart for section in sections for chart in section.charts]
-        page = _page(contents, sections, json.dumps(charts, default=vars, allow_nan=False))
+        page = _page(contents, sections, charts_json(charts))
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         what = f"has files that do not go together ({type(error).__name__}: {error})"
         remedy = "was one edited? run tune again; report this where none was"
@@ -127,7 +127,7 @@ def render(folder: str | Path, *, plots: bool = False) -> Path:
 
 def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
     environment = _environment()
-    script = _source(environment, "page.js")
+    script = _source(environment, "figures.js") + _source(environment, "page.js")
     library, compressed = _library()
     run = contents.run
     found = None if run is None else outcome(run.result, contents.bench, contents.exports)

@@ -2,46 +2,55 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
+from tuner.report.chart import charts_json
 from tuner.service.shapes import CoefficientHistory, Point
-from tuner.service.web.comparison import history_canvas
+from tuner.service.web.comparison import MAX_POINTS, history_chart, rmse_chart
 
 
-def point(best: float, half: float) -> Point:
+def point(best: float, half: float | None, name: str = "day") -> Point:
     return Point(
         mass=None,
         job="0" * 16,
-        name="day",
+        name=name,
         flown=None,
         ended="2026-01-01T00:00:00Z",
         best=best,
-        std_error=half / 2,
-        ci95=(best - half, best + half),
-        identifiable=True,
+        std_error=None if half is None else half / 2,
+        ci95=None if half is None else (best - half, best + half),
+        identifiable=half is not None,
         flights=["hop"],
     )
 
 
-@given(
-    best=st.floats(1e-6, 1e4),
-    sign=st.sampled_from([1, -1]),
-    width=st.floats(1e-6, 2.0),
-    moved=st.floats(0.0, 3.0),
-)
-def test_numbers_at_an_axis_differ_and_stand_where_they_belong(
-    best: float, sign: int, width: float, moved: float
-) -> None:
-    half = best * width
-    points = [point(sign * best, half), point(sign * best + moved * half, half)]
-    canvas = history_canvas(CoefficientHistory(unit="s", points=points))
-    labels = [float(label) for _, label in canvas.y_ticks]
-    assert 2 <= len(set(labels)) == len(labels) <= 6
-    first = canvas.y(sign * best)
-    of_unit = (canvas.y(sign * best - half) - first) / half
-    for value, label in canvas.y_ticks:
-        assert canvas.y(value) == pytest.approx(
-            first + (sign * best - float(label)) * of_unit, abs=0.6
-        )
+def test_jobs_stand_in_order_with_their_intervals_and_days() -> None:
+    name = "</script><b>x"
+    chart = history_chart(
+        "mass", CoefficientHistory(unit="kg", points=[point(2.0, 0.5), point(3.0, None, name)])
+    )
+    (panel,) = chart.panels
+    interval, known, unknown = panel.marks
+    assert panel.x_labels == ["2026-01-01"] * 2
+    assert (interval.x, interval.y) == ((0, 0, 0, 1), (1.5, 2.5, None, None))
+    assert (known.y, unknown.y) == ([2.0, None], [None, 3.0])
+    assert known.text[0] == "day: 2 ± 0.25 kg, from hop"
+    assert "<" not in charts_json([chart])  # no name ends the element that the charts stand in
+    assert json.loads(charts_json([chart]))[0]["panels"][0]["marks"][2]["text"][1].startswith(name)
+
+
+@pytest.mark.parametrize("count", [1, 599, 600, 601, 5000])
+def test_a_long_search_is_drawn_to_its_end_with_points_that_can_be_seen(count: int) -> None:
+    chart = rmse_chart([0.001 * n for n in range(1, count + 1)])
+    assert chart is not None
+    (line,) = chart.panels[0].marks
+    assert line.x[0] == 1
+    assert (line.x[-1], line.y[-1]) == (count, pytest.approx(count))
+    assert len(line.x) <= MAX_POINTS + 1
+
+
+def test_nothing_is_drawn_of_a_search_without_an_error() -> None:
+    assert rmse_chart([]) is None
+    assert rmse_chart([0.0, float("nan"), float("inf")]) is None

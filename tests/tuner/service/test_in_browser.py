@@ -73,7 +73,7 @@ def from_bags_to_the_report(page: Page, width: int) -> None:
     page.get_by_role("button", name="Start the fit").click()
     page.get_by_role("link", name="Open the report").wait_for()
     assert page.get_by_role("heading", name="First <b>fit</b>").is_visible()
-    assert page.locator("svg .curve").count() == 1
+    page.locator("[data-chart=rmse] [aria-label=line] path").wait_for(state="attached")
     assert "diagonal_3mps.bag (checks the fit)" in page.inner_text("main")
     assert page.evaluate(WIDTH) <= width
     page.locator("iframe").scroll_into_view_if_needed()
@@ -103,10 +103,11 @@ def test_the_curve_and_the_list_move_by_themselves(browser, client, table):
     job = submit(client, recording, namespace="slow")
     with visiting(browser, client) as page:
         page.goto(f"/jobs/{job}")
-        curve = page.locator("svg .curve")
-        curve.wait_for()
-        first = curve.get_attribute("points")
-        page.locator(f'svg .curve:not([points="{first}"])').wait_for()
+        curve = page.locator("[data-chart=rmse] [aria-label=line] path")
+        curve.wait_for(state="attached")
+        first = curve.get_attribute("d")
+        other = page.locator(f'[data-chart=rmse] [aria-label=line] path:not([d="{first}"])')
+        other.wait_for(state="attached")
         page.get_by_role("link", name="Open the report").wait_for()  # the page turned by itself
         page.goto("/jobs")
         other = submit(client, recording, name="another one")
@@ -185,8 +186,13 @@ def test_a_vehicle_s_history_and_a_comparison_are_drawn(browser, client, table):
     jobs = [ended(client, submit(client, recording, name=f"day {n}"))["id"] for n in range(3)]
     with visiting(browser, client) as page:
         page.goto("/vehicles/hovergames")
-        assert page.locator("svg .dot").count() == 3
-        assert page.locator("svg .interval").count() == 3
+        chart = page.locator("[data-chart=motor_constant]")
+        chart.locator("[aria-label=dot] circle").nth(2).wait_for()
+        interval = chart.locator("[aria-label=line] path").get_attribute("d")
+        assert interval is not None
+        assert interval.count("M") == 3
+        labels = chart.locator("[aria-label='y-axis tick label']").all_text_contents()
+        assert "1e-7" in labels[0]
         page.get_by_text("Numbers, and the flights behind them").click()
         assert page.get_by_role("cell", name="hop").count() == 3
         page.goto(f"/jobs/{jobs[2]}")

@@ -1,7 +1,4 @@
-"""Two jobs side by side, coefficients over jobs, and an error over a search, as pages show them.
-
-Figures are positions on a canvas, which a template writes as SVG.
-"""
+"""Two jobs side by side, coefficients over jobs, and an error over a search, as pages show them."""
 
 from __future__ import annotations
 
@@ -13,7 +10,10 @@ from pydantic import ValidationError
 
 from tuner.core.content_store import ContentStore
 from tuner.core.files import MAX_BYTES
+from tuner.core.phrases import listed
 from tuner.evaluate.records import RMSE_UNITS
+from tuner.report.chart import FITTED, INITIAL, Chart, Line, Look, Panel
+from tuner.report.section import figures, short
 from tuner.result import CoefficientResult, ExportRecord, ExportRecords, RunResult
 from tuner.service.errors import NotKnownError, NotNowError
 from tuner.service.shapes import CoefficientHistory
@@ -138,108 +138,48 @@ def flight_pairs(a: RunResult, b: RunResult) -> list[FlightPair]:
     ]
 
 
-WIDTH, HEIGHT = 640.0, 270.0
-LEFT, RIGHT, TOP, BOTTOM = 116.0, 12.0, 28.0, 46.0
+INTERVAL = Look(FITTED.colour, width=3.0)
 MAX_POINTS = 600
 """Points of a curve: more would not be seen."""
 
 
-@dataclass(frozen=True)
-class Canvas:
-    """The axes of a chart.
-
-    Attributes
-    ----------
-    across, up
-        Values at both ends of the axes.
-    x_ticks, y_ticks
-        Value -> label of each tick.
-    points
-        Of a curve.
-    """
-
-    across: tuple[float, float]
-    up: tuple[float, float]
-    x_ticks: Sequence[tuple[float, str]]
-    y_ticks: Sequence[tuple[float, str]]
-    points: Sequence[tuple[float, float]] = ()
-
-    def x(self, value: float) -> float:
-        """Return the horizontal position of a value."""
-        (first, last), width = self.across, WIDTH - LEFT - RIGHT
-        return round(LEFT + width * (value - first) / (last - first), 1)
-
-    def y(self, value: float) -> float:
-        """Return the vertical position of a value, from the top."""
-        (low, high), height = self.up, HEIGHT - TOP - BOTTOM
-        return round(HEIGHT - BOTTOM - height * (value - low) / (high - low), 1)
-
-
-def rmse_curve(rmse: Sequence[float]) -> Canvas | None:
-    """Return the RMSE (m) of each iteration in turn, on a logarithmic axis in mm.
-
-    None where there is nothing to draw yet.
-    """
-    known = [
-        (number, math.log10(1000 * value))
-        for number, value in enumerate(rmse, start=1)
-        if value > 0 and math.isfinite(value)
-    ]
+def rmse_chart(rmse: Sequence[float]) -> Chart | None:
+    """Return the RMSE (m) of each iteration in turn; None where there is nothing to draw yet."""
+    known = [(n, 1000.0 * value) for n, value in enumerate(rmse, start=1) if 0 < value < math.inf]
     if not known:
         return None
-    step = -(-len(known) // MAX_POINTS)
-    shown = [*known[:-1:step], known[-1]]
-    low, high = min(y for _, y in shown), max(y for _, y in shown)
-    if high - low < 0.3:
-        low, high = low - 0.15, high + 0.15
-    first, last = shown[0][0], max(shown[-1][0], shown[0][0] + 1)
-    whole = range(first, last + 1, max(1, round((last - first) / 5)))
-    return Canvas(
-        across=(first, last),
-        up=(low, high),
-        x_ticks=[(n, str(n)) for n in whole],
-        y_ticks=[(math.log10(v), f"{v:g}") for v in _decade_ticks(low, high)],
-        points=shown,
+    steps, values = zip(*known[: -1 : -(-len(known) // MAX_POINTS)], known[-1], strict=True)
+    return Chart(
+        key="rmse",
+        title="Position RMSE against iteration",
+        caption="Each stage compares more of the flights than the one before, so that it may rise.",
+        panels=[Panel([Line("RMSE", steps, values, FITTED)], y_title="mm", y_scale="log")],
+        x_title="iteration",
+        height=300,
     )
 
 
-def history_canvas(history: CoefficientHistory) -> Canvas:
-    """Return a canvas for a coefficient over the jobs of a vehicle, one place each, in order.
-
-    The first point stands at 0.5, the next at 1.5.
-    """
+def history_chart(name: str, history: CoefficientHistory) -> Chart:
+    """Return a coefficient with its intervals over the jobs of a vehicle, in order."""
     points = history.points
-    ends = [value for point in points for value in (point.best, *(point.ci95 or ()))]
-    low, high = min(ends), max(ends)
-    margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
-    low, high = low - margin, high + margin
-    days = [(n + 0.5, (of.flown or of.ended or "")[:10]) for n, of in enumerate(points)]
-    return Canvas(
-        across=(0, len(points)),
-        up=(low, high),
-        x_ticks=days[:: -(-len(points) // 6)],
-        y_ticks=_round_numbers(low, high),
-    )
-
-
-def _round_numbers(low: float, high: float) -> list[tuple[float, str]]:
-    """Return two to six round numbers between two others, with as many digits as they differ by."""
-    widest = (high - low) / 2
-    power = 10.0 ** math.floor(math.log10(widest))
-    step = max(factor * power for factor in (1, 2, 5) if factor * power <= widest)
-    leading = math.log10(max(abs(low), abs(high)))
-    digits = math.floor(leading) - math.floor(math.log10(step)) + 1
-    numbers = range(math.ceil(low / step), math.floor(high / step) + 1)
-    return [(number * step, f"{number * step:.{max(digits, 1)}g}") for number in numbers]
-
-
-def _decade_ticks(low: float, high: float) -> list[float]:
-    """Return round numbers between two powers of ten."""
-    factors = (1.0,) if high - low > 2 else (1.0, 2.0, 5.0)
-    found = [
-        factor * 10.0**power
-        for power in range(math.floor(low), math.ceil(high) + 1)
-        for factor in factors
-        if low <= math.log10(factor * 10.0**power) <= high
+    ends = [(n, end) for n, point in enumerate(points) for end in (*(point.ci95 or ()), None)]
+    texts = [
+        f"{point.name}: {figures(point.best)} ± {short(point.std_error)} {history.unit}, "
+        f"from {listed(point.flights)}"
+        for point in points
     ]
-    return found or [float(f"{10 ** ((low + high) / 2):.3g}")]
+    places, values = zip(*ends, strict=True)
+    marks = [Line("95 % interval", places, values, INTERVAL)]
+    for label, is_known, look in (("identified", True, FITTED), ("not identified", False, INITIAL)):
+        best = [p.best if bool(p.identifiable) == is_known else None for p in points]
+        if any(value is not None for value in best):
+            marks.append(
+                Line(label, list(range(len(points))), best, look, joined=False, text=texts)
+            )
+    days = [(point.flown or point.ended or "")[:10] for point in points]
+    return Chart(
+        key=name,
+        title=name,
+        panels=[Panel(marks, y_title=history.unit, x_labels=days)],
+        height=300,
+    )

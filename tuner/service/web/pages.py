@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import anyio.to_thread
 from fastapi import APIRouter, Form, Query, Request
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 from pydantic import TypeAdapter, ValidationError
 from starlette.datastructures import FormData
 from starlette.responses import HTMLResponse, RedirectResponse, Response
@@ -25,7 +26,9 @@ from tuner.core.validation import config_error
 from tuner.core.yaml_document import document_of
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
+from tuner.report.chart import charts_json
 from tuner.report.outcome import STYLE_OF, flights_table, outcome, warnings_of
+from tuner.report.page import LIBRARIES
 from tuner.report.section import figures
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
@@ -40,7 +43,7 @@ from tuner.service.settings import size_in_words
 from tuner.service.shapes import API, iso
 from tuner.service.tables import FINISHED, JobRow, RecordingRow, State
 from tuner.service.web import comparison
-from tuner.service.web.comparison import history_canvas, rmse_curve
+from tuner.service.web.comparison import history_chart, rmse_chart
 from tuner.service.words import on_the_web
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
@@ -64,6 +67,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     filters: dict[str, Callable[..., object]] = {
+        "charts": lambda charts: Markup(charts_json(charts)),
         "figures": figures,
         "short": lambda value: "–" if value is None else f"{value:.2g}",
         "percent": lambda value: "–" if value is None else f"{100 * value:+.2f} %",
@@ -120,6 +124,10 @@ FLIGHT_USES = ("fit", "holdout", "leave out")
 _STATIC = {
     "style.css": ("tuner.report:templates/page.css", "tuner.service.web:static/style.css"),
     "page.js": ("tuner.service.web:static/page.js",),
+    "figures.js": (
+        *(f"tuner.report:assets/{name}" for name in LIBRARIES),
+        "tuner.report:templates/figures.js",
+    ),
 }
 
 
@@ -337,8 +345,7 @@ def _live(service: Service, row: JobRow) -> dict[str, object]:
     log = [str(event.content["text"]) for event in events if event.kind == "message"]
     return {
         "job": row,
-        "curve": rmse_curve(iterations),
-        "iterations": len(iterations),
+        "chart": rmse_chart(iterations),
         "log": log[-MAX_LOG_LINES:],
         "event": row.events,
         "files": f"{API}/jobs/{row.id}/files",
@@ -370,8 +377,8 @@ def list_vehicles(service: ServiceOfApp) -> Response:
 def show_vehicle(service: ServiceOfApp, name: str) -> Response:
     """Show every coefficient of a vehicle over time."""
     found = history(service.database, name)
-    charts = [(key, of, history_canvas(of)) for key, of in found.coefficients.items()]
-    return render("vehicle.html.jinja", vehicle=name, mass=found.mass, charts=charts)
+    charts = [history_chart(key, of) for key, of in found.coefficients.items()]
+    return render("vehicle.html.jinja", vehicle=name, history=found, charts=charts)
 
 
 @web.get("/compare")

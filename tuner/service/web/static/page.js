@@ -2,6 +2,12 @@
 (() => {
   document.documentElement.classList.add("scripted");
 
+  const draw = (root) => {
+    const charts = root.querySelector(".charts");
+    if (charts) drawFigures(JSON.parse(charts.textContent), root);
+  };
+  draw(document);
+
   // parts of a page that move: fetched again when something happens, or every so often
   const renew = async (place) => {
     try {
@@ -11,6 +17,7 @@
       const log = place.querySelector(".log");
       const low = log && log.scrollTop + log.clientHeight > log.scrollHeight - 20;
       place.innerHTML = text;
+      draw(place);
       const after = place.querySelector(".log");
       if (after && low) after.scrollTop = after.scrollHeight;
       if (place.querySelector("[data-ended]")) location.reload();
