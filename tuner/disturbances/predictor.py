@@ -60,9 +60,8 @@ SEGMENTS_AT_ONCE = 8
 STATE_SIZE = 65
 """Numbers of state and disturbances that samples correct, with four commands in flight, a second
 lag of motors and the lag of tachometers: for an estimate of memory."""
-STRETCH_S, MIN_GAIN_SE = 2.0, 1.5
-"""Stretches by which likelihoods are compared, and the least gain in standard errors: half the
-standard errors by which the coefficient that gains it differs from neutral."""
+MIN_LIKELIHOOD_GAIN = 0.5 * 3.0**2
+"""Least gain of the log-likelihood by a coefficient: that of one at three standard errors."""
 MAX_INNOVATION_RATIO = 1.1
 """RMS of a flight's whitened innovations of a channel up to which it is matched. Simulated gusty
 flights of 18 s have up to 1.04."""
@@ -255,18 +254,14 @@ class Predictor:
         return 0.5 * float(sum(np.sum(np.minimum(size, GATE) ** 2) for _, size in self._sizes()))
 
     def is_likelier_than(self, other: Predictor) -> bool:
-        """Return whether its likelihood is significantly larger than another's of the same samples.
+        """Return whether one coefficient more makes the same samples significantly likelier.
 
-        The gain of all stretches exceeds zero by more than it scatters from stretch to stretch
-        (Vuong, "Likelihood ratio tests for model selection and non-nested hypotheses",
-        Econometrica 57, 1989).
+        That is by the likelihood ratio, which knows no errors of the model.
         """
         assert self.found is not None
         assert other.found is not None
         gain = np.asarray(other.found.loss) - np.asarray(self.found.loss)
-        length = round(STRETCH_S * float(self.schedule.log_rate))
-        sums = np.add.reduceat(gain, np.arange(0, len(gain), length), axis=0)
-        return bool(sums.sum() > MIN_GAIN_SE * np.sqrt(sums.size) * sums.std(ddof=1))
+        return bool(gain.sum() > MIN_LIKELIHOOD_GAIN)
 
     @property
     def without_gains(self) -> Predictor:

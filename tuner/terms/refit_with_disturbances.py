@@ -219,11 +219,15 @@ def _with_lag_terms(
     predictor: Predictor,
     on_message: Callable[[str], None],
 ) -> tuple[LinearisedInnovations, Fitted, Predictor]:
-    """Return the fit with lag terms, if innovations are likelier with them.
+    """Return the fit with lag terms, if innovations are likelier with them and call for them.
 
     At its neutral value a lag acts as a latency, and the fit without it has made up for it with
     other lags and stronger disturbances. So it is judged after a refit, and the other terms are
     selected once more beside it. A filter that has lost a flight selects nothing.
+
+    A lag shows where commands jump, often in the first tenths of a second of a flight alone. How
+    far the gain scatters from stretch to stretch says nothing of it then: the scatter of the scores
+    at the fit with the lag does.
     """
     with_lag_terms = seen.with_lag_terms() if predictor.keeps_track else None
     if with_lag_terms is None:
@@ -231,15 +235,16 @@ def _with_lag_terms(
     without, had = predictor.without_gains, seen.selected.kept
     del predictor
     fitted, beside = _fit_innovations(with_lag_terms, with_lag_terms.fitted, without)
-    if not (beside.keeps_track and beside.is_likelier_than(without)):
+    found = None
+    if beside.keeps_track and beside.is_likelier_than(without):
+        found = LinearisedInnovations.of(with_lag_terms, fitted, beside)
+    lags = set(with_lag_terms.kept) - set(had)
+    if found is None or not all(found.calls_for(lag) for lag in lags):
         full = full_problem_of(there.objective, there.point)
         point = Point(full.point.coefficients, without.inputs.offsets)
         return seen, there, without.at(full.objective, point)
     on_message(_changed_terms(seen.selected, with_lag_terms))
-    chosen, selected = (
-        LinearisedInnovations.of(with_lag_terms, fitted, beside).selection(had),
-        with_lag_terms,
-    )
+    chosen, selected = found.selection(had), with_lag_terms
     if chosen is not None:
         on_message(_changed_terms(selected, chosen))
         selected, fitted = chosen, chosen.fitted
@@ -470,6 +475,19 @@ class LinearisedInnovations:
             return None
         moved = vector_after(self.space, self.vector, self._change(model, tried, large))
         return self._with(base, tried, large, moved)
+
+    def calls_for(self, group: str) -> bool:
+        """Return whether innovations contradict the absence of a group that is in the fit."""
+        names = next(row.names for row in self.selected.rows if row.group == group)
+        others = [name for name in self.fitted.objective.space.names if name not in names]
+        return score(
+            self.linear,
+            self._model(others),
+            self._columns(names),
+            candidates=len(self.selected.rows),
+            inside=True,
+            min_gain=0.0,
+        ).is_accepted
 
     def with_lag_terms(self) -> Selected | None:
         """Return the terms with lags added, which start away from their neutral values.

@@ -254,6 +254,15 @@ def test_an_insignificant_term_is_not_refitted(chosen) -> None:
     assert chosen(seen([row("motor_lag", SelectionCode.IMMATERIAL)], {}), lags=True) is None
 
 
+@pytest.mark.parametrize(("size", "needed"), [(0.5, True), (1e-3, False)])
+def test_a_term_in_the_fit_is_needed_where_samples_contradict_its_absence(size, needed) -> None:
+    innovation = seen([DRAG.model_copy(update={"kept": True}), INFLOW], {})
+    moved = innovation.linear.scaled.copy()
+    moved[list(innovation.space.names).index("fuselage_drag")] = size * USUAL["fuselage_drag"]
+    there = replace(innovation, linear=replace(innovation.linear, scaled=moved))
+    assert there.calls_for("fuselage_drag") is needed
+
+
 @pytest.mark.parametrize("alike", [True, False])
 def test_shifts_by_omitted_terms_follow_from_innovations(alike: bool) -> None:
     """As far as they do what a coefficient does; what set-points hide stays as it was."""

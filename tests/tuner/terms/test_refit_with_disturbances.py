@@ -290,20 +290,23 @@ def test_a_lateness_that_samples_contradict_is_not_believed():
 
 
 @pytest.mark.parametrize(
-    ("likelier", "tracks", "called_for", "expected"),
+    ("lacks", "called_for", "expected"),
     [
-        (True, True, None, ["motor_lag"]),
-        (True, True, "drag", ["motor_lag", "drag"]),
-        (False, True, None, []),
-        (True, False, None, []),
+        ("", None, ["motor_lag"]),
+        ("", "drag", ["motor_lag", "drag"]),
+        ("likelihood", None, []),
+        ("significance", None, []),
+        ("track", None, []),
     ],
-    ids=["surely likelier", "others come with it", "by chance", "loses track"],
+    ids=["surely likelier", "others come with it", "by chance", "one gust", "loses track"],
 )
 def test_a_term_without_a_derivative_is_judged_by_a_fit_with_it(
-    monkeypatch, likelier, tracks, called_for, expected
+    monkeypatch, lacks, called_for, expected
 ):
     full = SimpleNamespace(objective=NOBODY, point=SimpleNamespace(coefficients=np.zeros(0)))
-    beside = SimpleNamespace(keeps_track=tracks, is_likelier_than=lambda _: likelier)
+    beside = SimpleNamespace(
+        keeps_track=lacks != "track", is_likelier_than=lambda _: lacks != "likelihood"
+    )
     beside.without_gains = beside
     without = SimpleNamespace(inputs=SimpleNamespace(offsets=np.zeros((5, 1))), keeps_track=True)
     without.without_gains = without
@@ -320,6 +323,7 @@ def test_a_term_without_a_derivative_is_judged_by_a_fit_with_it(
         return SimpleNamespace(
             selected=selected,
             with_lag_terms=lambda: grown("motor_lag"),
+            calls_for=lambda _: lacks != "significance",
             selection=lambda _: grown(called_for),
         )
 
