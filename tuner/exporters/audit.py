@@ -16,9 +16,15 @@ import numpy as np
 from sim_jax.constants import GRAVITY, RAD_S_PER_RPM
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
-from tuner.exporters.sdf.model import MAX_ROTORS, Inertial, Model, composite, inertials, read_model
-from tuner.exporters.sdf.spans import read_tree, render
-from tuner.exporters.target import read_file
+from tuner.exporters.sdf.model import (
+    MAX_ROTORS,
+    Inertial,
+    Model,
+    composite,
+    inertials,
+    motor_number,
+    read_model,
+)
 from tuner.exporters.targets.px4 import outside_range, read_parameters
 from tuner.result import Run
 from tuner.vehicle import values_of
@@ -93,7 +99,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     ExportError
         A file cannot be read, or is no model of a multirotor.
     """
-    model = read_model(read_tree(path, read_file, render), MAX_ROTORS)
+    model = read_model(path, MAX_ROTORS)
     rotors = _rotors(model)
     if not rotors:
         raise ExportError(path, "has no motor with a link and a number", "give each motor its own")
@@ -117,11 +123,11 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
 
 def _rotors(model: Model) -> list[Rotor]:
     links = model.rotor_links()
-    motors = {model.motor_number(motor): motor for motor in model.motors()}
+    motors = {motor_number(motor): motor for motor in model.motors()}
     rotors = []
     for index, (link, turns) in sorted(links.items()):
         radii = [radius.number for disc in link.all("collision") for radius in disc.all("radius")]
-        place = model.pose_of_link(link).position
+        place = model.pose_of(link).position
         radius = (radii or [0.0])[0] or 0.0
         rotors.append(Rotor(index, place, turns, motors[index].numbers, radius))
     return rotors

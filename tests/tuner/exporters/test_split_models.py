@@ -12,9 +12,8 @@ import pytest
 from tests.tuner.exporters.conftest import MODELS
 from tuner.core.errors import ExportError
 from tuner.exporters.sdf.model import composite, read_model
-from tuner.exporters.sdf.spans import read_tree, render
 from tuner.exporters.simulators import GZ_SIM
-from tuner.exporters.target import read_file, write
+from tuner.exporters.target import write
 from tuner.exporters.targets.sdf import sdf_draft
 from tuner.vehicle import values_of
 
@@ -53,7 +52,7 @@ def split(folder):
 
 
 def whole_of(path, rotors=4):
-    return read_model(read_tree(path, read_file, render), rotors)
+    return read_model(path, rotors)
 
 
 def test_numbers_are_written_where_they_live(vehicle, tmp_path):
@@ -148,7 +147,7 @@ def own(vehicle, path):
     model = whole_of(path, 12)
     rotors, centre = model.rotor_links(), composite(model).pose.position
     places = [
-        {"position": (model.pose_of_link(link).position - centre).tolist(), "spin": turns}
+        {"position": (model.pose_of(link).position - centre).tolist(), "spin": turns}
         for _, (link, turns) in sorted(rotors.items())
     ]
     data = vehicle.model_dump() | {"rotors": places, "mass": composite(model).mass}

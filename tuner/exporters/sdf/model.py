@@ -1,19 +1,25 @@
-"""The multirotor of a model file: links, their common mass, motors and control channels.
+"""The multirotor of a model: its files, links, their common mass, motors and control channels.
 
-Poses and tensors are in the model's frame unless stated otherwise, in SI units.
+A model of several files is one tree, in which each ``<include merge="true">`` holds the included
+model, as simulators merge it. Includes are followed within the parent of the model's folder. Poses
+and tensors are in the model's frame unless stated otherwise, in SI units.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
-from tuner.exporters.sdf.spans import MERGED, Element, model_in, pose_numbers
+from tuner.exporters.sdf.spans import Element, parse, render
+from tuner.exporters.target import read_file
 
 
 @dataclass(frozen=True)
@@ -39,13 +45,14 @@ class Inertial:
     pose: Pose
     inertia: Array
 
-    @property
-    def in_model(self) -> Array:
-        """The inertia along the model's axes."""
-        return self.pose.rotation @ self.inertia @ self.pose.rotation.T
+    def inertia_about(self, point: Array) -> Array:
+        """Return the inertia (3, 3) about a point (3,), along the model's axes."""
+        arm = self.pose.position - point
+        shift: Array = arm @ arm * np.eye(3) - np.outer(arm, arm)
+        return self.pose.rotation @ self.inertia @ self.pose.rotation.T + self.mass * shift
 
 
-def pose_of(numbers: Sequence[float]) -> Pose:
+def pose_from(numbers: Sequence[float]) -> Pose:
     """Return SDF's ``x y z roll pitch yaw`` (m, rad; fixed axes) as a pose."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import)
 
@@ -60,7 +67,7 @@ def join_bodies(bodies: Sequence[Inertial]) -> Inertial:
     """Return rigidly joined bodies as one, about their common centre of mass."""
     mass = sum(body.mass for body in bodies)
     centre = sum((body.mass * body.pose.position for body in bodies), np.zeros(3)) / mass
-    inertia = sum((_inertia_about(centre, body) for body in bodies), np.zeros((3, 3)))
+    inertia = sum((body.inertia_about(centre) for body in bodies), np.zeros((3, 3)))
     return Inertial(mass, Pose(centre, np.eye(3)), inertia)
 
 
@@ -100,11 +107,7 @@ def base_for(
         moment = sum((other.mass * other.pose.position for other in others), np.zeros(3))
         base = Pose((whole_mass * centre - moment) / mass, base.rotation)
     bare = Inertial(mass, base, np.zeros((3, 3)))
-    centre = join_bodies((bare, *others)).pose.position
-    rest = _inertia_about(centre, bare) + sum(
-        (_inertia_about(centre, other) for other in others), np.zeros((3, 3))
-    )
-    in_model = whole_inertia - rest
+    in_model = whole_inertia - join_bodies((bare, *others)).inertia
     moments = np.linalg.eigvalsh(in_model)
     if moments[0] <= 0 or moments[2] > moments[0] + moments[1]:
         raise ValueError(
@@ -114,32 +117,37 @@ def base_for(
     return Inertial(mass, base, base.rotation.T @ in_model @ base.rotation)
 
 
-def _inertia_about(point: Array, body: Inertial) -> Array:
-    """Return a body's inertia about a point, along the model's axes."""
-    arm = body.pose.position - point
-    shift: Array = arm @ arm * np.eye(3) - np.outer(arm, arm)
-    return body.in_model + body.mass * shift
-
-
 #: Names of the motor model and the control channels in the two simulators.
 _CLASSIC_MOTOR = "gazebo_motor_model"
 _GZ_MOTOR = "multicopter-motor-model"
 _CLASSIC_CHANNELS = "control_channels"
 MAX_ROTORS = 12
 """Motors with a larger number drive something else."""
+MAX_FILES = 16
+"""Of one model."""
+MERGED = "merged__"
+"""Tag of an include that holds the included model."""
+_NAME = re.compile(r"(?:model://)?([A-Za-z0-9_][A-Za-z0-9._-]{0,99})/?")
 
 
 @dataclass(frozen=True)
 class Model:
-    """A parsed model file.
+    """A parsed model.
 
     Attributes
     ----------
+    root
+        Its ``<model>``.
+    members
+        Its elements and those of merged models, each with the pose of its own model in this one.
     base
         The ``<link>`` whose inertial an export sets.
+    rotors
+        Motors with this number or a larger one drive something else.
     """
 
     root: Element
+    members: Sequence[tuple[Element, Pose]]
     base: Element
     rotors: int
 
@@ -151,7 +159,7 @@ class Model:
     @property
     def links(self) -> list[Element]:
         """All links of the model and of merged ones."""
-        return [element for element, _ in _members(self.root, IDENTITY) if element.tag == "link"]
+        return [element for element, _ in self.members if element.tag == "link"]
 
     @property
     def included(self) -> list[str]:
@@ -172,7 +180,7 @@ class Model:
         links = {link.attributes.get("name"): link for link in self.links}
         rotors = {}
         for motor in self.motors():
-            number = self.motor_number(motor)
+            number = motor_number(motor)
             named, turns = (motor.find(tag) for tag in ("linkName", "turningDirection"))
             link = links.get(named.value) if named else None
             if number is not None and link is not None:
@@ -181,54 +189,58 @@ class Model:
 
     def motors(self) -> list[Element]:
         """Return the motor plugins of the rotors, with those of templates without number."""
-        plugins = []
-        for plugin in self.root.all("plugin"):
-            names = _plugin_names(plugin)
-            if _CLASSIC_MOTOR in names or _GZ_MOTOR in names:
-                index = plugin.numbers.get("motorNumber")
-                if index is None or 0 <= index < self.rotors:
-                    plugins.append(plugin)
-        return plugins
-
-    def motor_number(self, motor: Element) -> int | None:
-        """Return the number of a motor plugin's rotor; None if a template has none."""
-        index = motor.numbers.get("motorNumber")
-        return None if index is None else int(index)
+        return [
+            plugin
+            for plugin in self.root.all("plugin")
+            if _CLASSIC_MOTOR in (names := _plugin_names(plugin)) or _GZ_MOTOR in names
+            if self._is_rotors(plugin, "motorNumber")
+        ]
 
     def channels(self) -> list[Element]:
         """Return the control channels of the vehicle's rotors (Gazebo classic only)."""
-        channels = []
-        for parent in self.root.all(_CLASSIC_CHANNELS):
-            for channel in parent.children:
-                index = channel.numbers.get("input_index")
-                kind = channel.find("joint_control_type")
-                drives = kind is None or kind.value.startswith("velocity")
-                if (
-                    channel.tag == "channel"
-                    and drives
-                    and (index is None or 0 <= index < self.rotors)
-                ):
-                    channels.append(channel)
-        return channels
+        return [
+            channel
+            for parent in self.root.all(_CLASSIC_CHANNELS)
+            for channel in parent.children
+            if channel.tag == "channel" and self._is_rotors(channel, "input_index")
+            if (kind := channel.find("joint_control_type")) is None
+            or kind.value.startswith("velocity")
+        ]
 
-    def pose_of_link(self, link: Element) -> Pose:
-        """Return the pose of a link in the model's frame.
+    def _is_rotors(self, element: Element, tag: str) -> bool:
+        """Return whether an element's number is a rotor's, or missing."""
+        return 0 <= element.numbers.get(tag, 0) < self.rotors
+
+    def pose_of(self, element: Element, passed: tuple[str, ...] = ()) -> Pose:
+        """Return the pose of a link or frame in the model's frame.
 
         Raises
         ------
         ExportError
-            Its reference frame is no link or frame of the model.
+            Its reference frame is no link or frame of the model, or one of those ``passed``.
         """
-        return self._pose_in_model(link, ())
+        pose = element.find("pose")
+        named = pose.attributes.get("relative_to", "") if pose else ""
+        frame = named or element.attributes.get("attached_to", "")
+        if frame in {"", "__model__"}:
+            outer = next(at for member, at in self.members if member is element)
+            return outer @ self._written_pose(element)
+        for other, _ in self.members:
+            same = other.attributes.get("name") == frame
+            if same and other.tag in {"link", "frame"} and frame not in passed:
+                return self.pose_of(other, (*passed, frame)) @ self._written_pose(element)
+        raise ExportError(
+            self.path, f"has a pose relative to '{frame}'", "give it relative to a link or frame"
+        )
 
     def pose_of_inertial(self, link: Element) -> Pose:
         """Return the pose of a link's inertial frame in the model's frame."""
         inertial = link.find("inertial")
-        return self.pose_of_link(link) @ (self._written_pose(inertial) if inertial else IDENTITY)
+        return self.pose_of(link) @ (self._written_pose(inertial) if inertial else IDENTITY)
 
     def _written_pose(self, element: Element) -> Pose:
         """Return an element's ``<pose>`` in its own reference frame."""
-        pose, numbers = element.find("pose"), pose_numbers(element)
+        pose, numbers = element.find("pose"), _pose_numbers(element)
         if pose is None or not numbers:
             return IDENTITY
         if pose.attributes.get("rotation_format", "euler_rpy") != "euler_rpy":
@@ -237,27 +249,13 @@ class Model:
             )
         if pose.attributes.get("degrees", "false") == "true":
             numbers[3:] = np.deg2rad(numbers[3:]).tolist()
-        return pose_of(numbers)
+        return pose_from(numbers)
 
-    def _pose_in_model(self, element: Element, passed: tuple[str, ...]) -> Pose:
-        pose = element.find("pose")
-        named = pose.attributes.get("relative_to", "") if pose else ""
-        frame = named or element.attributes.get("attached_to", "")
-        if frame in {"", "__model__"}:
-            within = next(
-                (at for member, at in _members(self.root, IDENTITY) if member is element), IDENTITY
-            )
-            return within @ self._written_pose(element)
-        return self._pose_of_frame(frame, passed) @ self._written_pose(element)
 
-    def _pose_of_frame(self, name: str, passed: tuple[str, ...]) -> Pose:
-        for element, _ in _members(self.root, IDENTITY):
-            same = element.attributes.get("name") == name
-            if same and element.tag in {"link", "frame"} and name not in passed:
-                return self._pose_in_model(element, (*passed, name))
-        raise ExportError(
-            self.path, f"has a pose relative to '{name}'", "give it relative to a link or frame"
-        )
+def motor_number(motor: Element) -> int | None:
+    """Return the number of a motor plugin's rotor; None if a template has none."""
+    index = motor.numbers.get("motorNumber")
+    return None if index is None else int(index)
 
 
 def _plugin_names(plugin: Element) -> str:
@@ -266,7 +264,99 @@ def _plugin_names(plugin: Element) -> str:
     return names.replace("MulticopterMotorModel", _GZ_MOTOR)
 
 
-def read_model(root: Element, rotors: int) -> Model:
+def _pose_numbers(element: Element) -> list[float]:
+    """Return the six numbers of an element's ``<pose>``; an empty list without one."""
+    pose = element.find("pose")
+    words = pose.value.split() if pose else []
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = [0.0]
+    if len(numbers) not in (0, 6) or not all(map(math.isfinite, numbers)):
+        what = f"has the pose '{' '.join(words)}'"
+        raise ExportError(element.source.path, what, "write six numbers")
+    return numbers
+
+
+def read_model(
+    path: Path,
+    rotors: int,
+    *,
+    texts: Mapping[Path, str] = MappingProxyType({}),
+    prepare: Callable[[str, Path], str] = render,
+) -> Model:
+    """Return the model of a file and of those that it includes.
+
+    Parameters
+    ----------
+    texts
+        File -> its text, for those that are not read.
+    prepare
+        Text and path -> the XML to parse, with the same positions if it is to be edited.
+
+    Raises
+    ------
+    ExportError
+        A file cannot be read, or is included twice, as in itself; or as of `model_of`.
+    """
+    files: list[Path] = []
+
+    def read(file: Path) -> Element:
+        if file in files:
+            raise ExportError(file, "is included twice, or in itself", "take the include out")
+        files.append(file)
+        if len(files) > MAX_FILES:
+            what = f"is one of more than {MAX_FILES} files of a model"
+            raise ExportError(file, what, "take includes out")
+        raw = texts[file] if file in texts else read_file(file)
+        root = parse(prepare(raw, file), file, raw)
+        if root.first("include") is not None:
+            for include in _model_in(root).children:
+                included = _included_file(include)
+                if included is not None:
+                    model = _model_in(read(included))
+                    at = _pose_of_include(include) or _pose_of_include(model)
+                    include.tag, include.children, include.at = MERGED, [model], at
+        return root
+
+    return model_of(read(path), rotors)
+
+
+def _model_in(root: Element) -> Element:
+    """Return the first ``<model>`` of a file."""
+    model = root if root.tag == "model" else root.first("model")
+    if model is None:
+        raise ExportError(root.source.path, "holds no <model>", "give the SDF of a multirotor")
+    return model
+
+
+def _included_file(include: Element) -> Path | None:
+    """Return the file that an element merges; None if it is not followed."""
+    if include.tag != "include" or include.attributes.get("merge") not in ("true", "1"):
+        return None
+    uri = include.find("uri")
+    name = None if uri is None else _NAME.fullmatch(uri.value)
+    if name is None:
+        return None
+    tree = include.source.path.absolute().parent.parent
+    file = tree / name.group(1) / "model.sdf"
+    return file if file.resolve().is_relative_to(tree.resolve()) and file.is_file() else None
+
+
+def _pose_of_include(element: Element) -> list[float]:
+    """Return the six numbers of the pose of an include or an included model, if it has one."""
+    pose, numbers = element.find("pose"), _pose_numbers(element)
+    frame = pose.attributes if pose and numbers else {}
+    if frame.get("relative_to") or frame.get("degrees") == "true":
+        raise ExportError(
+            element.source.path,
+            "includes a model at a pose that is not in radians from its own frame",
+            "write it as x y z roll pitch yaw",
+        )
+    return numbers
+
+
+def model_of(root: Element, rotors: int) -> Model:
     """Return the model of a parsed file.
 
     Raises
@@ -274,15 +364,18 @@ def read_model(root: Element, rotors: int) -> Model:
     ExportError
         It holds no model, no link, or no motor plugin.
     """
-    element, path = model_in(root), root.source.path
-    links = [member for member, _ in _members(element, IDENTITY) if member.tag == "link"]
-    missing = [include for include in element.all("include") if include.attributes.get("merge")]
+    element, path = _model_in(root), root.source.path
+    members = tuple(_members(element, IDENTITY))
+    links = [member for member, _ in members if member.tag == "link"]
     if not links:
         remedy = "give the SDF of a multirotor"
-        if missing:
+        if any(include.attributes.get("merge") for include in element.all("include")):
             remedy = "put the folders of the models that it includes beside its own"
         raise ExportError(path, "has no <link>", remedy)
-    model = Model(element, _base_link(element, links), rotors)
+    by_name = {link.attributes.get("name", ""): link for link in links}
+    named = (element.attributes.get("canonical_link", ""), "base_link")
+    base = next((by_name[name] for name in named if name in by_name), links[0])
+    model = Model(element, members, base, rotors)
     if not model.motors():
         raise ExportError(
             path,
@@ -297,18 +390,10 @@ def _members(parent: Element, frame: Pose) -> Iterator[tuple[Element, Pose]]:
     """Yield an element's children and those of merged models, and the frame of each."""
     for child in parent.children:
         if child.tag == MERGED:
-            numbers = [float(word) for word in child.attributes["at"].split()]
-            yield from _members(child.children[0], frame @ pose_of(numbers))
+            inner = frame @ pose_from(child.at) if child.at else frame
+            yield from _members(child.children[0], inner)
         else:
             yield child, frame
-
-
-def _base_link(root: Element, links: list[Element]) -> Element:
-    by_name = {link.attributes.get("name", ""): link for link in links}
-    for name in (root.attributes.get("canonical_link", ""), "base_link"):
-        if name in by_name:
-            return by_name[name]
-    return links[0]
 
 
 def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:

@@ -1,8 +1,6 @@
 """XML elements with their positions in the text, and edits of the text by position.
 
-Jinja templates of models are parsed with their expressions blanked out, or rendered. A model of
-several files is one tree, in which each ``<include merge="true">`` holds the included model, as
-simulators merge it. Includes are followed within the parent of the model's folder.
+Jinja templates of models are parsed with their expressions blanked out, or rendered.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ import math
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
@@ -22,6 +20,8 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)
 _TAG = re.compile(r"""(?:[^>"']|"[^"]*"|'[^']*')*>""")
 _FILLER = "J"
+MAX_DEPTH = 40
+"""Elements inside each other in one file."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +45,8 @@ class Element:
         Of the whole element.
     content, content_end
         Of the content between its tags; empty for ``<tag/>``.
+    at
+        Of an include that holds the included model: the pose, ``x y z roll pitch yaw``.
     """
 
     source: Source
@@ -55,6 +57,7 @@ class Element:
     content_end: int = 0
     end: int = 0
     children: list[Element] = field(default_factory=list)
+    at: Sequence[float] = ()
 
     @property
     def value(self) -> str:
@@ -267,112 +270,3 @@ if len(text) > 10_000_000:
 sys.stdout.buffer.write(text.encode())
 """
 """It runs as a process of its own: a template may loop, or multiply its text, without end."""
-
-
-MERGED = "merged__"
-"""Tag of an include that holds the included model; ``at`` is its pose, ``x y z roll pitch yaw``."""
-MAX_FILES = 16
-"""Of one model."""
-MAX_DEPTH = 40
-"""Elements inside each other in one file."""
-_NAME = re.compile(r"(?:model://)?([A-Za-z0-9_][A-Za-z0-9._-]{0,99})/?")
-
-
-def read_tree(
-    path: Path,
-    read: Callable[[Path], str],
-    prepare: Callable[[str, Path], str],
-    others: list[Path] | None = None,
-) -> Element:
-    """Return the root of a model's file, with included models in their includes.
-
-    Parameters
-    ----------
-    prepare
-        Text and path -> the XML to parse, with the same positions if it is to be edited.
-    others
-        Files of the model that were read before this one, to which it is added.
-
-    Raises
-    ------
-    ExportError
-        A file cannot be read, holds no model, or is included twice, as in itself.
-    """
-    files = [] if others is None else others
-    if path in files:
-        raise ExportError(path, "is included twice, or in itself", "take the include out")
-    files.append(path)
-    if len(files) > MAX_FILES:
-        what = f"is one of more than {MAX_FILES} files of a model"
-        raise ExportError(path, what, "take includes out")
-    raw = read(path)
-    root = parse(prepare(raw, path), path, raw)
-    if root.first("include") is None:
-        return root
-    for include in model_in(root).children:
-        file = _included_file(include)
-        if file is not None:
-            model = model_in(read_tree(file, read, prepare, files))
-            include.attributes = {"at": _pose(include) or _pose(model) or "0 0 0 0 0 0"}
-            include.tag, include.children = MERGED, [model]
-    return root
-
-
-def model_in(root: Element) -> Element:
-    """Return the first ``<model>`` of a file.
-
-    Raises
-    ------
-    ExportError
-        There is none.
-    """
-    model = root if root.tag == "model" else root.first("model")
-    if model is None:
-        raise ExportError(root.source.path, "holds no <model>", "give the SDF of a multirotor")
-    return model
-
-
-def _included_file(include: Element) -> Path | None:
-    """Return the file that an element merges; None if it is not followed."""
-    if include.tag != "include" or include.attributes.get("merge") not in ("true", "1"):
-        return None
-    uri = include.find("uri")
-    name = None if uri is None else _NAME.fullmatch(uri.value)
-    if name is None:
-        return None
-    tree = include.source.path.absolute().parent.parent
-    file = tree / name.group(1) / "model.sdf"
-    return file if file.resolve().is_relative_to(tree.resolve()) and file.is_file() else None
-
-
-def pose_numbers(element: Element) -> list[float]:
-    """Return the six numbers of an element's ``<pose>``; an empty list without one.
-
-    Raises
-    ------
-    ExportError
-        It has no six finite numbers.
-    """
-    pose = element.find("pose")
-    words = pose.value.split() if pose else []
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = [0.0]
-    if len(numbers) not in (0, 6) or not all(map(math.isfinite, numbers)):
-        what = f"has the pose '{' '.join(words)}'"
-        raise ExportError(element.source.path, what, "write six numbers")
-    return numbers
-
-
-def _pose(element: Element) -> str:
-    """Return an element's pose as six numbers in text; empty without one."""
-    pose, numbers = element.find("pose"), pose_numbers(element)
-    frame = pose.attributes if pose and numbers else {}
-    if frame.get("relative_to") or frame.get("degrees") == "true":
-        raise ExportError(
-            element.source.path,
-            "includes a model at a pose that is not in radians from its own frame",
-            "write it as x y z roll pitch yaw",
-        )
-    return " ".join(map(repr, numbers))

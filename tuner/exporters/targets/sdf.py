@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,18 +14,21 @@ from jinja2 import Environment, StrictUndefined
 from pydantic import ValidationError
 
 from tuner.core.errors import ExportError
-from tuner.exporters.sdf import spans, tags
+from tuner.core.numerics import Array
+from tuner.exporters.sdf import spans
 from tuner.exporters.sdf.model import (
     MAX_ROTORS,
+    MERGED,
     Inertial,
     Model,
     base_for,
     composite,
     inertials,
+    model_of,
+    motor_number,
     read_model,
 )
-from tuner.exporters.sdf.spans import MERGED, Edit, Element, parse, read_tree, render, without_jinja
-from tuner.exporters.sdf.tags import read_values, rotor_origin
+from tuner.exporters.sdf.spans import Edit, Element, parse, without_jinja
 from tuner.exporters.simulators import (
     GAZEBO_CLASSIC,
     GZ_SIM,
@@ -42,12 +47,153 @@ from tuner.exporters.target import (
     xml_comment,
 )
 from tuner.result import Gate
-from tuner.vehicle import VehicleFile
+from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of
 
 #: Products of inertia below this share of the trace are zero.
 MAX_ZERO_PRODUCT = 1e-9
 PROVENANCE = "Coefficients by tune"
 TEMPLATE = Path(__file__).parents[1] / "sdf" / "snippet.sdf.jinja"
+SPEED_LIMIT = "max_rotor_velocity"
+"""The number of a motor plugin's tag ``maxRotVelocity``, which is no coefficient."""
+
+
+# numbers: of a vehicle, their tags, and those in a model
+
+
+def _entries() -> dict[str, Written]:
+    """Return coefficient -> its tag and parent element."""
+    return {
+        name: entry
+        for name, row in COEFFICIENTS.items()
+        if isinstance(entry := row.exported_as.get("sdf"), Written)
+    }
+
+
+def motor_tags(vehicle: VehicleFile, index: int | None) -> dict[str, str]:
+    """Return tag -> name of the numbers in a rotor's motor plugin."""
+    tags = {"maxRotVelocity": SPEED_LIMIT}
+    tags |= {entry.tag: name for name, entry in _entries().items() if entry.parent == "motor"}
+    if rotor_constants(vehicle):
+        tags["motorConstant"] = f"motor_constant of rotor_{index}"
+    return tags
+
+
+def channel_tags() -> dict[str, str]:
+    """Return tag -> name in a control channel of PX4's interface plugin for Gazebo classic."""
+    return {entry.tag: name for name, entry in _entries().items() if entry.parent == "channel"}
+
+
+def center_of_mass(vehicle: VehicleFile) -> dict[str, float]:
+    """Return name -> m from the origin of rotor positions to the centre of mass; empty if equal."""
+    names = [f"center_of_mass_{axis}" for axis in "xyz"]
+    offset = {name: vehicle.effects.get(name, 0.0) for name in names}
+    return offset if any(offset.values()) else {}
+
+
+def rotor_constants(vehicle: VehicleFile) -> dict[str, float]:
+    """Return name -> each rotor's motor constant; empty if all are equal.
+
+    The product of the rotors' scales of thrust and torque is 1, from which the last one follows.
+    """
+    count = len(vehicle.rotors)
+    scales = [vehicle.effects.get(f"rotor_thrust_scale_{i + 1}") for i in range(count)]
+    if all(scale in (None, 1.0) for scale in scales):
+        return {}
+    known = [1.0 if scale is None else scale for scale in scales]
+    if scales[-1] is None:
+        known[-1] = 1.0 / math.prod(known)
+    constant = vehicle.aerodynamics.motor_constant
+    return {f"motor_constant of rotor_{i}": constant * scale for i, scale in enumerate(known)}
+
+
+def numbers_of(vehicle: VehicleFile, *, channels: bool = True) -> dict[str, float]:
+    """Return name -> value of the numbers that a model of a vehicle must hold.
+
+    Parameters
+    ----------
+    channels
+        Whether it has control channels, as for Gazebo classic.
+    """
+    entries, values = _entries(), values_of(vehicle)
+    numbers = {SPEED_LIMIT: vehicle.motor.max_rotor_velocity} | {
+        name: values[name]
+        for name, entry in entries.items()
+        if name in values and name not in vehicle.effects
+        if channels or entry.parent != "channel"
+    }
+    uneven = rotor_constants(vehicle)
+    if uneven:
+        del numbers["motor_constant"]
+    return numbers | center_of_mass(vehicle) | uneven
+
+
+def read_values(model: Model, vehicle: VehicleFile) -> dict[str, float]:
+    """Return name -> value of the numbers in a model.
+
+    Parameters
+    ----------
+    model
+        As rendered.
+    vehicle
+        Gives the rotors, whether they are equal, and whether rotor positions count from its
+        centre of mass.
+
+    Raises
+    ------
+    ExportError
+        Its rotors have different values.
+    """
+    tagged = [(motor, motor_tags(vehicle, motor_number(motor))) for motor in model.motors()]
+    tagged += [(channel, channel_tags()) for channel in model.channels()]
+    shared: dict[tuple[str, str], list[Element]] = defaultdict(list)
+    for element, tags in tagged:
+        for place in tags.items():
+            shared[place].append(element)
+    read = {name: _shared_value(elements, tag) for (tag, name), elements in shared.items()}
+    whole = composite(model)
+    if center_of_mass(vehicle):
+        origin = rotor_origin(model, vehicle)
+        offset = whole.pose.position - (np.zeros(3) if origin is None else origin)
+        read |= {f"center_of_mass_{axis}": float(offset[i]) for i, axis in enumerate("xyz")}
+    body = {f"inertia_{axis}{axis}": float(whole.inertia[i, i]) for i, axis in enumerate("xyz")}
+    held = {name: value for name, value in read.items() if value is not None}
+    return held | body | {"mass": whole.mass}
+
+
+def _shared_value(elements: Sequence[Element], tag: str) -> float | None:
+    """Return the value of a tag that elements share; None if they have none."""
+    path = elements[0].source.path
+    texts = {child.value if (child := of.find(tag)) else "" for of in elements}
+    try:
+        values = {float(text) if text else None for text in texts}
+    except ValueError:
+        found = " and ".join(sorted(texts))
+        raise ExportError(path, f"has the <{tag}> {found}", "write a number") from None
+    if len(values) > 1:
+        raise ExportError(path, f"has rotors of different {tag}", "give them one value")
+    return values.pop()
+
+
+def rotor_origin(model: Model, vehicle: VehicleFile) -> Array | None:
+    """Return the origin (3,) m of the vehicle file's rotor positions in a model.
+
+    None unless every rotor is a link, ``rotor_0`` and on.
+    """
+    links = {link.attributes.get("name"): link for link in model.links}
+    places = [
+        model.pose_of(links[name]).position - rotor.position
+        for index, rotor in enumerate(vehicle.rotors)
+        if (name := f"rotor_{index}") in links
+    ]
+    return np.mean(places, axis=0) if len(places) == len(vehicle.rotors) else None
+
+
+def as_text(value: float) -> str:
+    """Return a number as text of at most twelve digits."""
+    return format(value, ".12g")
+
+
+# the tags alone
 
 
 def sdf_or_snippet(
@@ -59,56 +205,42 @@ def sdf_or_snippet(
     """
     if into is not None:
         return sdf_draft(into, vehicle, provenance)
+    flown = simulator.flown(vehicle)
+    scaled = with_speed_unit(flown, gz_speed_unit(flown) if simulator is GZ_SIM else 1.0)
+    wanted = numbers_of(scaled, channels=simulator is not GZ_SIM)
 
-    def held_by(text: str, path: Path) -> dict[str, float]:
-        model = parse(f"<model><link name='base_link'>{text}</link></model>", path)
-        return read_values(read_model(model, len(vehicle.rotors)), vehicle)
+    def faults(path: Path, _: object) -> list[str]:
+        text = f"<model><link name='base_link'>{read_file(path)}</link></model>"
+        model = model_of(parse(text, path), len(scaled.rotors))
+        return differences(wanted, read_values(model, scaled))
 
-    notes = tags.plugin_deviations(vehicle)
-    vehicle = simulator.flown(vehicle)
-    unit = gz_speed_unit(vehicle) if simulator is GZ_SIM else 1.0
-    vehicle = with_speed_unit(vehicle, unit)
-    wanted = tags.carried_values(vehicle, channels=simulator is not GZ_SIM)
-    text = _snippet(vehicle, simulator, provenance)
-    there = tags.with_model_values(vehicle, wanted | held_by(text, TEMPLATE))
-    return Draft(
-        text,
-        with_speed_unit(there, 1.0 / unit),
-        notes,
-        lambda path, _: differences(wanted, held_by(read_file(path), path)),
-    )
+    return Draft(_snippet(scaled, simulator, provenance), flown, _deviations(vehicle), faults)
+
+
+def _deviations(vehicle: VehicleFile) -> tuple[str, ...]:
+    """Return clauses on properties of a vehicle that the plugins fly differently."""
+    if vehicle.aerodynamics.reaction_torque == "body":
+        return ()
+    return ("the plugins' reaction torque acts about the body's z axis, not the world's",)
 
 
 def _snippet(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> str:
     environment = Environment(
         undefined=StrictUndefined, keep_trailing_newline=True, autoescape=True
     )
-    inertia, centre = vehicle.inertia, tags.center_of_mass(vehicle)
-    motors = [
-        {tag: tags.as_text(value) for tag, value in _motor_values(vehicle, index).items()}
-        for index in range(len(vehicle.rotors))
-    ]
+    numbers = {name: as_text(value) for name, value in numbers_of(vehicle).items()}
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         provenance=xml_comment(provenance),
         simulator=simulator.name,
-        mass=tags.as_text(vehicle.mass),
-        ixx=tags.as_text(inertia.xx),
-        iyy=tags.as_text(inertia.yy),
-        izz=tags.as_text(inertia.zz),
-        center_of_mass=None if centre is None else " ".join(map(tags.as_text, centre)),
-        rotors=list(zip(vehicle.rotors, motors, strict=True)),
-        channel={
-            tag: tags.as_text(value) for tag, value in tags.tag_values(vehicle, "channel").items()
-        },
+        numbers=numbers,
+        rotors=vehicle.rotors,
+        motor_tags=[motor_tags(vehicle, index) for index in range(len(vehicle.rotors))],
+        channel_tags=channel_tags(),
+        center_of_mass=" ".join(map(as_text, center_of_mass(vehicle).values())),
     )
 
 
-def _motor_values(vehicle: VehicleFile, index: int) -> dict[str, float]:
-    """Return tag -> value of one rotor's motor plugin."""
-    values, uneven = tags.tag_values(vehicle, "motor"), tags.motor_constants(vehicle)
-    if uneven is not None:
-        values[tags.MOTOR_CONSTANT] = uneven[tags.rotor_constant_name(index)]
-    return values
+# a patched model
 
 
 def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
@@ -128,17 +260,14 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
         The model is not understood, or would not hold the wanted numbers.
     """
     rotors = len(vehicle.rotors)
-    model = read_model(read_tree(path, read_file, lambda text, _: without_jinja(text)), rotors)
-    whole = read_model(read_tree(path, read_file, render), rotors)
-    simulator = GZ_SIM if whole.is_gz else GAZEBO_CLASSIC
-    flown = simulator.flown(vehicle)
+    model = read_model(path, rotors, prepare=lambda text, _: without_jinja(text))
+    whole = read_model(path, rotors)
+    flown = (GZ_SIM if whole.is_gz else GAZEBO_CLASSIC).flown(vehicle)
     unit = gz_speed_unit(flown) if whole.is_gz else 1.0
-    vehicle, asked = with_speed_unit(flown, unit), vehicle
-    base = _base_body(whole, vehicle)
-    edits = [*_inertial_edits(model, base), *_motor_edits(model, vehicle)]
-    if tags.center_of_mass(vehicle) is not None:
-        edits += _pose_edits(model, whole, base)
-    edits = list(dict.fromkeys(map(_edit_of_variable, edits)))
+    scaled = with_speed_unit(flown, unit)
+    wanted = numbers_of(scaled, channels=bool(whole.channels()))
+    base = _base_body(whole, scaled)
+    edits = list(dict.fromkeys(map(_edit_of_variable, _edits(model, whole, scaled, base))))
     places = [(edit.source, edit.start, edit.end) for edit in edits if edit.end > edit.start]
     if len(set(places)) < len(places):
         raise ExportError(
@@ -147,24 +276,19 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
             "give each rotor's plugin a number of its own",
         )
     patched = _patched(model, edits, provenance)
+    final = read_model(path, rotors, texts=patched)
+    if wrong := differences(wanted, read_values(final, scaled)):
+        raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
 
     def faults(file: Path, instead: Mapping[Path, Path]) -> list[str]:
-        standing = {**instead, path: file}
-        root = read_tree(path, lambda p: read_file(standing.get(p, p)), render)
-        return differences(wanted, read_values(read_model(root, rotors), vehicle))
+        texts = {at: read_file(written) for at, written in {**instead, path: file}.items()}
+        return differences(wanted, read_values(read_model(path, rotors, texts=texts), scaled))
 
-    root = read_tree(path, lambda p: patched.get(p) or read_file(p), render)
-    final = read_model(root, rotors)
-    wanted = tags.carried_values(vehicle, channels=bool(whole.channels()))
-    written_values = read_values(final, vehicle)
-    wrong = differences(wanted, written_values)
-    if wrong:
-        raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
-    there, geometry = _rotors_there(final, tags.with_model_values(vehicle, written_values))
+    there, geometry = _rotors_there(final, flown)
     return Draft(
         patched.pop(path, model.root.source.raw),
-        with_speed_unit(there, 1.0 / unit),
-        tuple(_notes(whole, asked, vehicle, base, unit)),
+        there,
+        tuple(_notes(whole, vehicle, scaled, base, unit)),
         faults,
         gates=(Gate("rotors sit and turn there as the vehicle's do", geometry),),
         others=patched,
@@ -179,8 +303,7 @@ def simulator_of(path: Path) -> str:
     ExportError
         It is no model of a multirotor.
     """
-    model = read_model(read_tree(path, read_file, render), MAX_ROTORS)
-    return (GZ_SIM if model.is_gz else GAZEBO_CLASSIC).name
+    return (GZ_SIM if read_model(path, MAX_ROTORS).is_gz else GAZEBO_CLASSIC).name
 
 
 def _patched(model: Model, edits: Sequence[Edit], provenance: str) -> dict[Path, str]:
@@ -202,8 +325,8 @@ def _base_body(model: Model, vehicle: VehicleFile) -> Inertial:
     It moves only if the centre of mass is not the origin of rotor positions.
     """
     others = [body for link, body in inertials(model) if link is not model.base]
-    inertia, offset, centre = vehicle.inertia, tags.center_of_mass(vehicle), None
-    if offset is not None:
+    inertia, offset, centre = vehicle.inertia, center_of_mass(vehicle), None
+    if offset:
         origin = rotor_origin(model, vehicle)
         if origin is None:
             raise ExportError(
@@ -211,7 +334,7 @@ def _base_body(model: Model, vehicle: VehicleFile) -> Inertial:
                 "shows no places of rotors to put the centre of mass against",
                 f"call their links rotor_0 to rotor_{len(vehicle.rotors) - 1}",
             )
-        centre = origin + np.array(offset)
+        centre = origin + np.array([*offset.values()])
     try:
         return base_for(
             vehicle.mass,
@@ -221,15 +344,17 @@ def _base_body(model: Model, vehicle: VehicleFile) -> Inertial:
             centre=centre,
         )
     except ValueError as error:
-        more = _more_rotors(model, vehicle)
-        what = f"is of another vehicle: {more}" if more else str(error)
-        remedy = (
-            "give a model of this one" if more else "lighten those links, or give another model"
-        )
+        what, remedy = str(error), "lighten those links, or give another model"
+        if more := _more_rotors(model, vehicle):
+            what, remedy = f"is of another vehicle: {more}", "give a model of this one"
         raise ExportError(model.path, what, remedy) from None
 
 
-def _inertial_edits(model: Model, base: Inertial) -> Iterator[Edit]:
+def _edits(model: Model, whole: Model, vehicle: VehicleFile, base: Inertial) -> Iterator[Edit]:
+    """Yield the edits that put a vehicle's numbers into a model.
+
+    ``model`` is the text to edit, ``whole`` the rendered model.
+    """
     inertial = model.base.find("inertial")
     tensor = inertial.find("inertia") if inertial else None
     if inertial is None or tensor is None:
@@ -238,58 +363,43 @@ def _inertial_edits(model: Model, base: Inertial) -> Iterator[Edit]:
             f"base link '{model.base.attributes.get('name')}' has no <inertial> with <inertia>",
             "give it one, its numbers do not matter",
         )
-    yield from _value_edits(inertial, {"mass": base.mass})
+    yield from _value_edits(inertial, {"mass": as_text(base.mass)})
     smallest = MAX_ZERO_PRODUCT * np.trace(base.inertia)
     for row, column in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
         tag, value = f"i{'xyz'[row]}{'xyz'[column]}", base.inertia[row, column]
         none = abs(value) < smallest and row != column
         if not none or tensor.find(tag) is not None:
-            yield from _value_edits(tensor, {tag: 0.0 if none else value})
-
-
-def _pose_edits(model: Model, whole: Model, base: Inertial) -> Iterator[Edit]:
-    """Yield the edit that moves the base's inertial frame to the base's centre of mass.
-
-    ``model`` is the text to edit, ``whole`` the rendered model. The frame's angles stay; its
-    position has all digits, for the centre is the small difference of large numbers.
-    """
-    link = whole.pose_of_link(whole.base)
-    place = link.rotation.T @ (base.pose.position - link.position)
-    inertial = model.base.find("inertial")
-    assert inertial is not None, "its mass was set"
-    pose = inertial.find("pose")
-    angles = pose.value.split()[3:] if pose else ["0", "0", "0"]
-    written = " ".join([*(repr(float(number)) for number in place), *(angles or ["0", "0", "0"])])
-    if pose is None:
-        yield spans.append_child(inertial, "pose", written)
-    elif pose.value != written:
-        yield spans.set_value(pose, written)
-
-
-def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
+            yield from _value_edits(tensor, {tag: as_text(0.0 if none else value)})
+    numbers = {name: as_text(value) for name, value in numbers_of(vehicle).items()}
     for motor in model.motors():
-        index = model.motor_number(motor)
-        if index is None and tags.motor_constants(vehicle) is not None:
+        index = motor_number(motor)
+        if index is None and rotor_constants(vehicle):
             raise ExportError(
                 model.path,
                 "draws its rotors from a template, and this vehicle's differ in motor_constant",
                 "give each rotor a plugin of its own",
             )
-        yield from _value_edits(motor, _motor_values(vehicle, index or 0))
+        values = {tag: numbers[name] for tag, name in motor_tags(vehicle, index).items()}
+        yield from _value_edits(motor, values)
     for channel in model.channels():
-        yield from _value_edits(channel, tags.tag_values(vehicle, "channel"))
+        yield from _value_edits(
+            channel, {tag: numbers[name] for tag, name in channel_tags().items()}
+        )
+    if center_of_mass(vehicle):  # with all digits: it is the small difference of large numbers
+        link, pose = whole.pose_of(whole.base), inertial.find("pose")
+        place = (link.rotation.T @ (base.pose.position - link.position)).tolist()
+        angles = (pose.value.split()[3:] if pose else []) or ["0", "0", "0"]
+        yield from _value_edits(inertial, {"pose": " ".join([*map(repr, place), *angles])})
 
 
-def _value_edits(parent: Element, values: dict[str, float]) -> Iterator[Edit]:
+def _value_edits(parent: Element, values: Mapping[str, str]) -> Iterator[Edit]:
     """Yield the edits that set the values of children, without those that are equal already."""
     for tag, value in values.items():
         child = parent.find(tag)
         if child is None:
-            yield spans.append_child(parent, tag, tags.as_text(value))
-        else:
-            now = child.number
-            if now is None or tags.as_text(now) != tags.as_text(value):
-                yield spans.set_value(child, tags.as_text(value))
+            yield spans.append_child(parent, tag, value)
+        elif value != (child.value if child.number is None else as_text(child.number)):
+            yield spans.set_value(child, value)
 
 
 def _edit_of_variable(edit: Edit) -> Edit:
@@ -329,8 +439,8 @@ def _notes(
     if others:
         names = ", ".join(link.attributes.get("name", "") for link, _ in others)
         yield (
-            f"the vehicle's {tags.as_text(vehicle.mass)} kg and inertia are those of all links "
-            f"together: '{name}' gets {tags.as_text(base.mass)} kg and what inertia {names} leave"
+            f"the vehicle's {as_text(vehicle.mass)} kg and inertia are those of all links "
+            f"together: '{name}' gets {as_text(base.mass)} kg and what inertia {names} leave"
         )
     if model.included:
         yield f"the mass of what the model includes is not counted: {', '.join(model.included)}"
@@ -348,10 +458,10 @@ def _notes(
             f"gz-sim be told of {MAX_GZ_SPEED:.0f} at most: speeds are scaled by {unit:.6g} and "
             "motorConstant and rotorDragCoefficient to match, which moves nothing otherwise"
         )
-    if tags.center_of_mass(vehicle) is not None:
-        place = ", ".join(tags.as_text(round(number, 9)) for number in base.pose.position)
+    if center_of_mass(vehicle):
+        place = ", ".join(as_text(round(number, 9)) for number in base.pose.position)
         yield f"the inertial of '{name}' moves to ({place}) m for the vehicle's centre of mass"
-    yield from tags.plugin_deviations(asked)
+    yield from _deviations(asked)
 
 
 def _more_rotors(model: Model, vehicle: VehicleFile) -> str:
@@ -365,9 +475,9 @@ def _rotors_there(model: Model, vehicle: VehicleFile) -> tuple[VehicleFile, tupl
     more = _more_rotors(model, vehicle)
     clauses, rotors = [more] if more else [], list(vehicle.rotors)
     centre = composite(model).pose.position
-    offset = np.array(tags.center_of_mass(vehicle) or (0.0, 0.0, 0.0))
+    offset = np.array([*center_of_mass(vehicle).values()] or [0.0] * 3)
     for index, (link, turns) in sorted(model.rotor_links().items()):
-        rotor, place = rotors[index], model.pose_of_link(link).position - centre
+        rotor, place = rotors[index], model.pose_of(link).position - centre
         expected = np.array(rotor.position) - offset
         if np.abs(place - expected).max() > PLACE_TOLERANCE_M:
             clauses.append(
