@@ -12,11 +12,11 @@ import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from tuner.config import JobFile, Settings
@@ -30,15 +30,14 @@ from tuner.evaluate.records import AxesRmse
 from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
 from tuner.objective.criterion import Point, units_of
 from tuner.result import EFFECTIVE, EffectiveResult, LostTerm, PoseRmse, Run, RunResult
-from tuner.search.continuation import run_stages
-from tuner.search.estimation import stages_of
+from tuner.search.estimation import BOTH_POLISHES, polished
 from tuner.search.job_flights import (
     Recording,
     read_recordings,
     with_known,
 )
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Free, Progress, initial_progress
+from tuner.search.progress import Fitted, Free, Progress, plain_criterion
 from tuner.vehicle import (
     COEFFICIENTS,
     ControllerFile,
@@ -51,10 +50,8 @@ from tuner.vehicle import (
     write_vehicle,
 )
 
-LAST_STAGES = slice(-3, None)
-"""The stages of the search: whole flights, then the polish with weights for the missing terms."""
-POLISH_STAGE = -2
-"""The stage from which a search with fixed moments of inertia goes on."""
+ALL_STAGES, LAST_STAGES = slice(None), slice(-3, None)
+"""Stages of the fit: the last are whole flights, then polishes with weights for missing terms."""
 MOMENTS = frozenset(name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia")
 MIN_TOLERANCE = 1e-4
 """Relative reduction of the loss at which a stage ends. With a hundredth a moment constant ends a
@@ -181,7 +178,7 @@ def fit_effective(
 
     Prior knowledge is about the vehicle, not about a simulator without some terms: each coefficient
     has a weak prior at its start. If the moments of inertia end as impossible, they are fixed at
-    their start, and the fit of the others goes on.
+    their start, and the others are polished again.
     """
     settings, recordings = recorded
     begins = run.vehicle if simulator.start is None else simulator.start(run.vehicle)
@@ -205,48 +202,29 @@ def fit_effective(
         holdout=tuple(r.flight.name for r in recordings if r.holdout),
     )
     problem = job_of(replace(settings, vehicle=start, job=job, bench=None), recordings)
-    stages = stages_of(problem, problem.objective)
-    stages = tuple(
-        replace(
-            stage,
-            name=f"for {simulator.title}, {stage.name}",
-            tolerance=max(stage.tolerance, MIN_TOLERANCE),
-            rough=True,
-        )
-        for stage in (stages[LAST_STAGES] if simulator.start is None else stages)
-    )
     space, begun = problem.space, _start_of_fit(run, problem, lost)
+    fit = partial(
+        polished,
+        problem,
+        title=f"for {simulator.title}",
+        on_progress=on_progress,
+        left=MIN_TOLERANCE,
+    )
 
-    def ended(progress: Progress, moves: NDArray[np.bool_]) -> Progress:
-        none = np.zeros(begun.points.offsets.shape[1:], bool)
-        return run_stages(
-            problem.objective,
-            stages,
-            progress,
-            free=Free(moves, none),
-            undecided={},
-            on_progress=on_progress,
-        )
-
-    def vehicle(progress: Progress) -> VehicleFile:
-        values = space.numbers(progress.best_point.coefficients)
+    def vehicle(fitted: Fitted) -> VehicleFile:
+        values = space.numbers(fitted.point.coefficients)
         return simulator.flown(with_values(start, values))
 
-    progress = ended(begun, np.ones(len(space), bool))
+    moves, fixed = np.ones(len(space), bool), np.zeros(begun.point.offsets.shape, bool)
+    stages = LAST_STAGES if simulator.start is None else ALL_STAGES
+    fitted = fit(begun, free=Free(moves, fixed), stages=stages)
     with suppress(ConfigError):  # together the moments are no rigid body's
-        return vehicle(progress), progress.converged
+        return vehicle(fitted), fitted.converged
     moves = np.array([not MOMENTS.intersection(p.ratios) for p in space.parameters])
-    at_start = np.where(moves, progress.points.coefficients, space.initial)
-    again = replace(
-        begun,
-        stage=len(stages) + POLISH_STAGE,
-        points=replace(progress.points, coefficients=at_start),
-        scales=progress.scales,
-        iterations=progress.iterations,
-        evaluations=progress.evaluations,
-    )
-    progress = ended(again, moves)
-    return vehicle(progress), progress.converged
+    at_start = np.where(moves, fitted.point.coefficients, space.initial)
+    begun = replace(begun, point=Point(at_start, fitted.point.offsets), scales=fitted.scales)
+    fitted = fit(begun, free=Free(moves, fixed), stages=BOTH_POLISHES)
+    return vehicle(fitted), fitted.converged
 
 
 def _bounds(run: Run, start: VehicleFile, free: Sequence[str]) -> dict[str, CoefficientSettings]:
@@ -261,12 +239,9 @@ def _bounds(run: Run, start: VehicleFile, free: Sequence[str]) -> dict[str, Coef
     }
 
 
-def _start_of_fit(run: Run, problem: Job, lost: Collection[str]) -> Progress:
+def _start_of_fit(run: Run, problem: Job, lost: Collection[str]) -> Fitted:
     """Return where a fit begins, with clocks, air and weights as the run ended with them."""
-    objective, begun = (
-        problem.objective,
-        initial_progress(problem.objective, problem.space.initial[None]),
-    )
+    objective = problem.objective
     offsets: Any = run.result.settings.get("offsets", {})
     weighed: Any = run.result.settings.get("scales", {})
     conditions = {flight.name: flight.conditions for flight in run.result.flights}
@@ -276,12 +251,23 @@ def _start_of_fit(run: Run, problem: Job, lost: Collection[str]) -> Progress:
         [0.0 if name in lost else of_flight.get(name, 0.0) for of_flight in known]
         for name in objective.of_flight
     ]
-    at = np.array(rows) / units_of(objective.of_flight)[:, None]
-    scales = {
-        channel: np.array([weighed.get(flight, {}).get(channel, 1.0) for flight in names])
-        for channel in objective.segments.measured
-    }
-    return replace(begun, points=Point(begun.points.coefficients, at[None]), scales=scales)
+    return Fitted(
+        objective=objective,
+        point=Point(problem.space.initial, np.array(rows) / units_of(objective.of_flight)[:, None]),
+        criterion=plain_criterion(objective, objective.samples),
+        noise=problem.noise,
+        scales={
+            flight: {c: weighed.get(flight, {}).get(c, 1.0) for c in objective.segments.measured}
+            for flight in names
+        },
+        iterations=(),
+        outcomes=(),
+        method="gradient",
+        evaluations=0,
+        wall_time=0.0,
+        loss_best=np.inf,
+        converged=False,
+    )
 
 
 def free_coefficients(run: Run, simulator: Simulator, bare: VehicleFile) -> list[str]:

@@ -460,7 +460,8 @@ def test_a_quarter_turn_about_z_swaps_x_and_y():
     turned = pose_from([1, 2, 3, 0, 0, np.pi / 2])
     np.testing.assert_allclose(turned.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-15)
     box = Inertial(1.0, turned, np.diag([1.0, 2.0, 2.5]))
-    np.testing.assert_allclose(box.inertia_about(turned.position), np.diag([2.0, 1.0, 2.5]), atol=1e-15)
+    inertia = box.inertia_about(turned.position)
+    np.testing.assert_allclose(inertia, np.diag([2.0, 1.0, 2.5]), atol=1e-15)
 
 
 def test_angles_are_about_fixed_axes_roll_first():

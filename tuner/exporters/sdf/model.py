@@ -107,7 +107,9 @@ def base_for(
         moment = sum((other.mass * other.pose.position for other in others), np.zeros(3))
         base = Pose((whole_mass * centre - moment) / mass, base.rotation)
     bare = Inertial(mass, base, np.zeros((3, 3)))
-    in_model = whole_inertia - join_bodies((bare, *others)).inertia
+    centre = join_bodies((bare, *others)).pose.position
+    rest = sum((body.inertia_about(centre) for body in (*others, bare)), np.zeros((3, 3)))
+    in_model = whole_inertia - rest
     moments = np.linalg.eigvalsh(in_model)
     if moments[0] <= 0 or moments[2] > moments[0] + moments[1]:
         raise ValueError(

@@ -267,7 +267,8 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     scaled = with_speed_unit(flown, unit)
     wanted = numbers_of(scaled, channels=bool(whole.channels()))
     base = _base_body(whole, scaled)
-    edits = list(dict.fromkeys(map(_edit_of_variable, _edits(model, whole, scaled, base))))
+    edits = [*_edits(model, whole, scaled, base)]
+    edits = [*dict.fromkeys(map(_edit_of_variable, edits))]
     places = [(edit.source, edit.start, edit.end) for edit in edits if edit.end > edit.start]
     if len(set(places)) < len(places):
         raise ExportError(
