@@ -21,6 +21,8 @@ from tuner.options import (
     Options,
     RecordingOptions,
     SimulationOptions,
+    check_model,
+    plain,
     taking,
 )
 from tuner.recordings.loader import load_flight
@@ -35,7 +37,6 @@ if TYPE_CHECKING:
     from tuner.job.sensitivity import SensitivityResult
 
 Named = str | Path
-T = TypeVar("T")
 
 __all__ = [
     "compare",
@@ -81,7 +82,7 @@ def fit(flights: Named | Sequence[Named], **options: Any) -> Run:
     configure()
     from tuner.job.run import run  # noqa: PLC0415 (jax)
 
-    given = Options.of(flights, **options)
+    given = Options.of(flights=flights, **options)
     with engine_for(given.workers, given.cluster):
         folder, _ = run(
             given,
@@ -126,10 +127,12 @@ def compare(
     configure()
     from tuner.evaluate.comparison import compare as compare_vehicles  # noqa: PLC0415 (jax)
 
-    given = RecordingOptions.of(flights, **options)
+    given = RecordingOptions.of(flights=flights, **options)
     names = [vehicles] if isinstance(vehicles, Named) else vehicles
     labelled = names if isinstance(names, Mapping) else {str(name): name for name in names}
-    sets: dict[str, str | VehicleFile] = {k: text_of(v) for k, v in labelled.items()}
+    sets: dict[str, str | VehicleFile] = {str(k): plain(v) for k, v in labelled.items()}
+    for vehicle in sets.values():
+        check_model("vehicle", vehicle)
     table, _ = compare_vehicles(given, sets, [Path(path) for path in out])
     return table
 
@@ -171,7 +174,7 @@ def sensitivity(
     configure()
     from tuner.job.sensitivity import examine_vehicle  # noqa: PLC0415 (jax)
 
-    asked = ExaminationOptions.of(flights, **options)
+    asked = ExaminationOptions.of(flights=flights, **options)
     with engine_for(asked.workers, asked.cluster):
         command = f"tuner.sensitivity from Python: {asked.flights}"
         return examine_vehicle(asked, arena, command=command)
@@ -233,8 +236,7 @@ def simulate(
     configure()
     from tuner.evaluate.closed_loop import fly  # noqa: PLC0415 (jax)
 
-    given: dict[str, Any] = {name: text_of(value) for name, value in options.items()}
-    asked = SimulationOptions(trajectory=trajectory, **given)
+    asked = SimulationOptions.of(trajectory=trajectory, **options)
     with engine_for(asked.workers, asked.cluster):
         return tuple(fly(asked, grid=grid, forces=forces))
 
@@ -263,8 +265,7 @@ def export(run: Run | Named, format: str, **options: Any) -> Exported:  # noqa: 
     from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
     from tuner.exporters.export import export_draws, export_vehicle  # noqa: PLC0415
 
-    paths = {name: Path(options[name]) for name in ("into", "out") if options.get(name) is not None}
-    asked = ExportOptions(format, **options | paths)
+    asked = ExportOptions.of(format=format, **options)
     today = date.today()  # the user's own day
     if asked.draws is not None and asked.into is not None:
         raise ExportError("--draws", "do not go with --into", "leave one of them out")
@@ -276,8 +277,3 @@ def export(run: Run | Named, format: str, **options: Any) -> Exported:  # noqa: 
         of = read_run(run)
     writes = export_run if asked.draws is None else export_draws
     return writes(of, asked, today=today)
-
-
-def text_of(named: Path | T) -> str | T:
-    """Return a path as text, and anything else as it is."""
-    return str(named) if isinstance(named, Path) else named

@@ -29,12 +29,47 @@ Method = Literal["auto", "gradient", "cma", "hybrid"]
 
 FILES = ("flights", "vehicle", "controller", "config", "topics")
 """Options that name files, or what they hold."""
+MODELS = ("vehicle", "controller")
+"""Options that name a file or, from Python, may be what such a file holds."""
+PATHS = ("into", "out")
+"""Options that name what is written."""
 IN_JOB_FILE: Mapping[str, str] = {"fit": "free", "fix": "fixed", "global_": "global_method"}
 """Option -> what the job file, and Python, call it where that differs."""
 
 
+class FromPython:
+    """Options that a function of Python takes by their names."""
+
+    @classmethod
+    def of(cls, **given: Any) -> Self:
+        """Return options as Python gives them: ``free`` and ``fixed``, and paths for text.
+
+        Raises
+        ------
+        ConfigError
+            There is no such option, or its value is of another type or out of range.
+        """
+        from tuner.core.yaml_section import build, section_of  # noqa: PLC0415 (pydantic)
+
+        types = {field.name: field.type for field in fields(cls)}  # type: ignore[arg-type]
+        option_of = {IN_JOB_FILE.get(name, name): name for name in types}
+        for name in given:
+            if name not in option_of:
+                raise ConfigError(name, "is no option", did_you_mean(name, option_of))
+        words = {option_of[name]: plain(value) for name, value in given.items()}
+        if isinstance(words.get("flights"), str):
+            words["flights"] = [words["flights"]]
+        models = [name for name in MODELS if words.get(name) is not None]
+        for name in models:
+            check_model(name, words[name])
+        checked = {name: value for name, value in words.items() if name not in models}
+        build(section_of(cls, leaving=models), checked, "options")
+        folders = {name: Path(words[name]) for name in PATHS if words.get(name) is not None}
+        return cls(**words | folders)
+
+
 @dataclass(frozen=True)
-class FlightOptions:
+class FlightOptions(FromPython):
     """Recordings, and what flew."""
 
     flights: Names
@@ -44,28 +79,6 @@ class FlightOptions:
     """Simulate this controller (file or shipped). Default: the job file's, else hovergames."""
     config: str | None = None
     """Read settings from this job file. Default: tune.yaml beside the flights, if there is one."""
-
-    @classmethod
-    def of(cls, flights: str | Path | Sequence[str | Path], **given: Any) -> Self:
-        """Return options as Python gives them: ``free`` and ``fixed``, and paths for text.
-
-        Raises
-        ------
-        ConfigError
-            There is no such option.
-        """
-        option_of = {IN_JOB_FILE.get(field.name, field.name): field.name for field in fields(cls)}
-        for name in given:
-            if name not in option_of:
-                raise ConfigError(name, "is no option", did_you_mean(name, option_of))
-        words = {
-            option_of[name]: str(value) if isinstance(value, Path) else value
-            for name, value in given.items()
-        }
-        if words.get("out") is not None:
-            words["out"] = Path(words["out"])
-        paths = [flights] if isinstance(flights, str | Path) else flights
-        return cls([str(path) for path in paths], **words)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -158,7 +171,7 @@ class Options(RunOptions, FitOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrajectoryOptions:
+class TrajectoryOptions(FromPython):
     """A trajectory, and what flies it."""
 
     trajectory: str
@@ -191,7 +204,7 @@ class SimulationOptions(EngineOptions, TrajectoryOptions):
 
 
 @dataclass(frozen=True)
-class ExportOptions:
+class ExportOptions(FromPython):
     """The format that coefficients are written in, and where.
 
     Attributes
@@ -246,3 +259,28 @@ def taking(options: type) -> Callable[[F], F]:
         return function
 
     return shown
+
+
+def plain(value: Any) -> Any:
+    """Return paths as text, one or a list of them, and NumPy's numbers as Python's."""
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value.item() if getattr(value, "shape", None) == () else value
+
+
+def check_model(kind: str, value: object) -> None:
+    """Refuse what is neither the name of a vehicle or controller nor one itself.
+
+    Raises
+    ------
+    ConfigError
+        It is something else.
+    """
+    from tuner.vehicle import ControllerFile, VehicleFile  # noqa: PLC0415 (pydantic)
+
+    model = VehicleFile if kind == "vehicle" else ControllerFile
+    if not isinstance(value, str | model):
+        remedy = f"give a file, the name of a shipped {kind} or a {model.__name__}"
+        raise ConfigError(kind, f"is of type {type(value).__name__}", remedy)

@@ -393,6 +393,21 @@ def forget(folder: Path) -> None:
         remove_file(folder / name)
 
 
+def result_folder(folder: str | Path) -> Path:
+    """Return a folder of results that is there, and out of which no link leads.
+
+    Raises
+    ------
+    InputError
+        It is no folder, or a link leads out of it.
+    """
+    folder = Path(folder)
+    if not (exists(folder) and folder.is_dir()):
+        raise InputError(folder, "is no folder", "give the result folder of a run")
+    check_links(folder, IN_FOLDER)
+    return folder
+
+
 def read_run(folder: str | Path) -> Run:
     """Read a result folder.
 
@@ -402,10 +417,7 @@ def read_run(folder: str | Path) -> Run:
         It is no result folder, or is of another schema version, its two files disagree, or a link
         leads out of it.
     """
-    folder = Path(folder)
-    if not (exists(folder) and folder.is_dir()):
-        raise InputError(folder, "is no folder", "give the result folder of a run")
-    check_links(folder, IN_FOLDER)
+    folder = result_folder(folder)
     result = RunResult.read(folder, REMEDY)
     effective = result.effective
     for name in (*result.coefficients, *(effective.coefficients if effective else ())):

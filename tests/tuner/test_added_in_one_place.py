@@ -112,13 +112,15 @@ def test_an_option_is_one_field_for_the_command_line_python_the_job_file_and_htt
     bag.touch()
     (tmp_path / "tune.yaml").write_text("search: {starts: 2, seed: 7}\n")
     typed = app(["--flights", str(bag), "--starts", "3"])
-    assert typed == MoreOptions.of([bag], starts=3)
+    assert typed == MoreOptions.of(flights=[bag], starts=3)
     settled = resolve_settings(typed).job.search
     assert (settled.starts, settled.seed) == (3, 7)
     with pytest.raises(ConfigError, match="command line: starts is 9; it should be at most 8"):
-        resolve_settings(MoreOptions.of([bag], starts=9))
+        resolve_settings(MoreOptions([str(bag)], starts=9))
+    with pytest.raises(ConfigError, match="options: starts is 9; it should be at most 8"):
+        MoreOptions.of(flights=[bag], starts=9)
     with pytest.raises(ConfigError, match=r"stats: is no option; did you mean 'starts'\?"):
-        MoreOptions.of([bag], stats=3)
+        MoreOptions.of(flights=[bag], stats=3)
     of_http = section_of(MoreOptions, leaving=FILES)
     assert build(of_http, {"starts": 3}, "the request").starts == 3
     with pytest.raises(ConfigError, match="starts is '3'; it should be a whole number"):

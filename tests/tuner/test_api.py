@@ -16,8 +16,10 @@ from tuner.cli.commands import sensitivity as sensitivity_command
 from tuner.cli.commands import simulate as simulate_command
 from tuner.cli.tune import tune as tune_command
 from tuner.core.errors import InputError
+from tuner.core.shipped import configs_folder
 from tuner.vehicle import ControllerFile, with_values
 
+UPDATED = configs_folder() / "vehicles" / "hovergames_updated.yaml"
 #: Function -> its command, and what each calls by another name or has alone.
 PEERS = {
     api.fit: (
@@ -122,6 +124,35 @@ def test_wrong_input_is_the_same_one_line(tmp_path):
         tuner.compare([tmp_path / "gone.bag"], ["hovergames"])
     with pytest.raises(InputError, match="shipped vehicles"):
         tuner.simulate("circle", vehicle="nope")
+
+
+@pytest.mark.parametrize(
+    ("function", "given", "words"),
+    [
+        (api.fit, {"mass": "2"}, "options: mass is '2'; it should be a number"),
+        (api.fit, {"out": 3}, "options: out is 3; it should be the name of a file"),
+        (api.fit, {"flights": [None]}, r"options: flights\[0\] is None; it should be text"),
+        (api.fit, {"vehicle": ControllerFile()}, "vehicle: is of type ControllerFile; give"),
+        (api.sensitivity, {"controller": 3}, "controller: is of type int; give"),
+        (api.simulate, {"trajectory": "circle", "speed": [3.0]}, r"options: speed is \[3.0\]"),
+        (api.simulate, {"trajectory": "circle", "sped": 3.0}, "did you mean 'speed'"),
+        (api.simulate, {"trajectory": "circle", "grid": [1.0]}, "unknown coefficient '1.0'"),
+        (api.compare, {"vehicles": {"a": 3}}, "vehicle: is of type int; give"),
+        (api.export, {"run": "x", "format": "sdf", "draws": 1.5}, "it should be a whole number"),
+        (api.export, {"run": "x", "format": 3}, "options: format is 3; it should be text"),
+    ],
+)
+def test_a_value_of_another_type_is_one_line_too(function, given, words, bag):
+    recorded = function in {api.fit, api.sensitivity, api.compare}
+    with pytest.raises(InputError, match=words):
+        function(**({"flights": str(bag)} if recorded else {}) | given)
+
+
+def test_numbers_of_numpy_and_paths_are_taken():
+    (flight,) = tuner.simulate(
+        "circle", vehicle=UPDATED, duration=np.float32(4.0), speed=np.array(1.0)
+    )
+    assert flight.time[-1] == 4.0
 
 
 def test_a_fit_keeps_algebra_on_one_thread_and_gives_the_others_back(bag, monkeypatch):

@@ -111,7 +111,7 @@ class Client:
         ServerFaultError
             The server could not finish the job.
         """
-        given = FitOptions.of(flights, **options)
+        given = FitOptions.of(flights=flights, **options)
         place_for(None if out is None else Path(out))
         job = self.submit(given, name=name)
         self.wait(job)

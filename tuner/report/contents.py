@@ -10,15 +10,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import JsonValue
 
-from tuner.core.disk import check_links, exists, file_name, whole_file
-from tuner.core.errors import InputError
+from tuner.core.disk import file_name, whole_file
 from tuner.core.files import Part, ResultFile, read_arrays
 from tuner.core.numerics import Array
 from tuner.design.proposals import Proposals
 from tuner.evaluate.records import Table
 from tuner.findings.findings import Finding
 from tuner.ground.bench_json import BenchRecord
-from tuner.result import IN_FOLDER, ExportRecord, ExportRecords, Run, RunResult, read_run
+from tuner.result import (
+    ExportRecord,
+    ExportRecords,
+    Run,
+    RunResult,
+    read_run,
+    result_folder,
+)
 from tuner.search.iteration import Iteration, Outcome
 from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles
 
@@ -68,10 +74,7 @@ def read_contents(folder: str | Path) -> Contents:
     InputError
         It is neither, or one of its files cannot be used.
     """
-    folder = Path(folder)
-    if not (exists(folder) and folder.is_dir()):
-        raise InputError(folder, "is no folder", "give the result folder of a run")
-    check_links(folder, IN_FOLDER)
+    folder = result_folder(folder)
     run, about = None, About.read_if_any(folder)
     if about is None or (folder / RunResult.FILE).exists():
         run = read_run(folder)

@@ -383,7 +383,7 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
         "left-out flights": parts.left_out,
         "left-out terms": parts.terms,
         "step": parts.step,
-        "voltmeter": parts.readings,
+        "recorded inputs": parts.readings,
         "what the model lacks": parts.lack,
         "rest of the search": parts.search,
         "the rotors' limit": parts.limit,

@@ -1,6 +1,7 @@
 """The command `tune sensitivity` on a recording, from the command line and from Python."""
 
 import json
+import shutil
 
 import pytest
 
@@ -9,6 +10,7 @@ from tuner.cli import main
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
 from tuner.job.results import arena_of
+from tuner.report.contents import read_contents
 from tuner.result import OF_A_RUN
 from tuner.vehicle import ControllerFile
 
@@ -97,6 +99,16 @@ def test_a_wrong_arena_is_one_line_and_writes_nothing(bag, tmp_path, capsys, are
     assert expected in err
     assert err.count("\n") == 1
     assert not out.exists()
+
+
+def test_a_link_that_leads_out_of_its_folder_is_not_followed(examined, tmp_path):
+    folder = tmp_path / "examined"
+    shutil.copytree(examined.folder, folder)
+    read_contents(folder)
+    (folder / "report.html").unlink()
+    (folder / "report.html").symlink_to(examined.folder / "report.html")
+    with pytest.raises(InputError, match=r"report\.html: is a link that leads out"):
+        read_contents(folder)
 
 
 def test_the_other_way_round_is_refused_too(bag):
