@@ -13,7 +13,7 @@ fits to its other sections.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from tuner.core.numerics import Array, scaled_solve
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point, SegmentSums, units_of
 from tuner.objective.information import BLOCK_S, FisherInformation, information_at, with_secants
-from tuner.objective.normal_equations import Objective, flight_batches
+from tuner.objective.normal_equations import Objective, flight_batch, flight_batches
 from tuner.objective.residuals import huber_loss
 from tuner.objective.space import Space
 from tuner.search.continuation import RIDGE
@@ -65,6 +65,8 @@ class LinearisedLoss:
         (P,) of the columns, a condition's once for each flight; empty if not needed.
     neutral
         (P,) scaled neutral values, at which a term is absent; zero by default.
+    readings
+        (D, P) changes of the gradient with readings of the battery's voltmeter drawn again.
     """
 
     scaled: Array
@@ -80,6 +82,7 @@ class LinearisedLoss:
     condition_columns: int = 0
     names: tuple[str, ...] = ()
     neutral: Array | None = None
+    readings: Array | None = None
 
     @cached_property
     def _by_name(self) -> dict[str, list[int]]:
@@ -244,6 +247,7 @@ def linearise(
     *,
     offsets_fitted: NDArray[np.bool_],
     conditions: Sequence[str] = (),
+    readings: Collection[Objective] = (),
 ) -> LinearisedLoss:
     """Return the linear approximation of a fit, from one Jacobian by all of its parameters.
 
@@ -260,6 +264,8 @@ def linearise(
         (offsets, N) which offsets move with the others.
     conditions
         Names of conditions, whose columns follow those of the coefficients, N for each.
+    readings
+        The problem with readings of the battery's voltmeter drawn again.
     """
     parts, loss = [], 0.0
     half = replace(objective, memory=objective.memory // 2)
@@ -271,9 +277,15 @@ def linearise(
             partial(batch[0].residuals, criterion=batch[2]),
         )
         fitted = offsets_fitted[: len(offsets_fitted) - len(conditions), flights]
+        others = {
+            str(number): flight_batch(other, point, criterion, flights)[0].residuals(*batch[1:])
+            for number, other in enumerate(readings)
+        }
         parts.append(
             information_at(
-                *_with_free_conditions(*batch, jacobian, conditions), offsets_fitted=fitted
+                *_with_free_conditions(*batch, jacobian, conditions),
+                offsets_fitted=fitted,
+                alternatives=others,
             )
         )
         loss += _loss_of(batch[0], batch[2], jacobian)
@@ -408,6 +420,13 @@ def linearised_from(
             count + flights * np.arange(condition_count) + flight[:, None],
         ]
     )
+    changes = np.array([change.across.sum(axis=(0, 2)) for change in information.changes.values()])
+    readings = None
+    if len(changes):
+        readings = np.zeros((len(changes), len(scaled)))
+        for segment, number_of in enumerate(information.flight):
+            seen = [*range(count), *(count + flights * np.arange(condition_count) + number_of)]
+            readings[:, seen] += changes[:, segment]
     return LinearisedLoss(
         scaled=scaled,
         hessian=hessian[flown],
@@ -422,6 +441,7 @@ def linearised_from(
         condition_columns=condition_count * flights,
         names=names,
         neutral=neutral,
+        readings=readings,
     )
 
 

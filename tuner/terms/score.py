@@ -17,6 +17,7 @@ from tuner.objective.information import BLOCK_S
 from tuner.search.continuation import RIDGE
 from tuner.terms.linearisation import FLIGHT_SECTIONS, Columns, LinearisedLoss
 from tuner.uncertainty.covariance import STRETCH_S
+from tuner.uncertainty.estimates import STUDENT_FACTOR
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 
@@ -471,7 +472,8 @@ def _hotelling_chance(
     """Return the p-value of a group's score by Hotelling's T².
 
     Gusts in a closed loop outlast a stretch, so the covariance of the summed score is Newey and
-    West's (1987) estimate, with correlated neighbours.
+    West's (1987) estimate, with correlated neighbours. Errors of the battery's voltage outlast a
+    manoeuvre: their covariance, from readings of the voltmeter drawn again, is added.
 
     Parameters
     ----------
@@ -493,16 +495,22 @@ def _hotelling_chance(
     parts = [seen]
     if one_section_may_err:
         parts += [seen & ~out for out in linear.folds(_sections(linear.flight))]
-    called = without - with_group
-    return max(_hotelling_chance_in(part, called, with_group, linear.flight) for part in parts)
+    called, read = without - with_group, np.zeros((1, len(group)))
+    if linear.readings is not None:
+        read = linear.readings[:, group] - linear.readings[:, model] @ follow
+    read = STUDENT_FACTOR / np.sqrt(len(read)) * read
+    return max(
+        _hotelling_chance_in(part, called, with_group, linear.flight, read) for part in parts
+    )
 
 
 def _hotelling_chance_in(
-    part: NDArray[np.bool_], called: Array, scores: Array, flight: NDArray[np.intp]
+    part: NDArray[np.bool_], called: Array, scores: Array, flight: NDArray[np.intp], read: Array
 ) -> float:
     """Return the p-value of ``called`` (S, L) summed over a part (S,), by scatter of ``scores``.
 
-    Stretches outside the part still separate their neighbours.
+    Stretches outside the part still separate their neighbours. ``read`` (D, L) has the covariance
+    of errors that all stretches share: the sum of its rows' squares.
     """
     count, size = float(part.sum()), scores.shape[1]
     if count <= size + 1:
@@ -510,6 +518,7 @@ def _hotelling_chance_in(
     scores = scores * part[:, None]
     unit = 1.0 / np.sqrt(np.maximum((scores**2).sum(axis=0), 1e-300))
     spread = long_run_covariance(scores * unit, flight) * count / (count - 1.0)
+    spread += (read * unit).T @ (read * unit)
     along = called[part].sum(axis=0) * unit
     hotelling = max(float(along @ scaled_solve(spread + RIDGE * np.eye(size), along)), 0.0)
     return float(fdtrc(size, count - size, hotelling * (count - size) / (size * (count - 1.0))))

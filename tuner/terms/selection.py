@@ -68,6 +68,7 @@ from tuner.uncertainty.model_error import (
     gain_by_commands,
     gains_far_off,
     model_errors_of,
+    with_other_readings,
 )
 from tuner.vehicle import COEFFICIENTS, term_groups
 from tuner.vehicle.model import with_coefficients
@@ -295,6 +296,7 @@ class Selection:
             fitted.criterion,
             offsets_fitted=np.asarray(at.offsets) != 0.0,
             conditions=conditions_of(self.candidates),
+            readings=with_other_readings(objective, at, self.job.fitted).values(),
         )
         return LinearisedFit(fitted, added, linear)
 

@@ -258,7 +258,7 @@ def alternatives_of(
     return {
         STEP: replace(objective, schedule=finer),
         **limited,
-        **_with_other_readings(objective, point, flights),
+        **with_other_readings(objective, point, flights),
     }
 
 
@@ -312,14 +312,14 @@ def _with_speeds_earlier(objective: Objective, seconds: float) -> Objective:
     return replace(objective, segments=replace(objective.segments, measured=measured))
 
 
-def _with_other_readings(
+def with_other_readings(
     objective: Objective, point: Point, flights: Sequence[Flight]
 ) -> dict[str, Objective]:
-    """Return problems with voltmeter readings drawn again, if the fit uses them."""
+    """Return problems with voltmeter readings drawn again, if a fit of whole flights uses them."""
     segments = objective.segments
     vehicle = objective.model_at(point.coefficients).vehicle
     matters = bool(float(vehicle.effects.get("battery_exponent", 0.0)))
-    if not flights or segments.log_voltage is None or not matters:
+    if not flights or segments.windowed or segments.log_voltage is None or not matters:
         return {}
     windows = [Window(flight, 0.0) for flight in flights]
     as_read = log_voltage_of(flights, windows, objective.schedule)

@@ -29,11 +29,12 @@ from tuner.objective.battery import (
     with_reference_voltage,
 )
 from tuner.objective.criterion import Point
-from tuner.objective.normal_equations import normal_equations
+from tuner.objective.normal_equations import normal_equations, with_conditions
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, InitialState, Series
+from tuner.terms.linearisation import linearise
 from tuner.uncertainty.estimates import STEP, VOLTMETER_DRAWS
-from tuner.uncertainty.model_error import alternatives_of
+from tuner.uncertainty.model_error import alternatives_of, with_other_readings
 
 NOISE = 0.02
 
@@ -311,3 +312,35 @@ def test_a_fit_is_simulated_with_other_readings_where_they_matter_to_it(exponent
         assert 0.0 < off.std() < NOISE
     assert list(alternatives_of(fit, point)) == [STEP]
     assert list(alternatives_of(plain, point, flights)) == [STEP]
+
+
+def test_a_linear_approximation_knows_the_gradients_with_other_readings():
+    """Of a fit without error they are those of the other problems, of each flight's wind, too."""
+    flights = [loaded(seed)[0] for seed in range(2)]
+    plain = problem(("battery_exponent", "input_scaling"))
+    windows = [Window(known, 0.0) for known in flights]
+    volts = np.exp(np.asarray(log_voltage_of(flights, windows, plain.schedule)))
+    fit = with_battery(plain, volts)
+    vector = fit.space.vector_of({"battery_exponent": 1.0, "input_scaling": 1000.0})
+    fit, at = with_conditions(fit, Point(jnp.asarray(vector), jnp.zeros((5, 2))), ("wind_x",))
+    fit = with_data(fit, at)
+    others = list(with_other_readings(fit, at, flights).values())
+
+    def linear(objective, readings=()):
+        return linearise(
+            objective,
+            at,
+            criterion_of(objective),
+            offsets_fitted=np.zeros((6, 2), bool),
+            conditions=("wind_x",),
+            readings=readings,
+        )
+
+    here = linear(fit, others[:2])
+    assert here.readings.shape == (2, 4)
+    for other, gradient in zip(others[:2], here.readings, strict=True):
+        there = linear(other)
+        expected = there.gradients(np.zeros(4)).sum(axis=0)
+        assert np.all(np.abs(expected) > 1e-3)
+        np.testing.assert_allclose(gradient, expected, rtol=0.05, atol=0.01 * abs(expected).max())
+    assert linear(fit).readings is None

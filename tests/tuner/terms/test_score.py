@@ -83,6 +83,19 @@ def test_a_term_of_the_truth_earns_its_place():
     assert first.gain_fit == pytest.approx(first.gain_holdout, rel=0.05)
 
 
+@pytest.mark.parametrize(("size", "accepted"), [(0.1, True), (1.0, False)])
+def test_a_term_that_the_voltmeters_errors_explain_is_not_significant(size, accepted):
+    """They act in all stretches at once, so that no scatter between these shows them."""
+    linear = linear_fit(0.5)
+    follow = np.linalg.solve(linear.information()[:1, :1], linear.information()[:1, 1:2])
+    read = size * linear.information()[1] * np.array([[1.0], [-1.0]])
+    read[:, 0] += 100.0 * read[:, 1]
+    read[:, 1:2] += 100.0 * read[:, 1:2] @ follow  # a change that the model takes up counts not
+    found = score(replace(linear, readings=read), MODEL, FIRST, candidates=2)
+    assert found.is_accepted is accepted
+    assert found.gain_fit == score(linear, MODEL, FIRST, candidates=2).gain_fit
+
+
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("correlated", [False, True])
 def test_noise_buys_no_term_even_where_it_is_correlated_in_time(seed, correlated):
