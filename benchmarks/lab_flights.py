@@ -512,6 +512,8 @@ def _measured(
     for name, deviation in NOISE.items():
         measured[name] = measured[name] + deviation * random.normal(size=measured[name].shape)
     read = np.arange(len(signals["lap"])) % READ_EVERY == 0
-    volts = measured["battery_voltage"] + METER * random.normal(size=(len(read), 1))
+    before = np.maximum(HOVER - np.arange(len(read)) / RATE, 0.0)[:, None]
+    volts = measured["battery_voltage"] + ROTORS * CURRENT * lab.drain * before
+    volts = volts + METER * random.normal(size=(len(read), 1))
     measured["battery_voltage"] = np.where(read[:, None], volts, np.nan)
     return measured

@@ -11,7 +11,19 @@ import pytest
 from benchmarks import lab as laboratory
 from benchmarks import lab_flights
 from benchmarks.lab import Kept, Trial, _rows, _voltages, keep, kept, section
-from benchmarks.lab_flights import KNOWN, METER, SECONDS, UNKNOWN, Effect, drawn, effect_of
+from benchmarks.lab_flights import (
+    CURRENT,
+    KNOWN,
+    METER,
+    RATE,
+    READ_EVERY,
+    ROTORS,
+    SECONDS,
+    UNKNOWN,
+    Effect,
+    drawn,
+    effect_of,
+)
 from sim_jax.constants import GRAVITY
 from sim_jax.schedule import Schedule
 from tuner.findings.findings import Code, Finding
@@ -69,8 +81,9 @@ def test_several_effects_are_two_or_three_of_them(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_what_no_coefficient_describes_changes_the_recordings(monkeypatch, tmp_path, name):
-    """And nothing in them before a rotor is damaged."""
+    """And nothing in them before a rotor is damaged. The battery drains in the hover, too."""
     monkeypatch.setattr(lab_flights, "CHOICE", name)
+    monkeypatch.setattr(lab_flights, "METER", 0.0)
     monkeypatch.setattr(lab_flights, "PHYSICS", 400)
     monkeypatch.setattr(lab_flights, "SAGS", 1)
     effect = effect_of(0, seconds=SECONDS, flights=3, log_rate=100.0)
@@ -78,6 +91,9 @@ def test_what_no_coefficient_describes_changes_the_recordings(monkeypatch, tmp_p
     monkeypatch.setattr(lab_flights, "write_bag", lambda simulation, _: flown.append(simulation))
     for lab in (drawn(0), drawn(0, effect)):
         lab_flights.write(lab, tmp_path, seed=0)
+    volts = flown[0].signals["battery_voltage"][flown[0].time < 0.0]
+    fall = np.diff(volts[np.isfinite(volts)]) * RATE / READ_EVERY
+    np.testing.assert_allclose(fall, -ROTORS * CURRENT * drawn(0).drain, rtol=1e-6)
     pairs = list(zip(flown[:4], flown[4:], strict=True))
     moved = [
         np.abs(after.signals["rotor_speed"] - before.signals["rotor_speed"]).max(axis=1)
