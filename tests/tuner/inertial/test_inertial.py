@@ -137,7 +137,7 @@ def test_air_that_drags_at_the_rotors_is_not_taken_for_inertia(name, tmp_path):
     """At 4 m/s the moment of the shipped rotor drag is three times that of the turning, or more."""
     vehicle = read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml")
     (flown,) = fly(
-        SimulationOptions(trajectory=name, vehicle=vehicle, speed=4.0, duration=30.0, rate=400.0)
+        SimulationOptions(trajectory=name, vehicle=vehicle, speed=4.0, duration=16.0, rate=400.0)
     )
     settings = settings_for(log_file(flown, tmp_path / "log00", noise=0.0), vehicle)
     fitted = fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "run")

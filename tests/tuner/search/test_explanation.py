@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.docs.recorded import write_lab
 from tuner.config import Options
 from tuner.core.errors import OutputError
 from tuner.findings.findings import MAX_FINITE, Code, Finding, one_line
@@ -17,7 +18,6 @@ from tuner.search.findings import Explanation
 from tuner.terms import refit_with_disturbances as disturbances
 from tuner.uncertainty.verdict import Verdict
 
-FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 JOB = """
 terms: none
 disturbances: none
@@ -74,8 +74,9 @@ def test_flights_that_hardly_tell_anything_end_in_a_result(
     """
     job, folder, told = tmp_path / "job.yaml", tmp_path / "run", list[str]()
     job.write_text(JOB)
-    flights = [str(FLIGHTS / f"{name}.bag") for name in ("circle_3mps", "yaw_spin_3rps")]
-    options = Options(flights=flights, config=str(job))
+    write_lab(tmp_path)
+    flights = [str(tmp_path / f"{name}.bag") for name in ("circle_3mps", "yaw_spin_3rps")]
+    options = Options(flights=flights, vehicle="hovergames", config=str(job))
     for broken in (False, True):
         if broken:
             monkeypatch.setattr(disturbances, "hold_undetermined", fails)
