@@ -19,9 +19,8 @@ from tuner.core.disk import inside, make_folder, write_text
 from tuner.core.errors import ConfigError, ExportError, InputError
 from tuner.core.files import csv_text
 from tuner.core.numerics import Array, symmetric_eigen
-from tuner.exporters.simulators import ISAAC_LAB
 from tuner.exporters.target import Target, write
-from tuner.exporters.targets.isaaclab import configuration, isaaclab_text
+from tuner.exporters.targets.isaaclab import ISAAC_LAB, configuration, isaaclab_text
 from tuner.result import Run
 from tuner.uncertainty.records import Knowledge
 from tuner.vehicle import COEFFICIENTS, VehicleFile, values_of, with_values

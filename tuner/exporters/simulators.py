@@ -1,8 +1,8 @@
-"""Rotor speed and thrust, and the physics of each simulator, with source and version.
+"""Rotor speed and thrust, descriptions of simulators, and laws that several of them share.
 
 A simulator differs from the fitted physics by coefficients with a built-in value
 (`Simulator.entry`) and by its laws (`Simulator.laws`). Both give a vehicle with which the project's
-own simulation flies like that simulator.
+own simulation flies like that simulator. Those of one export target stand in its module.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ Laws = Callable[[VehicleFile], VehicleFile]
 _SETUP_ENTRY = NotCarried("it belongs to the set-up, not to the vehicle")
 
 
-def _with_body_torque(vehicle: VehicleFile) -> VehicleFile:
+def with_body_torque(vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle whose rotors' reaction torque acts about the body's z axis."""
     return vehicle.replace(aerodynamics=vehicle.aerodynamics.replace(reaction_torque="body"))
 
@@ -116,7 +116,7 @@ class Simulator:
     source: str
     deviations: tuple[str, ...]
     entry: Callable[[Coefficient], Entry | None]
-    laws: Laws = _with_body_torque
+    laws: Laws = with_body_torque
     free: tuple[str, ...] = ()
     ties: tuple[tuple[str, ...], ...] = ()
     fixed: tuple[str, ...] = ()
@@ -145,20 +145,29 @@ class Simulator:
 
     def with_built_in(self, vehicle: VehicleFile, names: Collection[str]) -> VehicleFile:
         """Return a vehicle with built-in values of some coefficients."""
-        effects = {name: value for name, value in vehicle.effects.items() if name not in names}
         built_in = {
             name: value
             for name in names
             if name in COEFFICIENTS and not COEFFICIENTS[name].is_effect
             if (value := self.built_in(name)) is not None
         }
-        return with_values(vehicle.replace(effects=effects), built_in)
+        return with_values(with_effects(vehicle, names), built_in)
+
+
+def with_effects(
+    vehicle: VehicleFile,
+    without: Collection[str],
+    effects: Mapping[str, float] = MappingProxyType({}),
+) -> VehicleFile:
+    """Return a vehicle without some effects, and with others."""
+    left = {name: value for name, value in vehicle.effects.items() if name not in without}
+    return vehicle.replace(effects={**left, **effects})
 
 
 # laws
 
 
-def _with_mean_lag(vehicle: VehicleFile) -> VehicleFile:
+def with_mean_lag(vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle with the mean lag for rotors that speed up or slow down."""
     motor = vehicle.motor
     lag = fmean((motor.time_constant_up, motor.time_constant_down))
@@ -178,32 +187,27 @@ def drag_at_hover(vehicle: VehicleFile) -> tuple[float, float, float]:
     return rotors + body[0], rotors * ratio + body[1], inflow + body[2]
 
 
-def _with_linear_drag(vehicle: VehicleFile, drag: tuple[float, float, float]) -> VehicleFile:
+def with_linear_drag(vehicle: VehicleFile, drag: tuple[float, float, float]) -> VehicleFile:
     """Return a vehicle with a linear drag of the body instead of rotor drag."""
-    effects = {
-        name: value
-        for name, value in vehicle.effects.items()
-        if name not in ("rotor_drag_ratio_y", "thrust_inflow_coefficient")
-    }
-    effects |= dict(zip((f"linear_drag_{axis}" for axis in "xyz"), drag, strict=True))
     aerodynamics = vehicle.aerodynamics.replace(rotor_drag_coefficient=0.0)
-    return vehicle.replace(effects=effects, aerodynamics=aerodynamics)
+    return with_effects(
+        vehicle.replace(aerodynamics=aerodynamics),
+        ("rotor_drag_ratio_y", "thrust_inflow_coefficient"),
+        dict(zip(LINEAR_DRAG, drag, strict=True)),
+    )
 
 
-def _with_one_drag(vehicle: VehicleFile) -> VehicleFile:
+def with_one_drag(vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle with the mean linear drag along x and y in all directions."""
     x, y, _ = drag_at_hover(vehicle)
-    return _with_linear_drag(vehicle, (fmean((x, y)),) * 3)
+    return with_linear_drag(vehicle, (fmean((x, y)),) * 3)
 
 
-def _with_one_damping(vehicle: VehicleFile) -> VehicleFile:
+def with_one_damping(vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle with the mean damping of rotation about all axes."""
-    names = [f"angular_drag_{axis}" for axis in "xyz"]
-    damping = fmean(max(vehicle.effects.get(name, 0.0), 0.0) for name in names)
-    effects = {name: value for name, value in vehicle.effects.items() if name not in names}
-    if damping > 0:
-        effects |= dict.fromkeys(names, damping)
-    return vehicle.replace(effects=effects)
+    damping = fmean(max(vehicle.effects.get(name, 0.0), 0.0) for name in ANGULAR_DRAG)
+    damped = dict.fromkeys(ANGULAR_DRAG, damping) if damping > 0 else {}
+    return with_effects(vehicle, ANGULAR_DRAG, damped)
 
 
 def with_linear_thrust(vehicle: VehicleFile, *, idle: bool) -> VehicleFile:
@@ -240,26 +244,6 @@ def with_linear_thrust(vehicle: VehicleFile, *, idle: bool) -> VehicleFile:
             max_rotor_velocity=full,
         ),
         aerodynamics=aerodynamics.replace(motor_constant=1.0 / unit, thrust_law="linear"),
-    )
-
-
-def with_linear_hover(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle whose thrust is linear in the command, with the same hover throttle.
-
-    Its moments of inertia are scaled like the slope of thrust over command in the hover, so that it
-    turns like the vehicle.
-    """
-    hover, step = hover_command(vehicle), 1e-4
-    if hover is None or vehicle.aerodynamics.thrust_law == "linear":
-        return with_linear_thrust(vehicle, idle=False)
-    slope = [thrust_at(vehicle, rotor_speed(vehicle, hover + sign * step)) for sign in (-1, 1)]
-    thrust = vehicle.mass * GRAVITY / len(vehicle.rotors)
-    ratio = (slope[1] - slope[0]) / (2 * step) / (thrust / hover)
-    linear, inertia = with_linear_thrust(vehicle, idle=False), vehicle.inertia
-    full = hover_speed(vehicle) / hover
-    return linear.replace(
-        inertia=inertia.replace(**{axes: value / ratio for axes, value in inertia}),
-        motor=linear.motor.replace(input_scaling=full, max_rotor_velocity=full),
     )
 
 
@@ -313,7 +297,7 @@ def _with_whole_speeds(vehicle: VehicleFile) -> VehicleFile:
         input_scaling=high - low, zero_position_armed=low, input_offset=0.0, quadratic=0.0
     )
     fastest = max(motor.max_rotor_velocity, high)
-    return _with_body_torque(vehicle.replace(motor=motor.replace(max_rotor_velocity=fastest)))
+    return with_body_torque(vehicle.replace(motor=motor.replace(max_rotor_velocity=fastest)))
 
 
 # simulators
@@ -359,40 +343,19 @@ GZ_SIM = Simulator(
     ),
     laws=_with_whole_speeds,
 )
-SIH = Simulator(
-    name="sih",
-    title="PX4's SIH",
-    version="PX4 1.16 (039af95d)",
-    source="src/modules/simulation/simulator_sih/sih.cpp",
-    deviations=(
-        "thrust is linear in the command, and zero without one",
-        "the command lags, by one time constant",
-        "one drag in all directions, linear in the velocity and at the centre of mass",
-        "one damping of rotation about all axes",
-    ),
-    entry=registry_entries("px4"),
-    laws=lambda vehicle: _with_one_damping(
-        _with_one_drag(_with_mean_lag(with_linear_thrust(_with_body_torque(vehicle), idle=False)))
-    ),
-    free=("linear_drag_x", "linear_drag_y", "linear_drag_z"),
-    ties=(("linear_drag_x", "linear_drag_y", "linear_drag_z"),),
-    fixed=("input_scaling", "zero_position_armed", "time_constant_up", "time_constant_down"),
-    start=with_linear_hover,
-)
-
-_CENTRE = {f"center_of_mass_{axis}": "rotor positions" for axis in "xyz"}
-_MOTORS = ("input_scaling", "zero_position_armed", "input_offset", "quadratic")
+CENTRE = {f"center_of_mass_{axis}": "rotor positions" for axis in "xyz"}
+MOTORS = ("input_scaling", "zero_position_armed", "input_offset", "quadratic")
 _NOT_MODELLED = {
     "rolling_moment_coefficient": NotCarried("it has no such term", 0.0),
     "max_relative_airspeed": NotCarried("its thrust does not depend on the airspeed", NO_LOSS),
 }
 """Coefficients of Gazebo's motor model that the others lack, and why."""
 _BODY = ("mass", "inertia_xx", "inertia_yy", "inertia_zz")
-_LINEAR = ("linear_drag_x", "linear_drag_y", "linear_drag_z")
-_ANGULAR = ("angular_drag_x", "angular_drag_y", "angular_drag_z")
+LINEAR_DRAG = ("linear_drag_x", "linear_drag_y", "linear_drag_z")
+ANGULAR_DRAG = ("angular_drag_x", "angular_drag_y", "angular_drag_z")
 
 
-def _entries(title: str, *groups: tuple[str, ...], **keys: str) -> Callable[..., Entry]:
+def entries(title: str, *groups: tuple[str, ...], **keys: str) -> Callable[..., Entry]:
     """Return `Simulator.entry` of a simulator from its coefficients.
 
     Parameters
@@ -400,7 +363,7 @@ def _entries(title: str, *groups: tuple[str, ...], **keys: str) -> Callable[...,
     groups, keys
         Coefficients with their own names, beside body and motors, and coefficient -> key.
     """
-    held = {name: name for group in (_BODY, _MOTORS, *groups) for name in group} | keys
+    held = {name: name for group in (_BODY, MOTORS, *groups) for name in group} | keys
 
     def entry(row: Coefficient) -> Entry:
         if row.name in held:
@@ -414,29 +377,14 @@ def _entries(title: str, *groups: tuple[str, ...], **keys: str) -> Callable[...,
     return entry
 
 
-def _about_centre_of_mass(vehicle: VehicleFile) -> VehicleFile:
+def about_centre_of_mass(vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle whose rotor positions count from its centre of mass."""
-    offset = [vehicle.effects.get(name, 0.0) for name in _CENTRE]
-    effects = {name: value for name, value in vehicle.effects.items() if name not in _CENTRE}
+    offset = [vehicle.effects.get(name, 0.0) for name in CENTRE]
     rotors = tuple(
         rotor.replace(position=tuple(at - o for at, o in zip(rotor.position, offset, strict=True)))
         for rotor in vehicle.rotors
     )
-    return _with_body_torque(vehicle.replace(effects=effects, rotors=rotors))
-
-
-def _with_square_rotors(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle with rotors in a square around the centre of mass, at its height."""
-    arm = fmean(abs(rotor.position[axis]) for rotor in vehicle.rotors for axis in (0, 1))
-
-    def side(x: float) -> float:
-        return arm if x > 0 else -arm
-
-    rotors = tuple(
-        rotor.replace(position=(side(rotor.position[0]), side(rotor.position[1]), 0.0))
-        for rotor in vehicle.rotors
-    )
-    return _with_body_torque(vehicle.replace(rotors=rotors))
+    return with_body_torque(with_effects(vehicle.replace(rotors=rotors), CENTRE))
 
 
 THIS_PROJECT = Simulator(
@@ -447,99 +395,4 @@ THIS_PROJECT = Simulator(
     deviations=(),
     entry=lambda row: Written(".".join(row.place)),
     laws=lambda vehicle: vehicle,
-)
-MUJOCO = Simulator(
-    name="mujoco",
-    title="MuJoCo",
-    version="MuJoCo 3.3 to 4.0",
-    source="mujoco.readthedocs.io, XMLreference: actuator/general, dyntype filterexact",
-    deviations=(
-        "each rotor's thrust is an actuator's, which lags the control in N by one time constant",
-        "drag is linear in the velocity of the rotors' centre, at the hover's rotor speed",
-    ),
-    entry=_entries(
-        "MuJoCo",
-        _LINEAR,
-        _ANGULAR,
-        time_constant_up="dynprm",
-        time_constant_down="dynprm",
-        motor_constant="gainprm, ctrlrange",
-        moment_constant="gear",
-        rotor_drag_coefficient="biasprm",
-        thrust_inflow_coefficient="biasprm",
-        rotor_drag_ratio_y="biasprm",
-        **_CENTRE,
-    ),
-    laws=lambda vehicle: with_linear_thrust(
-        _with_mean_lag(_about_centre_of_mass(vehicle)), idle=True
-    ),
-    fixed=(*_MOTORS, "time_constant_up", "time_constant_down"),
-)
-ROTORPY = Simulator(
-    name="rotorpy",
-    title="RotorPy",
-    version="RotorPy 3.0.0",
-    source="rotorpy/vehicles/multirotor.py",
-    deviations=("one time constant, up and down",),
-    entry=_entries(
-        "RotorPy",
-        time_constant_up="tau_m",
-        time_constant_down="tau_m",
-        motor_constant="k_eta",
-        moment_constant="k_m",
-        rotor_drag_coefficient="k_d",
-        thrust_inflow_coefficient="k_z",
-        fuselage_drag="c_Dx, c_Dy, c_Dz",
-        flapping_moment_coefficient="k_flap",
-        **_CENTRE,
-    ),
-    laws=lambda vehicle: _with_mean_lag(_about_centre_of_mass(vehicle)),
-    ties=(("time_constant_up", "time_constant_down"),),
-)
-DRONE_MODELS = Simulator(
-    name="drone-models",
-    title="crazyflow (drone-models)",
-    version="drone-models 0.1.0, crazyflow 0.4.0",
-    source="drone_models/first_principles/model.py",
-    deviations=(
-        "drag is linear in the body's velocity, at the centre of mass",
-        "rotors sit in a square at the height of the centre of mass",
-        "the gyroscopic moment about forward has the other sign",
-    ),
-    entry=_entries(
-        "drone-models",
-        _LINEAR,
-        time_constant_up="rotor_dyn_coef",
-        time_constant_down="rotor_dyn_coef",
-        motor_constant="rpm2thrust",
-        moment_constant="rpm2torque",
-        rotor_drag_coefficient="drag_matrix",
-        rotor_inertia="prop_inertia",
-    ),
-    laws=lambda vehicle: _with_square_rotors(_with_linear_drag(vehicle, drag_at_hover(vehicle))),
-    free=("linear_drag_x", "linear_drag_y"),
-)
-ISAAC_LAB = Simulator(
-    name="isaaclab",
-    title="Isaac Lab",
-    version="Isaac Lab 2.3 to 3.0 (1ab6d6cf)",
-    source="isaaclab_contrib/actuators/thruster.py, assets/multirotor",
-    deviations=(
-        "one drag in all directions, linear in the velocity and at the centre of mass",
-        "one damping of rotation about all axes",
-    ),
-    entry=_entries(
-        "Isaac Lab",
-        _LINEAR,
-        _ANGULAR,
-        time_constant_up="tau_inc_range",
-        time_constant_down="tau_dec_range",
-        motor_constant="thrust_const_range",
-        moment_constant="torque_to_thrust_ratio",
-        rotor_drag_coefficient="linear_damping",
-        **_CENTRE,
-    ),
-    laws=lambda vehicle: _with_one_damping(_with_one_drag(_about_centre_of_mass(vehicle))),
-    free=_LINEAR,
-    ties=(_LINEAR,),
 )

@@ -90,6 +90,45 @@ def module_assignments(path: Path) -> dict[str, Any]:
     }
 
 
+def numbers_draft(
+    numbers: Callable[[VehicleFile], Mapping[str, Any]],
+    text: Callable[[VehicleFile, str], str],
+    read: Callable[[Path], Mapping[str, Any]],
+    *,
+    gates: Callable[[VehicleFile], tuple[Gate, ...]] = lambda _: (),
+    flier: Callable[[VehicleFile], Callable[..., Any] | None] = lambda _: None,
+) -> Callable[..., Draft]:
+    """Return the `Target.draft` of a format whose file holds nested numbers.
+
+    Parameters
+    ----------
+    numbers
+        The vehicle by its simulator's laws -> the numbers that its file must hold.
+    text
+        That vehicle, and provenance in one line -> the file.
+    read
+        A file -> the numbers that it holds.
+    gates
+        The vehicle -> conditions of the format's own.
+    flier
+        The vehicle by its simulator's laws -> `Draft.flier`.
+    """
+
+    def draft(vehicle: VehicleFile, provenance: str, simulator: Simulator, _: object) -> Draft:
+        flown = simulator.flown(vehicle)
+        wanted = flatten(numbers(flown))
+        return Draft(
+            text(flown, provenance),
+            flown,
+            (),
+            lambda path, _: differences(wanted, flatten(read(path))),
+            gates(vehicle),
+            flier=flier(flown),
+        )
+
+    return draft
+
+
 def xml_comment(text: str) -> str:
     """Return a line that an XML comment, and a Jinja template, may hold."""
     return re.sub(r"-(?=-)|\{(?=[{%#])", r"\g<0> ", text)

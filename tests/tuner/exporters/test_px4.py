@@ -3,9 +3,10 @@ import math
 import pytest
 
 from tuner.core.errors import ExportError
-from tuner.exporters.simulators import GZ_SIM, SIH
+from tuner.exporters.simulators import GZ_SIM
 from tuner.exporters.target import write
 from tuner.exporters.targets.px4 import (
+    SIH,
     outside_range,
     parameters,
     px4_draft,

@@ -14,8 +14,9 @@ from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.simulation_files import write_flights
 from tuner.exporters.export import export_vehicle
 from tuner.exporters.external_simulator import flier_of
-from tuner.exporters.simulators import MUJOCO, hover_command, thrust_to_weight
+from tuner.exporters.simulators import hover_command, thrust_to_weight
 from tuner.exporters.target import target_of, write
+from tuner.exporters.targets.mujoco import MUJOCO
 from tuner.options import ExportOptions
 from tuner.recordings.loader import load_flight
 from tuner.search.job_flights import Recording
@@ -36,6 +37,14 @@ def test_what_is_written_is_read_back_and_a_changed_number_is_seen(kind, vehicle
     assert "2.243" in text
     path.write_text(text.replace("2.243", "2.244"))
     assert draft.faults(path, {})
+
+
+def test_every_number_of_a_mujoco_model_is_read_back(vehicle, tmp_path):
+    target, path = target_of("mujoco"), tmp_path / "x.xml"
+    draft = target.draft(vehicle, "by a test", target.simulator, None)
+    upside_down = draft.text.replace('gear="0 0 1 0 0', 'gear="0 0 -1 0 0', 1)
+    path.write_text(upside_down)
+    assert draft.faults(path, {}) == ["rotor_0 gear[2] is -1.0, not 1.0"]
 
 
 @EVERY

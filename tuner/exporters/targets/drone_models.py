@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tomllib
 from collections.abc import Callable
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,17 @@ from tuner.core.disk import file_name
 from tuner.core.numerics import Array
 from tuner.core.yaml_document import commented
 from tuner.exporters.external_simulator import flier_of
-from tuner.exporters.simulators import DRONE_MODELS, rotor_speed, thrust_at
-from tuner.exporters.target import PLACE_TOLERANCE_M, Draft, Target, differences, flatten, read_file
+from tuner.exporters.simulators import (
+    LINEAR_DRAG,
+    Simulator,
+    drag_at_hover,
+    entries,
+    rotor_speed,
+    thrust_at,
+    with_body_torque,
+    with_linear_drag,
+)
+from tuner.exporters.target import PLACE_TOLERANCE_M, Target, numbers_draft, read_file
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
@@ -47,29 +57,35 @@ def params(vehicle: VehicleFile) -> dict[str, Any]:
     }
 
 
-def drone_models_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
+def table(vehicle: VehicleFile, provenance: str) -> str:
     """Return a table to put into drone-models' ``data/params.toml``."""
-    flown = DRONE_MODELS.flown(vehicle)
-    wanted, key = params(flown), file_name(vehicle.name, "")
-    lines = "".join(f"{name} = {value!r}\n" for name, value in wanted.items())
+    lines = "".join(f"{name} = {value!r}\n" for name, value in params(vehicle).items())
+    return f'{commented(provenance)}["{file_name(vehicle.name, "")}"]\n{lines}'
 
-    text = f'{commented(provenance)}["{key}"]\n{lines}'
+
+def _rotor_gates(vehicle: VehicleFile) -> tuple[Gate, ...]:
     arms = [abs(r.position[axis]) for r in vehicle.rotors for axis in (0, 1)]
-    apart = max(arms) - min(arms)
-    other = (f"its rotors sit in no square: arms of {min(arms):g} to {max(arms):g} m",)
-    counts = () if vehicle.is_quad else ("it has four rotors",)
-    square = other if apart > PLACE_TOLERANCE_M else ()
-    return Draft(
-        text,
-        flown,
-        (),
-        lambda path, _: differences(flatten(wanted), flatten(tomllib.loads(read_file(path))[key])),
-        gates=(Gate("the simulator has such rotors", square or counts),),
-        flier=_flier(wanted),
+    objections = () if vehicle.is_quad else ("it has four rotors",)
+    if max(arms) - min(arms) > PLACE_TOLERANCE_M:
+        objections = (f"its rotors sit in no square: arms of {min(arms):g} to {max(arms):g} m",)
+    return (Gate("the simulator has such rotors", objections),)
+
+
+def _with_square_rotors(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle with rotors in a square around the centre of mass, at its height."""
+    arm = fmean(abs(rotor.position[axis]) for rotor in vehicle.rotors for axis in (0, 1))
+
+    def side(x: float) -> float:
+        return arm if x > 0 else -arm
+
+    rotors = tuple(
+        rotor.replace(position=(side(rotor.position[0]), side(rotor.position[1]), 0.0))
+        for rotor in vehicle.rotors
     )
+    return with_body_torque(vehicle.replace(rotors=rotors))
 
 
-def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
+def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
     """Return the flier of drone-models' dynamics; None if that is not installed.
 
     It needs the environment variable SCIPY_ARRAY_API=1. It has derivatives only: a step is one of
@@ -79,6 +95,7 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
         from drone_models.first_principles import dynamics  # noqa: PLC0415
     except (ImportError, RuntimeError):  # it wants SCIPY_ARRAY_API=1 from the start
         return None
+    content = params(vehicle)
     names = ("mass", "L", "prop_inertia", "gravity_vec", "J", "rpm2thrust", "rpm2torque")
     arrays = {
         name: np.asarray(content[name])
@@ -129,4 +146,38 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
     return flier_of(Flying)
 
 
-TARGET = Target("drone-models", ".toml", drone_models_draft, DRONE_MODELS)
+DRONE_MODELS = Simulator(
+    name="drone-models",
+    title="crazyflow (drone-models)",
+    version="drone-models 0.1.0, crazyflow 0.4.0",
+    source="drone_models/first_principles/model.py",
+    deviations=(
+        "drag is linear in the body's velocity, at the centre of mass",
+        "rotors sit in a square at the height of the centre of mass",
+        "the gyroscopic moment about forward has the other sign",
+    ),
+    entry=entries(
+        "drone-models",
+        LINEAR_DRAG,
+        time_constant_up="rotor_dyn_coef",
+        time_constant_down="rotor_dyn_coef",
+        motor_constant="rpm2thrust",
+        moment_constant="rpm2torque",
+        rotor_drag_coefficient="drag_matrix",
+        rotor_inertia="prop_inertia",
+    ),
+    laws=lambda vehicle: _with_square_rotors(with_linear_drag(vehicle, drag_at_hover(vehicle))),
+    free=("linear_drag_x", "linear_drag_y"),
+)
+TARGET = Target(
+    "drone-models",
+    ".toml",
+    numbers_draft(
+        params,
+        table,
+        lambda path: next(iter(tomllib.loads(read_file(path)).values())),
+        gates=_rotor_gates,
+        flier=_flier,
+    ),
+    DRONE_MODELS,
+)

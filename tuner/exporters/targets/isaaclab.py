@@ -6,8 +6,20 @@ import math
 from typing import Any
 
 from tuner.core.yaml_document import commented
-from tuner.exporters.simulators import ISAAC_LAB, hover_speed, rotor_speed, thrust_at
-from tuner.exporters.target import Draft, Target, differences, flatten, module_assignments
+from tuner.exporters.simulators import (
+    ANGULAR_DRAG,
+    CENTRE,
+    LINEAR_DRAG,
+    Simulator,
+    about_centre_of_mass,
+    entries,
+    hover_speed,
+    rotor_speed,
+    thrust_at,
+    with_one_damping,
+    with_one_drag,
+)
+from tuner.exporters.target import Target, module_assignments, numbers_draft
 from tuner.vehicle import VehicleFile
 
 RAD_PER_TURN = 2 * math.pi
@@ -76,17 +88,37 @@ def isaaclab_text(content: dict[str, dict[str, Any]], provenance: str) -> str:
     return commented(provenance) + "\n".join(pieces) + _USE
 
 
-def isaaclab_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
-    """Return arguments of ``ThrusterCfg`` and ``MultirotorCfg`` for a vehicle."""
-    flown = ISAAC_LAB.flown(vehicle)
-    wanted = configuration(flown)
-
-    return Draft(
-        isaaclab_text(wanted, provenance),
-        flown,
-        (),
-        lambda path, _: differences(flatten(wanted), flatten(module_assignments(path))),
-    )
-
-
-TARGET = Target("isaaclab", "_isaaclab.py", isaaclab_draft, ISAAC_LAB)
+ISAAC_LAB = Simulator(
+    name="isaaclab",
+    title="Isaac Lab",
+    version="Isaac Lab 2.3 to 3.0 (1ab6d6cf)",
+    source="isaaclab_contrib/actuators/thruster.py, assets/multirotor",
+    deviations=(
+        "one drag in all directions, linear in the velocity and at the centre of mass",
+        "one damping of rotation about all axes",
+    ),
+    entry=entries(
+        "Isaac Lab",
+        LINEAR_DRAG,
+        ANGULAR_DRAG,
+        time_constant_up="tau_inc_range",
+        time_constant_down="tau_dec_range",
+        motor_constant="thrust_const_range",
+        moment_constant="torque_to_thrust_ratio",
+        rotor_drag_coefficient="linear_damping",
+        **CENTRE,
+    ),
+    laws=lambda vehicle: with_one_damping(with_one_drag(about_centre_of_mass(vehicle))),
+    free=LINEAR_DRAG,
+    ties=(LINEAR_DRAG,),
+)
+TARGET = Target(
+    "isaaclab",
+    "_isaaclab.py",
+    numbers_draft(
+        configuration,
+        lambda vehicle, provenance: isaaclab_text(configuration(vehicle), provenance),
+        module_assignments,
+    ),
+    ISAAC_LAB,
+)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 from tuner.exporters.simulators import full_thrust, hover_command, hover_speed, thrust_to_weight
-from tuner.exporters.target import Draft, Target, differences, read_file
+from tuner.exporters.target import Target, numbers_draft, read_file
 from tuner.vehicle import COEFFICIENTS, VehicleFile, values_of
 
 
-def json_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
+def coefficients(vehicle: VehicleFile) -> dict[str, float]:
+    """Return name -> number of a vehicle."""
+    return values_of(vehicle) | {"max_rotor_velocity": vehicle.motor.max_rotor_velocity}
+
+
+def json_text(vehicle: VehicleFile, provenance: str) -> str:
     """Return coefficients with units, rotors (forward, left, up; m), and thrust and hover."""
-    values = values_of(vehicle) | {"max_rotor_velocity": vehicle.motor.max_rotor_velocity}
+    values = coefficients(vehicle)
     content = {
         "name": vehicle.name,
         "provenance": provenance,
@@ -31,11 +35,13 @@ def json_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
         },
     }
 
-    def faults(path: Path, _: object) -> list[str]:
-        return differences(values, json.loads(read_file(path))["coefficients"])
-
-    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    return Draft(text, vehicle, (), faults)
+    return json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-TARGET = Target("json", ".json", json_draft)
+TARGET = Target(
+    "json",
+    ".json",
+    numbers_draft(
+        coefficients, json_text, lambda path: json.loads(read_file(path))["coefficients"]
+    ),
+)

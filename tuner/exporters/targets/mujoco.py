@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
@@ -14,44 +14,86 @@ from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
 from tuner.core.phrases import printable
 from tuner.exporters.external_simulator import flier_of
-from tuner.exporters.simulators import MUJOCO, drag_at_hover, full_thrust, rotor_speed, thrust_at
-from tuner.exporters.target import Draft, Target, differences, read_file, xml_comment
+from tuner.exporters.simulators import (
+    ANGULAR_DRAG,
+    CENTRE,
+    LINEAR_DRAG,
+    MOTORS,
+    Simulator,
+    about_centre_of_mass,
+    drag_at_hover,
+    entries,
+    full_thrust,
+    rotor_speed,
+    thrust_at,
+    with_linear_thrust,
+    with_mean_lag,
+)
+from tuner.exporters.target import Target, numbers_draft, read_file, xml_comment
 from tuner.vehicle import VehicleFile
 
-_AXES = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+Attributes: TypeAlias = dict[str, str | tuple[float, ...]]
+"""Of an XML element: words, or numbers."""
+NUMBERS = {
+    "inertial": ("pos", "mass", "diaginertia"),
+    "site": ("pos",),
+    "general": ("gear", "dynprm", "gainprm", "biasprm", "ctrlrange"),
+}
+"""Tag -> its attributes that are numbers."""
 _USE = """
   The first controls are the rotors' thrusts in N, which lag what is asked for; those named drag_
   and damping_ need none. A command 0..1 asks for motor_constant times its rotor speed squared.
 """
 
 
+def elements(vehicle: VehicleFile) -> dict[str, list[Attributes]]:
+    """Return tag -> attributes of each of its elements, of a vehicle by MuJoCo's laws."""
+    inertia, motor, aero = vehicle.inertia, vehicle.motor, vehicle.aerodynamics
+    thrusts = thrust_at(vehicle, rotor_speed(vehicle, 0.0)), full_thrust(vehicle)
+    sites: list[Attributes] = []
+    actuators: list[Attributes] = []
+    for number, rotor in enumerate(vehicle.rotors):
+        name, turn = f"rotor_{number}", -1.0 if rotor.spin == "ccw" else 1.0
+        sites.append({"name": name, "pos": rotor.position})
+        actuators.append(
+            {
+                "name": name,
+                "site": name,
+                "gear": (0, 0, 1, 0, 0, turn * aero.moment_constant),
+                "dyntype": "filterexact",
+                "dynprm": (motor.time_constant_up,),
+                "gainprm": (1,),
+                "ctrlrange": thrusts,
+            }
+        )
+    centre = np.mean([rotor.position for rotor in vehicle.rotors], axis=0)
+    sites.append({"name": "hub", "pos": tuple(centre.tolist())})
+    names = [f"{kind}_{axis}" for kind in ("drag", "damping") for axis in "xyz"]
+    for number, value in enumerate((*drag_at_hover(vehicle), *_damping(vehicle))):
+        if value:
+            actuators.append(
+                {
+                    "name": names[number],
+                    "site": "hub",
+                    "gear": tuple(int(number == direction) for direction in range(6)),
+                    "gainprm": (0,),
+                    "biastype": "affine",
+                    "biasprm": (0, 0, -value),
+                    "ctrlrange": (0, 0),
+                }
+            )
+    moments = (inertia.xx, inertia.yy, inertia.zz)
+    body: Attributes = {"pos": (0, 0, 0), "mass": (vehicle.mass,), "diaginertia": moments}
+    return {"inertial": [body], "site": sites, "general": actuators}
+
+
 def mjcf(vehicle: VehicleFile, provenance: str) -> str:
     """Return the model of a vehicle by MuJoCo's laws."""
-    inertia, motor, aero = vehicle.inertia, vehicle.motor, vehicle.aerodynamics
-    places = [" ".join(map(_number, rotor.position)) for rotor in vehicle.rotors]
-    centre = np.mean([rotor.position for rotor in vehicle.rotors], axis=0)
-    low, full = thrust_at(vehicle, rotor_speed(vehicle, 0.0)), full_thrust(vehicle)
-    sites, actuators = [], []
-    for number, (rotor, place) in enumerate(zip(vehicle.rotors, places, strict=True)):
-        turn = (-1.0 if rotor.spin == "ccw" else 1.0) * aero.moment_constant
-        sites.append(f'<site name="rotor_{number}" pos="{place}"/>')
-        actuators.append(
-            f'<general name="rotor_{number}" site="rotor_{number}" '
-            f'gear="0 0 1 0 0 {_number(turn)}" '
-            f'dyntype="filterexact" dynprm="{_number(motor.time_constant_up)}" gainprm="1" '
-            f'ctrlrange="{_number(low)} {_number(full)}"/>'
-        )
-    sites.append(f'<site name="hub" pos="{" ".join(map(_number, centre.tolist()))}"/>')
-    for kind, values in (("drag", drag_at_hover(vehicle)), ("damping", _damping(vehicle))):
-        for (axis, direction), value in zip(_AXES.items(), values, strict=True):
-            gear = f"{direction} 0 0 0" if kind == "drag" else f"0 0 0 {direction}"
-            if value:
-                actuators.append(
-                    f'<general name="{kind}_{axis}" site="hub" gear="{gear}" gainprm="0" '
-                    f'biastype="affine" biasprm="0 0 {_number(-value)}" ctrlrange="0 0"/>'
-                )
-    moments = " ".join(map(_number, (inertia.xx, inertia.yy, inertia.zz)))
-    size = " ".join(_number(max(abs(r.position[axis]) for r in vehicle.rotors)) for axis in (0, 1))
+    written = {
+        tag: [f"<{tag} {' '.join(map(_attribute, found, found.values()))}/>" for found in of_tag]
+        for tag, of_tag in elements(vehicle).items()
+    }
+    size = " ".join(repr(max(abs(r.position[axis]) for r in vehicle.rotors)) for axis in (0, 1))
     comment = xml_comment(provenance) + _USE
     return f"""<mujoco model={quoteattr(printable(vehicle.name))}>
   <!-- {comment.strip()} -->
@@ -60,16 +102,20 @@ def mjcf(vehicle: VehicleFile, provenance: str) -> str:
   <worldbody>
     <body name="vehicle" pos="0 0 1">
       <freejoint name="free"/>
-      <inertial pos="0 0 0" mass="{_number(vehicle.mass)}" diaginertia="{moments}"/>
+      {written["inertial"][0]}
       <geom name="frame" type="box" size="{size} 0.02" mass="0" contype="0" conaffinity="0"/>
-      {(chr(10) + "      ").join(sites)}
+      {(chr(10) + "      ").join(written["site"])}
     </body>
   </worldbody>
   <actuator>
-    {(chr(10) + "    ").join(actuators)}
+    {(chr(10) + "    ").join(written["general"])}
   </actuator>
 </mujoco>
 """
+
+
+def _attribute(key: str, value: str | tuple[float, ...]) -> str:
+    return f'{key}="{value if isinstance(value, str) else " ".join(map(repr, value))}"'
 
 
 def _damping(vehicle: VehicleFile) -> tuple[float, float, float]:
@@ -81,63 +127,38 @@ def _damping(vehicle: VehicleFile) -> tuple[float, float, float]:
     return x, y, z + float((drag[0] - body[0]) * arms[1] + (drag[1] - body[1]) * arms[0])
 
 
-def _number(value: float) -> str:
-    return repr(float(value))
-
-
-def read_mjcf(path: Path) -> dict[str, float]:
-    """Return name -> number of a model by this target."""
-    root = ElementTree.fromstring(read_file(path))
-    held: dict[str, float] = {}
-    for element, keys in (
-        ("inertial", ("mass", "diaginertia")),
-        ("site", ("pos",)),
-        ("general", ("gear", "dynprm", "biasprm", "ctrlrange")),
-    ):
-        for found in root.iter(element):
-            for key in keys:
-                for index, word in enumerate((found.get(key) or "").split()):
-                    held[f"{found.get('name', '')} {key}[{index}]".strip()] = float(word)
-    return held
-
-
-def mujoco_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
-    """Return a model; the gate flies it in MuJoCo if that is installed."""
-    flown = MUJOCO.flown(vehicle)
-    inertia = flown.inertia
-    wanted = {
-        "mass[0]": flown.mass,
-        **{f"diaginertia[{i}]": getattr(inertia, a) for i, a in enumerate(("xx", "yy", "zz"))},
+def numbers_of(vehicle: VehicleFile) -> dict[str, list[float]]:
+    """Return name of an element and of an attribute -> its numbers."""
+    return {
+        f"{found.get('name', '')} {key}".strip(): [*value]
+        for of_tag in elements(vehicle).values()
+        for found in of_tag
+        for key, value in found.items()
+        if not isinstance(value, str)
     }
-    for number, rotor in enumerate(flown.rotors):
-        turn = (-1.0 if rotor.spin == "ccw" else 1.0) * flown.aerodynamics.moment_constant
-        wanted |= {f"rotor_{number} pos[{i}]": at for i, at in enumerate(rotor.position)}
-        wanted |= {
-            f"rotor_{number} gear[5]": turn,
-            f"rotor_{number} dynprm[0]": flown.motor.time_constant_up,
-            f"rotor_{number} ctrlrange[1]": full_thrust(flown),
-        }
-    for axis, drag in zip("xyz", drag_at_hover(flown), strict=True):
-        if drag:
-            wanted[f"drag_{axis} biasprm[2]"] = -drag
-    text = mjcf(flown, provenance)
-    return Draft(
-        text,
-        flown,
-        (),
-        lambda path, _: differences(wanted, read_mjcf(path)),
-        flier=_flier(text, flown),
-    )
 
 
-def _flier(text: str, vehicle: VehicleFile) -> Callable[..., Any] | None:
-    """Return the flier of a model in MuJoCo; None if that is not installed."""
+def read_mjcf(path: Path) -> dict[str, list[float]]:
+    """Return the numbers of a model by this target, as of `numbers_of`."""
+    root = ElementTree.fromstring(read_file(path))
+    return {
+        f"{found.get('name', '')} {key}".strip(): [
+            float(word) for word in found.get(key, "").split()
+        ]
+        for tag, keys in NUMBERS.items()
+        for found in root.iter(tag)
+        for key in keys
+    }
+
+
+def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
+    """Return the flier of a vehicle in MuJoCo; None if that is not installed."""
     try:
         import mujoco  # noqa: PLC0415 (an extra)
     except ImportError:
         return None
     try:
-        model = mujoco.MjModel.from_xml_string(text)
+        model = mujoco.MjModel.from_xml_string(mjcf(vehicle, ""))
     except ValueError as error:
         raise ExportError(
             vehicle.name, f"MuJoCo does not take it ({error})", "report this"
@@ -167,4 +188,31 @@ def _flier(text: str, vehicle: VehicleFile) -> Callable[..., Any] | None:
     return flier_of(Flying)
 
 
-TARGET = Target("mujoco", ".xml", mujoco_draft, MUJOCO)
+MUJOCO = Simulator(
+    name="mujoco",
+    title="MuJoCo",
+    version="MuJoCo 3.3 to 4.0",
+    source="mujoco.readthedocs.io, XMLreference: actuator/general, dyntype filterexact",
+    deviations=(
+        "each rotor's thrust is an actuator's, which lags the control in N by one time constant",
+        "drag is linear in the velocity of the rotors' centre, at the hover's rotor speed",
+    ),
+    entry=entries(
+        "MuJoCo",
+        LINEAR_DRAG,
+        ANGULAR_DRAG,
+        time_constant_up="dynprm",
+        time_constant_down="dynprm",
+        motor_constant="gainprm, ctrlrange",
+        moment_constant="gear",
+        rotor_drag_coefficient="biasprm",
+        thrust_inflow_coefficient="biasprm",
+        rotor_drag_ratio_y="biasprm",
+        **CENTRE,
+    ),
+    laws=lambda vehicle: with_linear_thrust(
+        with_mean_lag(about_centre_of_mass(vehicle)), idle=True
+    ),
+    fixed=(*MOTORS, "time_constant_up", "time_constant_down"),
+)
+TARGET = Target("mujoco", ".xml", numbers_draft(numbers_of, mjcf, read_mjcf, flier=_flier), MUJOCO)

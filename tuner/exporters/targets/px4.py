@@ -13,19 +13,27 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from sim_jax.constants import GRAVITY
 from tuner.core.errors import ExportError
 from tuner.core.yaml_document import commented
 from tuner.exporters.simulators import (
     GZ_SIM,
+    LINEAR_DRAG,
     MAX_GZ_SPEED,
-    SIH,
     Simulator,
     drag_at_hover,
     full_thrust,
     gz_speed_unit,
     hover_command,
     hover_speed,
+    registry_entries,
     rotor_speed,
+    thrust_at,
+    with_body_torque,
+    with_linear_thrust,
+    with_mean_lag,
+    with_one_damping,
+    with_one_drag,
 )
 from tuner.exporters.target import PLACE_TOLERANCE_M, Draft, Target, differences, read_file
 from tuner.result import Gate
@@ -33,6 +41,48 @@ from tuner.vehicle import VehicleFile
 
 INT32, FLOAT = 6, 9
 """MAVLink's numbers of parameter types, as ground stations write them."""
+
+
+def with_linear_hover(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose thrust is linear in the command, with the same hover throttle.
+
+    Its moments of inertia are scaled like the slope of thrust over command in the hover, so that it
+    turns like the vehicle.
+    """
+    hover, step = hover_command(vehicle), 1e-4
+    if hover is None or vehicle.aerodynamics.thrust_law == "linear":
+        return with_linear_thrust(vehicle, idle=False)
+    slope = [thrust_at(vehicle, rotor_speed(vehicle, hover + sign * step)) for sign in (-1, 1)]
+    thrust = vehicle.mass * GRAVITY / len(vehicle.rotors)
+    ratio = (slope[1] - slope[0]) / (2 * step) / (thrust / hover)
+    linear, inertia = with_linear_thrust(vehicle, idle=False), vehicle.inertia
+    full = hover_speed(vehicle) / hover
+    return linear.replace(
+        inertia=inertia.replace(**{axes: value / ratio for axes, value in inertia}),
+        motor=linear.motor.replace(input_scaling=full, max_rotor_velocity=full),
+    )
+
+
+SIH = Simulator(
+    name="sih",
+    title="PX4's SIH",
+    version="PX4 1.16 (039af95d)",
+    source="src/modules/simulation/simulator_sih/sih.cpp",
+    deviations=(
+        "thrust is linear in the command, and zero without one",
+        "the command lags, by one time constant",
+        "one drag in all directions, linear in the velocity and at the centre of mass",
+        "one damping of rotation about all axes",
+    ),
+    entry=registry_entries("px4"),
+    laws=lambda vehicle: with_one_damping(
+        with_one_drag(with_mean_lag(with_linear_thrust(with_body_torque(vehicle), idle=False)))
+    ),
+    free=LINEAR_DRAG,
+    ties=(LINEAR_DRAG,),
+    fixed=("input_scaling", "zero_position_armed", "time_constant_up", "time_constant_down"),
+    start=with_linear_hover,
+)
 
 
 def parameters(vehicle: VehicleFile, simulator: Simulator) -> dict[str, float | int]:

@@ -10,8 +10,15 @@ import numpy as np
 from tuner.core.numerics import Array
 from tuner.core.yaml_document import commented
 from tuner.exporters.external_simulator import flier_of
-from tuner.exporters.simulators import ROTORPY, rotor_speed
-from tuner.exporters.target import Draft, Target, differences, flatten, module_assignments
+from tuner.exporters.simulators import (
+    CENTRE,
+    Simulator,
+    about_centre_of_mass,
+    entries,
+    rotor_speed,
+    with_mean_lag,
+)
+from tuner.exporters.target import Target, module_assignments, numbers_draft
 from tuner.vehicle import VehicleFile
 
 
@@ -45,34 +52,24 @@ def quad_params(vehicle: VehicleFile) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def rotorpy_draft(vehicle: VehicleFile, provenance: str, *_: object) -> Draft:
+def module_text(vehicle: VehicleFile, provenance: str) -> str:
     """Return a Python module that RotorPy's ``Multirotor`` takes ``quad_params`` from."""
-    flown = ROTORPY.flown(vehicle)
-    params = quad_params(flown)
-    lines = "".join(f"    {name!r}: {value!r},\n" for name, value in params.items())
-    text = (
+    lines = "".join(f"    {name!r}: {value!r},\n" for name, value in quad_params(vehicle).items())
+    return (
         f"{commented(provenance)}import numpy as np\n\n_P = {{\n{lines}}}\nquad_params = {{\n"
         "    **_P,\n    'rotor_pos': {name: np.array(r) for name, r in _P['rotor_pos'].items()},\n"
         "    'rotor_directions': np.array(_P['rotor_directions']),\n"
         "    'rI': np.array(_P['rI']),\n}\n"
     )
-    return Draft(
-        text,
-        flown,
-        (),
-        lambda path, _: differences(
-            flatten(params), flatten(module_assignments(path).get("_P", {}))
-        ),
-        flier=_flier(params),
-    )
 
 
-def _flier(params: dict[str, Any]) -> Callable[..., Any] | None:
-    """Return the flier of parameters in RotorPy; None if that is not installed."""
+def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
+    """Return the flier of a vehicle in RotorPy; None if that is not installed."""
     try:
         from rotorpy.vehicles.multirotor import Multirotor  # noqa: PLC0415
     except ImportError:
         return None
+    params = quad_params(vehicle)
     arrays = params | {
         "rotor_pos": {name: np.array(place) for name, place in params["rotor_pos"].items()},
         "rotor_directions": np.array(params["rotor_directions"]),
@@ -101,4 +98,35 @@ def _flier(params: dict[str, Any]) -> Callable[..., Any] | None:
     return flier_of(Flying)
 
 
-TARGET = Target("rotorpy", "_params.py", rotorpy_draft, ROTORPY)
+ROTORPY = Simulator(
+    name="rotorpy",
+    title="RotorPy",
+    version="RotorPy 3.0.0",
+    source="rotorpy/vehicles/multirotor.py",
+    deviations=("one time constant, up and down",),
+    entry=entries(
+        "RotorPy",
+        time_constant_up="tau_m",
+        time_constant_down="tau_m",
+        motor_constant="k_eta",
+        moment_constant="k_m",
+        rotor_drag_coefficient="k_d",
+        thrust_inflow_coefficient="k_z",
+        fuselage_drag="c_Dx, c_Dy, c_Dz",
+        flapping_moment_coefficient="k_flap",
+        **CENTRE,
+    ),
+    laws=lambda vehicle: with_mean_lag(about_centre_of_mass(vehicle)),
+    ties=(("time_constant_up", "time_constant_down"),),
+)
+TARGET = Target(
+    "rotorpy",
+    "_params.py",
+    numbers_draft(
+        quad_params,
+        module_text,
+        lambda path: module_assignments(path).get("_P", {}),
+        flier=_flier,
+    ),
+    ROTORPY,
+)
