@@ -33,13 +33,14 @@ from tuner.config import Options, resolve_settings
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
+from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import Objective
 from tuner.objective.space import Space
 from tuner.search.continuation import run_stages
 from tuner.search.estimation import free_offsets
 from tuner.search.job_flights import read_recordings
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Fitted, Free, criterion_of, initial_progress, point_of
+from tuner.search.progress import Fitted, criterion_of, initial_progress, point_of
 from tuner.search.stages import plan
 from tuner.terms.candidates import with_terms
 from tuner.uncertainty.estimates import uncertainty_of
@@ -231,7 +232,7 @@ def fitted(objective: Objective) -> Fitted:
         objective,
         stages,
         initial_progress(objective, begin[None]),
-        free=Free(np.ones(len(space), bool), free_offsets(reference_job())),
+        free=Point(np.ones(len(space), bool), free_offsets(reference_job())),
         undecided={},
         on_progress=lambda _: None,
     )

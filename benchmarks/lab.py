@@ -47,7 +47,7 @@ from tuner.job.prepare import prepare
 from tuner.objective.battery import VOLTAGE, log_voltage_of
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight
-from tuner.search.findings import Explanation
+from tuner.search.listener import Reporter
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected
@@ -273,9 +273,7 @@ def job_at(lab: Lab, folder: Path, *, seed: int) -> tuple[Job, tuple[Finding, ..
 
 def searched(job: Job, folder: Path) -> Selected:
     """Return the fit of a job, with the terms that its flights call for."""
-    return search_with_terms(
-        job, folder, resume=False, on_progress=lambda *_: None, on_message=lambda _: None
-    )
+    return search_with_terms(job, folder, resume=False, reporter=Reporter())
 
 
 def trial_of(seed: int) -> Trial:
@@ -286,13 +284,12 @@ def trial_of(seed: int) -> Trial:
         job, said = job_at(lab, Path(name), seed=seed)
         clock = time.process_time()
         selected = searched(job, Path(name))
-        explanation = Explanation(lambda _: None)
-        selected, fitted, examination = refit_and_examine(
-            selected, lambda *_: None, lambda _: None, explanation
-        )
+        reporter = Reporter()
+        selected, examination = refit_and_examine(selected, reporter)
+        fitted = selected.fitted
         seconds = time.process_time() - clock
     if examination is None:
-        raise RuntimeError(one_line(explanation.findings[-1]))
+        raise RuntimeError(one_line(reporter.findings[-1]))
     free = {
         name: estimate
         for name, estimate in examination.uncertainty.estimates.items()
@@ -303,7 +300,7 @@ def trial_of(seed: int) -> Trial:
     said = (
         *said,
         *fitted.findings,
-        *explanation.findings,
+        *reporter.findings,
         *model_error_findings(examination.model_errors, examination.uncertainty),
         *flights_disagree(fitted, examination),
         *term_findings(fitted, examination.uncertainty),

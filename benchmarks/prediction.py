@@ -54,6 +54,7 @@ from tuner.recordings.loader import InertialFlight
 from tuner.recordings.states import States, initial_state, local_parabolas, states_at
 from tuner.result import BEST_FIT_FILE
 from tuner.search.job_flights import read_inertial_flights, read_recordings
+from tuner.search.listener import Reporter
 from tuner.search.problem import job_of
 from tuner.terms.selection import search_with_terms, with_first_terms
 from tuner.uncertainty.identifiability import hold_undetermined
@@ -289,12 +290,9 @@ def _predicted(path: Path, mass: float) -> dict[str, list[Predictions]]:
     parts = (replace(recording, flight=first), replace(recording, flight=second, holdout=True))
     job = with_first_terms(job_of(settings, parts))
     with tempfile.TemporaryDirectory() as name:
-        selected = search_with_terms(
-            job, Path(name), resume=False, on_progress=lambda *_: None, on_message=lambda _: None
-        )
-        fitted, _ = hold_undetermined(
-            selected.job, selected.fitted, lambda *_: None, lambda _: None
-        )
+        reporter = Reporter()
+        selected = search_with_terms(job, Path(name), resume=False, reporter=reporter)
+        fitted, _ = hold_undetermined(selected.job, selected.fitted, reporter)
     best = vehicle_fitted(selected.job, fitted)
     controller = controller_flown(selected.job, fitted)
     return predictions_by_all(

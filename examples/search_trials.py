@@ -29,7 +29,7 @@ configure()
 
 from tuner.config import Options, Settings, resolve_settings  # noqa: E402 (jax is configured first)
 from tuner.engine import Report, engine_for  # noqa: E402
-from tuner.evaluate.validation import validate, vehicle_fitted  # noqa: E402
+from tuner.evaluate.validation import validate  # noqa: E402
 from tuner.findings.findings import Code  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
 from tuner.recordings.flight import Flight, Series  # noqa: E402
@@ -88,7 +88,7 @@ def worst(job: Job, fitted: Fitted) -> str:
 def reference() -> str:
     """Fit from the original coefficients, and fly the held-out flight."""
     job, fitted, seconds = solved(settings_of())
-    flown = validate(job, fitted, vehicle_fitted(job, fitted))
+    flown = validate(job, fitted)
     (held,) = (r.flight for r in job.recordings if r.holdout)
     first, last = flown.initial[held.name].rmse, flown.best[held.name].rmse
     ratios = [getattr(first, axis) / getattr(last, axis) for axis in ("x", "y", "z")]

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from tuner.config import Settings
-    from tuner.job.listener import Listener
-    from tuner.search.iteration import Iteration, PointEstimate
+    from tuner.search.listener import Iteration, Listener, PointEstimate
 
 
 SEARCH_ENDED = (
@@ -56,7 +55,7 @@ def progress_on_terminal(*, quiet: bool, verbose: bool = False) -> Iterator[List
     """Yield a listener that shows a run on the terminal, or nothing; each message if verbose."""
     from tuner.cli.results import WIDTH, estimates_table, folds_table
     from tuner.findings.findings import shorten_finding
-    from tuner.job.listener import SILENT, Listener
+    from tuner.search.listener import SILENT, Listener
 
     if quiet:
         yield SILENT

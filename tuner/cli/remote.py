@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from tuner.client.client import Client
-    from tuner.job.listener import Listener
+    from tuner.search.listener import Listener
 
 Server = Annotated[
     str | None,
@@ -48,7 +48,7 @@ def client_of(server: str | None, token: str | None) -> closing[Client]:
 
 def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> None:
     """Pass what happens to a job on to a listener, as a run on this machine does."""
-    from tuner.search.iteration import Iteration, PointEstimate
+    from tuner.search.listener import Iteration, PointEstimate
     from tuner.uncertainty.records import Refit
 
     for kind, content in events:

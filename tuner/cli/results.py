@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tuner.job.sensitivity import SensitivityResult
     from tuner.report.contents import Contents
     from tuner.result import ExportRecord, RunResult
-    from tuner.search.iteration import PointEstimate
+    from tuner.search.listener import PointEstimate
     from tuner.uncertainty.records import Refit
 
 WIDTH, LINES = 100, 30

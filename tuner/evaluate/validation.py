@@ -26,8 +26,8 @@ from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings.flight import Flight
-from tuner.search.iteration import PointEstimate
 from tuner.search.job_flights import with_known
+from tuner.search.listener import PointEstimate
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, loop_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, VehicleFile, initial_values, with_values
@@ -149,9 +149,10 @@ class Validation:
     turning_explained: dict[str, float] = field(default_factory=dict)
 
 
-def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
+def validate(job: Job, fitted: Fitted) -> Validation:
     """Fly every flight with the initial and with the fitted vehicle."""
     comparison, controller = comparison_of(job, fitted), controller_flown(job, fitted)
+    vehicle = vehicle_fitted(job, fitted)
     validation = Validation(
         initial=comparison.fly(job.user_settings.vehicle),
         best=comparison.fly(vehicle),

@@ -37,7 +37,7 @@ from tuner.search.job_flights import (
     with_known,
 )
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Fitted, Free, Progress, plain_criterion
+from tuner.search.progress import Fitted, Progress, plain_criterion
 from tuner.vehicle import (
     COEFFICIENTS,
     ControllerFile,
@@ -217,13 +217,13 @@ def fit_effective(
 
     moves, fixed = np.ones(len(space), bool), np.zeros(begun.point.offsets.shape, bool)
     stages = LAST_STAGES if simulator.start is None else ALL_STAGES
-    fitted = fit(begun, free=Free(moves, fixed), stages=stages)
+    fitted = fit(begun, free=Point(moves, fixed), stages=stages)
     with suppress(ConfigError):  # together the moments are no rigid body's
         return vehicle(fitted), fitted.converged
     moves = np.array([not MOMENTS.intersection(p.ratios) for p in space.parameters])
     at_start = np.where(moves, fitted.point.coefficients, space.initial)
     begun = replace(begun, point=Point(at_start, fitted.point.offsets), scales=fitted.scales)
-    fitted = fit(begun, free=Free(moves, fixed), stages=BOTH_POLISHES)
+    fitted = fit(begun, free=Point(moves, fixed), stages=BOTH_POLISHES)
     return vehicle(fitted), fitted.converged
 
 

@@ -32,7 +32,9 @@ from tuner.evaluate.validation import (
     impossible_inertia,
     initial_of,
     offsets_of,
+    vehicle_fitted,
 )
+from tuner.findings.findings import Finding
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.inlets import INLETS, window_seconds
@@ -53,6 +55,7 @@ from tuner.result import (
 from tuner.search.job_flights import Recording
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
+from tuner.terms.candidates import Selected
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, knowledge_of
 from tuner.uncertainty.records import Knowledge, Sources
@@ -66,7 +69,6 @@ from tuner.uncertainty.verdict import (
     judge_by_error,
 )
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, write_vehicle
-from tuner.vehicle.selection_table import SelectionRow
 from tuner.vehicle.vehicle import scaled_to_size
 
 METRICS_FILE = "metrics.csv"
@@ -74,14 +76,13 @@ CONTROLLER_FILE = "controller.yaml"
 
 
 def result_of(
-    job: Job,
-    fitted: Fitted,
-    uncertainty: Uncertainty | None,
+    selected: Selected,
     validation: Validation,
+    uncertainty: Uncertainty | None,
     *,
+    findings: tuple[Finding, ...],
+    command: str,
     sources: Mapping[str, Sources] | None = None,
-    command: str = "",
-    selection: tuple[SelectionRow, ...] = (),
     effective: EffectiveResult | None = None,
     next_log: tuple[LogProposal, ...] = (),
 ) -> RunResult:
@@ -89,7 +90,7 @@ def result_of(
 
     ``uncertainty`` is None where it was not examined, or not yet.
     """
-    settings = job.settings
+    job, fitted, settings = selected.job, selected.fitted, selected.job.settings
     # of each clock in s, and of each gyro axis in rad/s
     table = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
     return RunResult(
@@ -116,7 +117,7 @@ def result_of(
         coefficients=_coefficients(job, fitted, uncertainty),
         sources=dict(sources or {}),
         flights=tuple(_flight(job, fitted, recording, validation) for recording in job.recordings),
-        findings=fitted.findings,
+        findings=findings,
         search=SearchResult(
             method=fitted.method,
             evaluations=fitted.evaluations,
@@ -127,7 +128,7 @@ def result_of(
             converged=fitted.converged,
             message=Ending.NO_FURTHER_GAIN if fitted.converged else Ending.ITERATION_LIMIT,
         ),
-        selection=selection,
+        selection=selected.rows_after_holding,
         effective=effective,
         next_log=next_log,
     )
@@ -287,18 +288,20 @@ def _clock(job: Job, fitted: Fitted, recording: Recording) -> Literal["given", "
 def write_folder(
     folder: Path,
     result: RunResult,
-    vehicle: VehicleFile,
-    job: Job,
+    selected: Selected,
     effective: VehicleFile | None = None,
 ) -> None:
     """Write the vehicles, ``controller.yaml``, ``metrics.csv``, and last ``result.json``.
 
-    ``best_fit.yaml`` is the vehicle; ``effective.yaml`` the one for Gazebo, where that is another.
+    ``best_fit.yaml`` is the fitted vehicle; ``effective.yaml`` the one for Gazebo, where that is
+    another.
     """
-    settings = result.settings
+    settings, job = result.settings, selected.job
     fitted = ", ".join(flight.name for flight in job.fitted)
     source = {"made_by": f"{PROGRAM} {result.versions[PROGRAM]}", "flights": fitted}
-    named = vehicle.replace(name=f"{job.settings.vehicle.name}_fitted", source=source)
+    named = vehicle_fitted(job, selected.fitted).replace(
+        name=f"{job.settings.vehicle.name}_fitted", source=source
+    )
     write_vehicle(named, folder / BEST_FIT_FILE, header=f"Fitted by tune to {fitted}.")
     if effective is not None and result.effective is not None:
         lost = ", ".join(term.group for term in result.effective.lost)

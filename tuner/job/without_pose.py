@@ -19,10 +19,10 @@ from tuner.inertial.measurement import measure_inertial, widen_to_agree
 from tuner.inertial.prediction import RateErrors, rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, write_measurements
-from tuner.job.listener import SILENT, Listener
 from tuner.recordings.loader import InertialFlight
 from tuner.result import place_for
 from tuner.search.job_flights import left_out_finding
+from tuner.search.listener import SILENT, Listener
 from tuner.vehicle import VehicleFile, values_of, with_values
 
 OVER_MASS = ("motor_constant", "inertia_xx", "inertia_yy")

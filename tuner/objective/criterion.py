@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from tuner.core.numerics import Array
 from tuner.objective.segments import OFFSETS
@@ -33,6 +33,8 @@ def units_of(names: Sequence[str]) -> Array:
 class Point(eqx.Module):
     """A point of the search: coefficients that all flights share, and the offsets of each flight.
 
+    Also a mark for each of these parameters: whether a search may move it.
+
     Attributes
     ----------
     coefficients
@@ -42,8 +44,21 @@ class Point(eqx.Module):
         the units of `units_of`.
     """
 
-    coefficients: Float[AnyArray, " K"]
-    offsets: Float[AnyArray, "offsets N"]
+    coefficients: Shaped[AnyArray, " K"]
+    offsets: Shaped[AnyArray, "offsets N"]
+
+    @property
+    def packed(self) -> Array:
+        """All parameters as one vector, offsets one kind after the other."""
+        return np.concatenate([self.coefficients, np.ravel(self.offsets)])
+
+    def after(self, change: Array) -> Point:
+        """Return the point after a change of the parameters, packed."""
+        count = len(self.coefficients)
+        return Point(
+            self.coefficients + change[:count],
+            self.offsets + change[count:].reshape(self.offsets.shape),
+        )
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from tuner.result import (
     read_run,
     result_folder,
 )
-from tuner.search.iteration import Iteration, Outcome
+from tuner.search.listener import Iteration, Outcome
 from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles
 
 if TYPE_CHECKING:

@@ -26,10 +26,9 @@ from tuner.objective.normal_equations import (
     sums_at,
 )
 from tuner.objective.segments import CLOCKS
-from tuner.search.iteration import Iteration
+from tuner.search.listener import Iteration
 from tuner.search.optimisers import descend, estimated_states, evolve
 from tuner.search.progress import (
-    Free,
     Iterate,
     Optimiser,
     Progress,
@@ -64,7 +63,7 @@ def run_stages(
     stages: tuple[Stage, ...],
     progress: Progress,
     *,
-    free: Free,
+    free: Point,
     undecided: Undecided,
     on_progress: OnProgress,
     seed: int = 0,
@@ -82,7 +81,7 @@ def run_stages(
     progress
         Where to begin: `initial_progress`, or a checkpoint.
     free
-        The parameters that may move.
+        Which parameters may move.
     undecided
         The choices of a `Loop` that are tried both ways -> the informative flights (N,).
     on_progress
@@ -115,7 +114,7 @@ class _Search:
     """The arguments of `run_stages` that are the same for all stages."""
 
     objective: Objective
-    free: Free
+    free: Point
     on_progress: OnProgress
     seed: int
 
@@ -200,7 +199,7 @@ def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -
         stage=stage,
         points=points,
         losses=progress.losses,
-        free=Free(free.coefficients & stage.coefficients, free.offsets & kept & stage.offsets),
+        free=Point(free.coefficients & stage.coefficients, free.offsets & kept & stage.offsets),
         seed=1 + search.seed + 1000 * progress.stage,
         damping=progress.damping,
         last=last,
@@ -209,7 +208,7 @@ def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -
         return problem
     sums = sums_at(problem.objective, points, problem.criterion)
     stay = _clocks_that_differ(problem, best, sums)
-    free = Free(problem.free.coefficients, problem.free.offsets & stay)
+    free = Point(problem.free.coefficients, problem.free.offsets & stay)
     if not np.any(points.offsets[:, ~stay]):  # nothing moves: the points are flown already
         return replace(problem, free=free, sums=sums)
     points = Point(points.coefficients, points.offsets * stay)
@@ -232,10 +231,9 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
     here: SegmentSums = jax.tree.map(lambda leaf: np.asarray(leaf)[best], sums)
     point = point_of(problem.points, best)
     loss, gradient, hessian = normal_equations(objective, point, problem.criterion, here)
-    moves = np.flatnonzero(np.concatenate([free.coefficients, free.offsets.ravel()]))
+    moves = np.flatnonzero(free.packed)
     inverse = scaled_inverse(hessian[np.ix_(moves, moves)], RIDGE)
-    late = np.concatenate([np.zeros(len(objective.space)), np.ravel(point.offsets)])[moves]
-    late = late - inverse @ gradient[moves]
+    late = point.packed[moves] - inverse @ gradient[moves]
     first, clocks = len(objective.space), len(CLOCKS) * objective.flights
     left: list[int] = np.flatnonzero((moves >= first) & (moves < first + clocks)).tolist()
     right: list[int] = []

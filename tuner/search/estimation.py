@@ -30,12 +30,11 @@ from tuner.recordings.content import ReadOptions
 from tuner.recordings.loader import reading_key
 from tuner.search.continuation import Undecided, run_stages
 from tuner.search.findings import unmatched, with_end_findings
-from tuner.search.iteration import Iteration, Outcome
+from tuner.search.listener import Iteration, Outcome
 from tuner.search.optimisers import MIN_DAMPING
 from tuner.search.problem import Job
 from tuner.search.progress import (
     Fitted,
-    Free,
     Loop,
     Progress,
     by_flight,
@@ -258,7 +257,7 @@ def _attempt(
     stages = stages_of(job, job.objective, method)
     if job.windows is not None:  # windows replace the stages of short horizons
         stages = tuple(stage for stage in stages if stage.horizon == job.objective.samples)
-    free = Free(np.ones(len(job.space), bool), free_offsets(job))
+    free = Point(np.ones(len(job.space), bool), free_offsets(job))
     start, spent = initial_progress(job.objective, starts), 0.0
     progress = start
     if resume:
@@ -380,7 +379,7 @@ def polished(
     job: Job,
     fitted: Fitted,
     *,
-    free: Free,
+    free: Point,
     title: str,
     on_progress: Callable[[Progress], None],
     stages: slice = BOTH_POLISHES,
@@ -395,7 +394,7 @@ def polished(
     fitted
         Its objective, which need not be the job's, and the point to begin at.
     free
-        The parameters that may move.
+        Which parameters may move.
     title
         Prefix of the stages' names in messages.
     on_progress
@@ -437,7 +436,7 @@ def search_again(
     fitted: Fitted,
     vector: Array,
     *,
-    free: Free,
+    free: Point,
     title: str,
     on_progress: Callable[[Progress], None],
 ) -> Fitted:
@@ -477,7 +476,7 @@ def _run_again(
     progress: Progress,
     stages: Sequence[Stage],
     *,
-    free: Free,
+    free: Point,
     undecided: Undecided,
     title: str,
     on_progress: Callable[[Progress], None],

@@ -1,17 +1,13 @@
-"""Findings of a fit: those at the end of a search, and a run's, each reported once."""
+"""Findings of a fit at the end of a search."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
-from typing import TypeVar
 
 import numpy as np
 
-from tuner.core.errors import EngineError, OutputError
-from tuner.core.spans import span
-from tuner.findings.findings import Code, Finding, Level, one_line
+from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.problem import Job
@@ -166,68 +162,3 @@ def reference_voltage_findings(initial: VehicleFile, best: VehicleFile) -> tuple
 
 def _size(channels: Mapping[str, float]) -> float:
     return float(np.median(list(channels.values())))
-
-
-logger = logging.getLogger(__name__)
-
-T = TypeVar("T")
-
-
-class Explanation:
-    """Findings of a fit, and parts of its examination.
-
-    Parameters
-    ----------
-    on_message
-        Gets each finding at once, as a line.
-
-    Attributes
-    ----------
-    findings
-        Findings after the search.
-    """
-
-    def __init__(self, on_message: Callable[[str], None]) -> None:
-        self._on_message = on_message
-        self._reported: list[Finding] = []
-        self.findings: tuple[Finding, ...] = ()
-
-    def report(self, findings: Sequence[Finding]) -> None:
-        """Report findings that were not reported yet."""
-        for finding in findings:
-            if finding not in self._reported:
-                self._reported.append(finding)
-                self._on_message(one_line(finding))
-
-    def add(self, findings: Sequence[Finding]) -> None:
-        """Keep findings, and report them."""
-        self.report(findings)
-        self.findings = (*self.findings, *findings)
-
-    def attempt(self, name: str, compute: Callable[[], T], fallback: T) -> T:
-        """Return the result of a part, or a fallback and a finding where it fails.
-
-        Parameters
-        ----------
-        name
-            Name of the part in messages and profiles.
-        compute
-            Computes the result.
-        fallback
-            Returned where that fails.
-
-        Raises
-        ------
-        OutputError, EngineError
-            The disk is full, or workers are gone.
-        """
-        try:
-            with span(name):
-                return compute()
-        except (OutputError, EngineError):
-            raise
-        except Exception as error:
-            logger.error("%s failed", name, exc_info=error)
-            names = (type(error).__name__, " ".join(str(error).split())[:200])
-            self.add([Finding(Code.PART_FAILED, "warning", name, names=names)])
-            return fallback

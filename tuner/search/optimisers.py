@@ -193,7 +193,7 @@ def _stepped(
     tried, last = before.tried, before.quadratic
     damping, stalled, accepted = float(before.damping), False, True
     if last is not None:
-        change = (_packed(tried) - _packed(before.point))[moves]
+        change = (tried.packed - before.point.packed)[moves]
         rise = here.loss - last.loss
         accepted, predicted = _accepts(before, here.loss, moves)
         if not accepted:
@@ -204,21 +204,20 @@ def _stepped(
             )
         elif predicted < 0.0 and rise < GOOD_GAIN_RATIO * predicted:
             damping /= DAMPING_FACTOR
-        at_rest = np.abs(change) < STALL_TOLERANCE * (1.0 + np.abs(_packed(tried)[moves]))
+        at_rest = np.abs(change) < STALL_TOLERANCE * (1.0 + np.abs(tried.packed[moves]))
         stalled = (
             accepted and bool(at_rest.all()) and abs(rise) < STALL_TOLERANCE * (1.0 + here.loss)
         )
         here = here if accepted else last
     point = tried if accepted else before.point
     gradient, hessian = here.gradient[moves], here.hessian[np.ix_(moves, moves)]
-    following = _packed(point)
-    back = _solved(hessian, gradient, damping)
-    following[moves] -= back
+    back, onward = _solved(hessian, gradient, damping), np.zeros(len(here.gradient))
+    onward[moves] = -back
     gain = 0.5 * gradient @ _solved(hessian, gradient, 0.0)
     step_reduction = gradient @ back - 0.5 * back @ hessian @ back
     return Step(
         point=point,
-        tried=_unpacked(following, point),
+        tried=point.after(onward),
         accepted=np.asarray(accepted),
         damping=np.asarray(damping),
         stalled=np.asarray(stalled),
@@ -234,7 +233,7 @@ def _accepts(before: Step, loss: float, moves: NDArray[np.intp]) -> tuple[bool, 
     """Return whether one start's point is accepted with a loss, and the predicted rise."""
     last = before.quadratic
     assert last is not None, "a point that was tried follows an accepted one"
-    change = (_packed(before.tried) - _packed(before.point))[moves]
+    change = (before.tried.packed - before.point.packed)[moves]
     predicted = last.gradient[moves] @ change
     predicted += 0.5 * change @ last.hessian[np.ix_(moves, moves)] @ change
     return bool(loss - last.loss <= MIN_GAIN_RATIO * predicted), float(predicted)
@@ -257,29 +256,19 @@ def _of(tree: Any, start: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[start], tree)
 
 
-def _packed(point: Point) -> Array:
-    return np.concatenate([point.coefficients, np.ravel(point.offsets)])
-
-
-def _unpacked(packed: Array, like: Point) -> Point:
-    count = len(like.coefficients)
-    return replace(
-        like, coefficients=packed[:count], offsets=packed[count:].reshape(like.offsets.shape)
-    )
-
-
 def descend(problem: StageProblem) -> Iterator[Iterate]:
     """Minimise a stage's loss for every start; coefficients and flights' offsets move together.
 
     Free initial states are those estimated at the best point. A point linearised about others may
     have seemed better than it is: if the next step is rejected, it is simulated again.
     """
-    free = np.concatenate([problem.free.coefficients, problem.free.offsets.ravel()])
     # initial states (L, F) of the next linearisation, and of the best point's
     states = best_about = problem.criterion.states
     step, losses = initial_step(problem.points, problem.damping, problem.sums), list[Array]()
     while True:
-        step = advance(problem.objective, step, replace(problem.criterion, states=states), free)
+        step = advance(
+            problem.objective, step, replace(problem.criterion, states=states), problem.free.packed
+        )
         assert step.sums is not None, "a step has sums"
         assert step.best is not None, "and a best point"
         best, channels = int(np.argmin(step.loss)), root_mean_squares(problem.objective, step.sums)

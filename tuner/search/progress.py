@@ -23,7 +23,7 @@ from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.recordings.flight import Flight
-from tuner.search.iteration import Iteration, Outcome
+from tuner.search.listener import Iteration, Outcome
 from tuner.search.stages import Stage
 
 HUBER = 4.0
@@ -74,22 +74,6 @@ def _leaves(controller: Controller) -> list[Scalar]:
 
 
 @dataclass(frozen=True)
-class Free:
-    """The parameters that a search may move.
-
-    Attributes
-    ----------
-    coefficients
-        (K,) of the search vector.
-    offsets
-        (offsets, N) of the flights.
-    """
-
-    coefficients: NDArray[np.bool_]
-    offsets: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
 class StageProblem:
     """The problem of one stage.
 
@@ -104,7 +88,7 @@ class StageProblem:
     losses
         (S,) of the last stage; infinite before the first.
     free
-        The parameters that may move in this stage.
+        Which parameters may move in this stage.
     seed
         For an optimiser that draws at random; differs from stage to stage.
     damping
@@ -120,7 +104,7 @@ class StageProblem:
     stage: Stage
     points: Point
     losses: Array
-    free: Free
+    free: Point
     seed: int
     damping: Array
     last: bool

@@ -115,7 +115,7 @@ def _fit(assignment: Assignment, channel: IO[str]) -> dict[str, Any]:
 
 def _listener(channel: IO[str]) -> Any:
     """Return a listener that writes the events of a run as lines of JSON."""
-    from tuner.job.listener import Listener  # noqa: PLC0415
+    from tuner.search.listener import Listener  # noqa: PLC0415
 
     def say(kind: str, **content: object) -> None:
         channel.write(json.dumps({"kind": kind, **content}) + "\n")

@@ -234,11 +234,13 @@ class Selected:
             if not row.kept and row.reason is not SelectionCode.NO_INFORMATION
         )
 
-    def rows_after_holding(self, held: Mapping[str, str]) -> tuple[SelectionRow, ...]:
-        """Return the table with chosen terms not kept if all their coefficients are ``held``."""
+    @property
+    def rows_after_holding(self) -> tuple[SelectionRow, ...]:
+        """The table, with chosen terms not kept if all their coefficients are held."""
         return tuple(
             row.model_copy(update={"kept": False, "reason": SelectionCode.NO_INFORMATION})
-            if row.reason in ACCEPTED and all(held.get(name) == name for name in row.names)
+            if row.reason in ACCEPTED
+            and all(self.fitted.held.get(name) == name for name in row.names)
             else row
             for row in self.rows
         )

@@ -19,9 +19,10 @@ from tuner.objective.criterion import Point
 from tuner.objective.information import with_start_values
 from tuner.objective.space import Space
 from tuner.search.estimation import LAST_POLISH, free_offsets, polished
-from tuner.search.findings import UNMATCHED_CODES, Explanation, outlying_flights, unmatched_findings
+from tuner.search.findings import UNMATCHED_CODES, outlying_flights, unmatched_findings
+from tuner.search.listener import Reporter
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, Free, Progress
+from tuner.search.progress import Fitted
 from tuner.terms.candidates import (
     NEGLIGIBLE_SIZE,
     Evidence,
@@ -61,52 +62,40 @@ ROUGH_STEPS = 2
 """Steps before the first selection: more would fit missing terms by disturbances."""
 
 
-ExaminedFit = tuple[Selected, Fitted, Examination | None]
-"""A job's selection and fit, and its examination; None where that failed."""
-
-
 def refit_and_examine(
-    selected: Selected,
-    on_progress: Callable[[Job, Progress], None],
-    on_message: Callable[[str], None],
-    explanation: Explanation,
-) -> ExaminedFit:
+    selected: Selected, reporter: Reporter
+) -> tuple[Selected, Examination | None]:
     """Return the fit with estimated disturbances, or with undetermined coefficients held.
 
-    Innovations may change the terms. Disturbances are not estimated where flights contradict the
-    fit, nor by default where only odd flights are not matched.
+    And its examination; None where that failed. Innovations may change the terms. Disturbances are
+    not estimated where flights contradict the fit, nor by default where only odd flights are not
+    matched.
     """
-    refit = partial(with_disturbances, on_progress=on_progress, on_message=on_message)
     examined, setting = None, selected.job.settings.job.disturbances
     if not (selected.refuted or (setting == "auto" and outlying_flights(selected.fitted.scales))):
-        examined = explanation.attempt("disturbances", partial(refit, selected), None)
+        refit = partial(with_disturbances, selected, reporter)
+        examined = reporter.attempt("disturbances", refit, None)
     if examined is not None and (
-        refuted := set(refuted_by_commands(*examined[:2])).difference(selected.kept)
+        refuted := set(refuted_by_commands(examined[0])).difference(selected.kept)
     ):
-        on_message(GAINS_REFUTED.format(listed(sorted(refuted))))
-        less = with_refuted(selected, refuted)
-        examined = explanation.attempt("disturbances", partial(refit, less), None)
-    on_message("Examining how well each coefficient is known.")
+        reporter.on_message(GAINS_REFUTED.format(listed(sorted(refuted))))
+        refit = partial(with_disturbances, with_refuted(selected, refuted), reporter)
+        examined = reporter.attempt("disturbances", refit, None)
+    reporter.on_message("Examining how well each coefficient is known.")
     if examined is not None:
         return examined
-    job, fitted = selected.job, selected.fitted
+    shifts = selected.selection_shifts
     hold = partial(
-        hold_undetermined,
-        job,
-        fitted,
-        on_progress,
-        on_message,
-        selection_shifts=selected.selection_shifts,
+        hold_undetermined, selected.job, selected.fitted, reporter, selection_shifts=shifts
     )
-    unexamined: tuple[Fitted, Examination | None] = fitted, None
-    return selected, *explanation.attempt("examination", hold, unexamined)
+    unexamined: tuple[Fitted, Examination | None] = selected.fitted, None
+    fitted, examination = reporter.attempt("examination", hold, unexamined)
+    return replace(selected, fitted=fitted), examination
 
 
 def with_disturbances(
-    selected: Selected,
-    on_progress: Callable[[Job, Progress], None],
-    on_message: Callable[[str], None],
-) -> tuple[Selected, Fitted, Examination] | None:
+    selected: Selected, reporter: Reporter
+) -> tuple[Selected, Examination] | None:
     """Return the fit in which disturbances are estimated too, and its examination.
 
     None where the job does not ask for it, the residuals are at the noise level, set-points were
@@ -114,7 +103,7 @@ def with_disturbances(
     would not shrink. None, too, where the two fits contradict each other, unless innovations added
     a lag that the simulated flights lack.
     """
-    job, fitted = selected.job, selected.fitted
+    job, fitted, on_message = selected.job, selected.fitted, reporter.on_message
     setting = job.settings.job.disturbances
     wanted = setting == "follow" or (setting == "auto" and candidates_of(job))
     if fitted.residuals_at_noise_level or not fitted.polished or not wanted:
@@ -155,9 +144,9 @@ def with_disturbances(
     again = polished(
         job,
         there,
-        free=Free(np.zeros(len(job.space), bool), offsets),
+        free=Point(np.zeros(len(job.space), bool), offsets),
         title="clocks",
-        on_progress=partial(on_progress, job),
+        on_progress=partial(reporter.on_progress, job),
         stages=LAST_POLISH,
     )
     again = replace(
@@ -182,9 +171,9 @@ def with_disturbances(
             fitted = polished(
                 job,
                 again,
-                free=Free(np.ones(len(job.space), bool), offsets),
+                free=Point(np.ones(len(job.space), bool), offsets),
                 title="simulated",
-                on_progress=partial(on_progress, job),
+                on_progress=partial(reporter.on_progress, job),
             )
         alternatives = alternatives_of(fitted.objective, fitted.point)
         before = examine(
@@ -197,7 +186,7 @@ def with_disturbances(
         if not agree:
             on_message("It contradicts the fit of the simulated flights, which is kept.")
         better = agree and _is_sharper(examination.uncertainty, before.uncertainty)
-    return (seen.selected, again, examination) if better else None
+    return (replace(seen.selected, fitted=again), examination) if better else None
 
 
 def _without_contradicted_lag(

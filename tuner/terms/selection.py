@@ -12,7 +12,7 @@ them, sections of the same flight can; a held-out flight keeps its own, as it ke
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,15 +35,14 @@ from tuner.search.estimation import (
     FIRST_POLISH,
     LAST_POLISH,
     ROUGH_TOLERANCE,
-    OnProgress,
     free_offsets,
     polished,
     search,
     search_again,
 )
-from tuner.search.iteration import PointEstimate
+from tuner.search.listener import Reporter
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, Free, Progress, loop_of, with_loop
+from tuner.search.progress import Fitted, Progress, loop_of, with_loop
 from tuner.terms.candidates import (
     Selected,
     candidate_groups,
@@ -96,8 +95,7 @@ class Selection:
     job: Job
     fitted: Fitted
     candidates: Groups
-    on_progress: OnProgress
-    on_message: Callable[[str], None]
+    reporter: Reporter
 
     def run(self) -> Selected:
         """Add groups until no other is accepted."""
@@ -165,7 +163,7 @@ class Selection:
         last, if something is left to explain.
         """
         groups = {group: names for group, names in self.candidates.items() if not is_lumped(group)}
-        self.on_message(
+        self.reporter.on_message(
             f"The flights call for more than the base model: searching again with all "
             f"{len(groups)} groups of terms, to see which can go."
         )
@@ -186,7 +184,7 @@ class Selection:
             groups = {**state.added, **{name: self.candidates[name] for name in names}}
             if set(groups) in judged:
                 break
-            self.on_message(f"Fitting again with {listed(names)}.")
+            self.reporter.on_message(f"Fitting again with {listed(names)}.")
             trial = self._pruned(self._refitted(state, groups))
             by_flight = wanted[best].reason is SelectionCode.PREDICTS_FLIGHTS
             gone = [name for name in names if name not in trial.added]
@@ -210,7 +208,7 @@ class Selection:
         )
         if not taken or not kept:
             return state if kept else replace(state, added={})
-        self.on_message(f"Fitting again without {listed(tuple(taken))}.")
+        self.reporter.on_message(f"Fitting again without {listed(tuple(taken))}.")
         groups = {name: self.candidates[name] for name in kept}
         return self._pruned(self._refitted(self._without(state, taken), groups))
 
@@ -260,14 +258,14 @@ class Selection:
         )
         offsets = free_offsets(self.job)
         moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
-        free_ones = Free(
+        free_ones = Point(
             np.ones(len(names), bool),
             np.vstack([offsets, np.tile(moves[:, None], offsets.shape[1])]),
         )
         title = f"with {len(new)} terms more" if new else f"with {len(groups)} terms"
 
         def on_progress(progress: Progress) -> None:
-            self.on_progress(replace(self.job, space=objective.space), progress)
+            self.reporter.on_progress(replace(self.job, space=objective.space), progress)
 
         if anew:
             start[: len(self.job.space)] = self.job.space.initial
@@ -475,18 +473,15 @@ def search_with_terms(
     folder: Path,
     *,
     resume: bool,
-    on_progress: OnProgress,
-    on_message: Callable[[str], None],
-    on_estimates: Callable[[Sequence[PointEstimate]], None] = lambda _: None,
-    on_doubt: Callable[[Finding], None] = lambda _: None,
+    reporter: Reporter,
     findings: tuple[Finding, ...] = (),
 ) -> Selected:
     """Look for the best coefficients of a job, and for the terms that its flights call for.
 
     Where most flights are far off, terms are tried before the base model is polished, and before
     CMA-ES looks for another start; where flights contradict the fit, none is. Arguments and errors
-    are those of `search`. Before terms are tried, ``on_estimates`` gets the search's estimates; if
-    the search stopped early, ``on_doubt`` gets findings about gains from recorded commands.
+    are those of `search`. Before terms are tried, the listener gets the search's estimates, or, if
+    the search stopped early, findings about gains from recorded commands as doubts.
     """
 
     def searched(*, resume: bool, provisional: bool) -> Selected:
@@ -495,19 +490,19 @@ def search_with_terms(
                 job,
                 folder,
                 resume=resume,
-                on_progress=on_progress,
+                on_progress=reporter.on_progress,
                 findings=findings,
                 provisional=provisional,
             )
         if fitted.polished:
-            on_estimates(point_estimates(job, fitted))
+            reporter.listener.on_estimates(point_estimates(job, fitted))
         if _is_refuted(fitted):
             return Selected(job, fitted, refuted=True)
         if not fitted.polished:
             for finding in gains_far_off(fitted, job.fitted):
-                on_doubt(finding)
+                reporter.listener.on_doubt(finding)
         with span("selection of terms"):
-            selected = with_terms_selected(job, fitted, on_progress, on_message)
+            selected = with_terms_selected(job, fitted, reporter)
         return replace(selected, refuted=_is_refuted(selected.fitted))
 
     selected = searched(resume=resume, provisional=bool(candidates_of(job)))
@@ -522,21 +517,19 @@ def _is_refuted(fitted: Fitted) -> bool:
     return is_refuted(fitted.objective, fitted.point, fitted.criterion)
 
 
-def with_terms_selected(
-    job: Job, fitted: Fitted, on_progress: OnProgress, on_message: Callable[[str], None]
-) -> Selected:
+def with_terms_selected(job: Job, fitted: Fitted, reporter: Reporter) -> Selected:
     """Return the fit with the terms that the job names, or that the flights select.
 
     A job with a ``free`` list selects none, unless ``terms`` names some.
     """
     clock, candidates = time.perf_counter(), candidates_of(job)
-    selection = Selection(job, fitted, candidates, on_progress, on_message)
+    selection = Selection(job, fitted, candidates, reporter)
     if not isinstance(job.settings.job.terms, str):
         selected = Selected(job, fitted, selection.rows_of_named())
     elif candidates:
         selected = selection.run()
-        if refuted := refuted_by_commands(selected, selected.fitted):
-            on_message(GAINS_REFUTED.format(listed(refuted)))
+        if refuted := refuted_by_commands(selected):
+            reporter.on_message(GAINS_REFUTED.format(listed(refuted)))
             left = {name: names for name, names in candidates.items() if name not in refuted}
             gone = [row for row in with_refuted(selected, refuted).rows if row.group in refuted]
             without = replace(selection, candidates=left).run()
@@ -548,13 +541,14 @@ def with_terms_selected(
     return replace(selected, fitted=replace(selected.fitted, wall_time=fitted.wall_time + spent))
 
 
-def refuted_by_commands(selected: Selected, fitted: Fitted) -> tuple[str, ...]:
+def refuted_by_commands(selected: Selected) -> tuple[str, ...]:
     """Return the groups of fitted gains that recorded commands refute.
 
     In a closed-loop simulation wrong gains may make up for model errors; the regression of recorded
     commands on recorded rates estimates the gains by themselves.
     """
     kept = {row.group: row.names for row in selected.rows if row.kept and row.names[0] in GAIN_AXES}
+    fitted = selected.fitted
     if not kept or (model_errors := model_errors_of(fitted, selected.job.fitted)) is None:
         return ()
     numbers = fitted.objective.space.numbers(fitted.point.coefficients)

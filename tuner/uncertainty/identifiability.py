@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -25,9 +25,10 @@ from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal_equations import Objective, normal_equations
 from tuner.search.continuation import RIDGE
 from tuner.search.estimation import BOTH_POLISHES, LAST_POLISH, free_offsets, polished
+from tuner.search.listener import Reporter
 from tuner.search.optimisers import advance, initial_step
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, Free, Progress
+from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import PRIOR_WIDENING
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, FullProblem, examine
@@ -48,8 +49,7 @@ CLOSED_LOOP_TOLERANCE = 2.0
 def hold_undetermined(
     job: Job,
     fitted: Fitted,
-    on_progress: Callable[[Job, Progress], None],
-    on_message: Callable[[str], None],
+    reporter: Reporter,
     *,
     selection_shifts: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Fitted, Examination]:
@@ -84,17 +84,17 @@ def hold_undetermined(
         names = sorted(set(stand_ins.values()))
         if set(names) <= set(fitted.held.values()):
             break
-        on_message(
+        reporter.on_message(
             f"The flights do not identify {listed(names)}: held at the initial value, and the "
             "others are fitted again."
         )
         rest = hold(
-            job, fitted, stand_ins, on_progress, stages=LAST_POLISH if predicts else BOTH_POLISHES
+            job, fitted, stand_ins, reporter, stages=LAST_POLISH if predicts else BOTH_POLISHES
         )
         if not _loss_ratio(fitted, rest) < (
             1.0 + SEARCH_TOLERANCE if predicts else CLOSED_LOOP_TOLERANCE
         ):
-            on_message(
+            reporter.on_message(
                 f"With {listed(names)} at the initial value the flights are met worse: all keep "
                 "their values."
             )
@@ -105,12 +105,12 @@ def hold_undetermined(
         idle = _undetermined_terms(job, fitted, examination.uncertainty)
         if not idle:
             break
-        on_message(
+        reporter.on_message(
             f"The flights do not identify {listed(idle)}, which ended at a bound: taken out of the "
             "model, and the others are fitted again."
         )
         stand_ins = dict(fitted.held) | {name: name for name in idle}
-        fitted = hold(job, fitted, stand_ins, on_progress)
+        fitted = hold(job, fitted, stand_ins, reporter)
         examination = examined(fitted)
     return fitted, examination
 
@@ -189,7 +189,7 @@ def hold(
     job: Job,
     fitted: Fitted,
     stand_ins: Mapping[str, str],
-    on_progress: Callable[[Job, Progress], None],
+    reporter: Reporter,
     *,
     stages: slice = BOTH_POLISHES,
 ) -> Fitted:
@@ -207,7 +207,7 @@ def hold(
     if not is_held.any():
         return fitted
     clock = time.perf_counter()
-    free = Free(~is_held, free_offsets(job))
+    free = Point(~is_held, free_offsets(job))
     point = _point_after_holding(
         fitted, np.where(is_held, space.initial, fitted.point.coefficients), free
     )
@@ -217,27 +217,24 @@ def hold(
         free=free,
         stages=stages,
         title=f"with {len(names)} held",
-        on_progress=lambda progress: on_progress(job, progress),
+        on_progress=lambda progress: reporter.on_progress(job, progress),
     )
     return replace(
         end, held=dict(stand_ins), wall_time=fitted.wall_time + time.perf_counter() - clock
     )
 
 
-def _point_after_holding(fitted: Fitted, vector: NDArray[np.float64], free: Free) -> Point:
+def _point_after_holding(fitted: Fitted, vector: NDArray[np.float64], free: Point) -> Point:
     """Return the point with the coefficients at a vector (K,), and the free ones moved to suit."""
     objective, point = fitted.objective, fitted.point
     sums = objective.sums(point, fitted.criterion)
     hessian = normal_equations(objective, point, fitted.criterion, sums).hessian
     change = np.zeros(len(hessian))
     change[: len(vector)] = vector - point.coefficients
-    follow = np.flatnonzero(np.concatenate([free.coefficients, free.offsets.ravel()]))
+    follow = np.flatnonzero(free.packed)
     square = hessian[np.ix_(follow, follow)]
     change[follow] = -scaled_solve(square, (hessian @ change)[follow], RIDGE)
-    return Point(
-        point.coefficients + change[: len(vector)],
-        point.offsets + change[len(vector) :].reshape(point.offsets.shape),
-    )
+    return point.after(change)
 
 
 POINTS = 13
@@ -305,9 +302,7 @@ def _refitted(
 ) -> Array:
     """Return χ² (S,) with one coordinate fixed and all others at their minimum."""
     offsets = np.asarray(point.offsets)
-    count = len(objective.space)
-    free = np.concatenate([np.ones(count), (offsets != 0.0).astype(float).ravel()])
-    free[index] = 0.0
+    free = Point(np.arange(len(objective.space)) != index, offsets != 0.0).packed
     weak_priors = replace(criterion, prior=1.0 / PRIOR_WIDENING)
     points = Point(starts, np.repeat(offsets[None], len(starts), axis=0))
     step, previous = initial_step(points), np.full(len(starts), np.inf)

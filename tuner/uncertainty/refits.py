@@ -18,11 +18,12 @@ from tuner.core.files import csv_text
 from tuner.engine import Report, current
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.evaluate.validation import best_values, comparison_of
+from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import Objective
 from tuner.search.estimation import free_offsets, polished
-from tuner.search.iteration import Iteration
+from tuner.search.listener import Iteration
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, Free
+from tuner.search.progress import Fitted
 from tuner.uncertainty.records import Refit
 from tuner.vehicle import with_values
 
@@ -79,7 +80,7 @@ def _refit(task: tuple[Callable[[], tuple[Job, Fitted]], Draw], report: Report) 
     end = polished(
         job,
         replace(fitted, objective=_counted(fitted.objective, draw.counts)),
-        free=Free(np.array([name not in held for name in job.space.names]), free_offsets(job)),
+        free=Point(np.array([name not in held for name in job.space.names]), free_offsets(job)),
         title=draw.title,
         on_progress=lambda progress: report(progress.iterations[-1].model_dump()),
     )
@@ -154,12 +155,35 @@ def cross_validate(
 
     There are two at least. The engine in force computes the folds. Those side by side report each
     stage when it has ended.
+
+    Parameters
+    ----------
+    folder
+        Gets ``cross_validation.csv``: a row a flight left out, then the standard deviation of each
+        column over them.
     """
     names = [flight.name for flight in job.fitted]
     others = 1.0 - np.eye(len(names))
     draws = [Draw(f"without {n}", row, n) for n, row in zip(names, others, strict=True)]
     folds = refits(job, fitted, draws, on_iteration)
-    write_cross_validation(folds, folder)
+    coefficients = list(folds[0].coefficients)
+    rows = [
+        [
+            *(None if fold.rmse is None else getattr(fold.rmse, axis) for axis in RMSE_UNITS),
+            *(fold.coefficients[name] for name in coefficients),
+        ]
+        for fold in folds
+    ]
+    spread = [
+        float(np.std([value for value in column if value is not None], ddof=1))
+        if sum(value is not None for value in column) > 1
+        else None
+        for column in zip(*rows, strict=True)
+    ]
+    labels = (*(fold.left_out for fold in folds), "spread")
+    table = ([label, *row] for label, row in zip(labels, (*rows, spread), strict=True))
+    header = ("left_out", *(f"rmse_{axis}" for axis in RMSE_UNITS), *coefficients)
+    write_text(folder / CROSS_VALIDATION_FILE, csv_text(header, table))
     return folds
 
 
@@ -174,28 +198,3 @@ def jackknife_errors(folds: Sequence[Refit]) -> dict[str, float]:
         name: float(np.sqrt(share * np.sum((values - values.mean()) ** 2)))
         for name, values in coefficients_of(folds).items()
     }
-
-
-def write_cross_validation(folds: Sequence[Refit], folder: Path) -> None:
-    """Write ``cross_validation.csv``: a row a flight left out, then the coefficients' spread.
-
-    The last row holds the standard deviation of each column over the flights left out.
-    """
-    names = list(folds[0].coefficients)
-    rows = [
-        [
-            *(None if fold.rmse is None else getattr(fold.rmse, axis) for axis in RMSE_UNITS),
-            *(fold.coefficients[name] for name in names),
-        ]
-        for fold in folds
-    ]
-    spread = [
-        float(np.std([value for value in column if value is not None], ddof=1))
-        if sum(value is not None for value in column) > 1
-        else None
-        for column in zip(*rows, strict=True)
-    ]
-    labels = (*(fold.left_out for fold in folds), "spread")
-    table = ([label, *row] for label, row in zip(labels, (*rows, spread), strict=True))
-    header = ("left_out", *(f"rmse_{axis}" for axis in RMSE_UNITS), *names)
-    write_text(folder / CROSS_VALIDATION_FILE, csv_text(header, table))

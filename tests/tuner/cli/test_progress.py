@@ -10,7 +10,7 @@ from rich.console import Console
 from tuner.cli.progress import STAGE_PHRASES, _LiveLine, progress_on_terminal
 from tuner.core.spans import span, watching
 from tuner.findings.findings import Code, Finding
-from tuner.search.iteration import Iteration, PointEstimate
+from tuner.search.listener import Iteration, PointEstimate
 
 MESSAGE = "Examining [how well] each coefficient is known, of which there are many." * 4
 
@@ -127,7 +127,7 @@ def test_every_stage_of_a_run_has_its_words():
         name
         for folder in ("job", "recordings")
         for path in Path("tuner", folder).glob("*.py")
-        for name in re.findall(r'(?:span|explanation\.attempt)\(\s*"([^"]+)"', path.read_text())
+        for name in re.findall(r'(?:span|reporter\.attempt)\(\s*"([^"]+)"', path.read_text())
     }
     assert len(named) > 10
     assert named <= set(STAGE_PHRASES)

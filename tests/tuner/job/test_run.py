@@ -19,15 +19,14 @@ from tuner.config import Options
 from tuner.core.errors import InputError
 from tuner.evaluate.comparison import Comparison
 from tuner.findings.findings import Code, sentence
-from tuner.job.listener import Listener
 from tuner.job.run import run
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause
 from tuner.report import render
 from tuner.report.contents import SearchRecord
 from tuner.result import OF_A_RUN, read_run
-from tuner.search.iteration import PointEstimate
 from tuner.search.job_flights import Recording
+from tuner.search.listener import Listener, PointEstimate
 from tuner.vehicle import ControllerFile, read_controller, read_vehicle, values_of
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"

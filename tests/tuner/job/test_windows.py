@@ -13,12 +13,12 @@ from tuner.core.errors import ConfigError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.findings.findings import Code
-from tuner.job.listener import Listener
 from tuner.job.prepare import check_information, check_recordings
 from tuner.job.run import run
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.unit_detection import UNIT_PHRASES, UNITS, to_si
 from tuner.search.estimation import search
+from tuner.search.listener import Listener, Reporter
 from tuner.search.problem import job_of
 from tuner.search.progress import criterion_of, initial_progress
 from tuner.search.stages import WHOLE_LENGTH, plan
@@ -250,7 +250,7 @@ def test_one_of_what_trades_off_is_held_and_the_rest_follows(
     job = job_through("rotor_speed", full_flight, full_bag, updated, free=free)
     messages = []
     fitted, examination = hold_undetermined(
-        job, fitted_through(job, tmp_path), lambda *_: None, messages.append
+        job, fitted_through(job, tmp_path), Reporter(Listener(on_message=messages.append))
     )
     assert fitted.held["motor_constant"] == "mass"
     assert "mass" in messages[0]

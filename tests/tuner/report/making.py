@@ -25,7 +25,7 @@ from tuner.result import (
     SearchResult,
     Status,
 )
-from tuner.search.iteration import Iteration, Outcome
+from tuner.search.listener import Iteration, Outcome
 from tuner.uncertainty.records import (
     CoefficientKnowledge,
     EffectOverTime,

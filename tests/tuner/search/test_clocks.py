@@ -9,7 +9,7 @@ import pytest
 from tuner.objective.criterion import Point
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search import continuation
-from tuner.search.progress import Free, criterion_of
+from tuner.search.progress import criterion_of
 from tuner.search.stages import Stage
 
 FLIGHTS, POSE = 3, 0
@@ -35,7 +35,7 @@ def stays(monkeypatch, late):
     offsets[0, POSE] = late
     offsets[0, -1] = 1.0  # a gyro's bias is no clock
     points = Point(jnp.zeros((1, 1)), jnp.asarray(offsets))
-    free = Free(np.ones(1, bool), np.ones(offsets.shape[1:], bool))
+    free = Point(np.ones(1, bool), np.ones(offsets.shape[1:], bool))
     problem = SimpleNamespace(objective=objective, points=points, criterion=None, free=free)
     stay = continuation._clocks_that_differ(problem, 0, np.zeros(1))
     assert stay[2:].all()

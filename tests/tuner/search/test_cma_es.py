@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
+from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import run_stages
-from tuner.search.progress import Free, initial_progress
+from tuner.search.progress import initial_progress
 from tuner.search.stages import Stage, plan
 
 FREE = ("inertia_zz", "motor_constant", "moment_constant")
@@ -19,7 +20,7 @@ def fit():
 
 def evolved(fit, *, seed, free=None):
     stage = Stage("CMA-ES", 400, 5.0, False, False, 12, 1e-3, False, False, optimiser="cma")
-    free = Free(
+    free = Point(
         np.ones(len(FREE), bool) if free is None else free, np.zeros((len(OFFSETS), 2), bool)
     )
     start = fit.space.vector_of(

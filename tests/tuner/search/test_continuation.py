@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
+from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import normal_equations, sums_at
 from tuner.objective.segments import OFFSETS
 from tuner.search import continuation, optimisers
 from tuner.search.continuation import _clocks_that_differ, run_stages
-from tuner.search.progress import Free, criterion_of, initial_progress, point_of
+from tuner.search.progress import criterion_of, initial_progress, point_of
 from tuner.search.stages import schedule_of
 
 FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input_scaling")
@@ -27,7 +28,7 @@ def fit():
 def searched(fit, vectors, *, offsets=False):
     stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=30)
     reports = []
-    free = Free(np.ones(len(fit.space), bool), np.full((len(OFFSETS), 2), offsets))
+    free = Point(np.ones(len(fit.space), bool), np.full((len(OFFSETS), 2), offsets))
     progress = initial_progress(fit, np.asarray(vectors))
     progress = run_stages(
         fit, stages, progress, free=free, undecided={}, on_progress=reports.append
@@ -79,7 +80,7 @@ def test_the_same_search_twice_gives_the_same_numbers(fit):
 
 def test_the_search_ends_within_a_tenth_of_a_standard_error_of_the_minimum(fit):
     stage, reports = schedule_of(fit.samples, 1.0, robust=True, steps=30)[-1], []
-    free = Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool))
+    free = Point(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool))
     start = initial_progress(fit, np.asarray(fit.space.initial)[None] + 0.02)
     progress = run_stages(fit, (stage,), start, free=free, undecided={}, on_progress=reports.append)
     last = reports[-1]

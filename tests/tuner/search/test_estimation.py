@@ -12,6 +12,7 @@ from tuner.config import JobFile, Options, resolve_settings
 from tuner.config.job import Search
 from tuner.core.errors import InputError
 from tuner.findings.findings import Code, Finding, sentence
+from tuner.objective.criterion import Point
 from tuner.objective.space import space_of
 from tuner.search import estimation as module
 from tuner.search.estimation import fingerprint, load, polished, save, starting_vectors
@@ -21,8 +22,8 @@ from tuner.search.findings import (
     unmatched,
     unmatched_findings,
 )
-from tuner.search.iteration import Outcome
-from tuner.search.progress import Free, initial_progress
+from tuner.search.listener import Outcome
+from tuner.search.progress import initial_progress
 from tuner.search.stages import plan, remaining_seconds
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.vehicle import ControllerFile
@@ -92,7 +93,7 @@ def test_findings_are_those_of_the_last_polish(fitted, updated, monkeypatch):
     missed = Finding(Code.FLIGHT_UNMATCHED, "warning", "spin", {"position": 30.0})
     doubt = Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": 3})
     monkeypatch.setattr(module, "run_stages", lambda _, __, progress, **___: progress)
-    free = Free(np.ones(len(FREE), bool), np.ones(np.shape(fitted.point.offsets), bool))
+    free = Point(np.ones(len(FREE), bool), np.ones(np.shape(fitted.point.offsets), bool))
     matched = replace(fitted, findings=(missed, doubt))
     again = polished(job, matched, free=free, title="again", on_progress=lambda _: None)
     assert again.findings == (doubt,)

@@ -11,10 +11,9 @@ from tests.docs.recorded import write_lab
 from tuner.config import Options
 from tuner.core.errors import OutputError
 from tuner.findings.findings import MAX_FINITE, Code, Finding, one_line
-from tuner.job.listener import Listener
 from tuner.job.run import run
 from tuner.result import read_run
-from tuner.search.findings import Explanation
+from tuner.search.listener import Listener, Reporter
 from tuner.terms import refit_with_disturbances as disturbances
 from tuner.uncertainty.verdict import Verdict
 
@@ -32,10 +31,10 @@ def fails(*_: object, **__: object) -> None:
 
 def test_a_part_that_fails_is_named_and_the_rest_goes_on() -> None:
     told: list[str] = []
-    explanation = Explanation(told.append)
-    assert explanation.attempt("intervals", lambda: 1, None) == 1
-    assert explanation.attempt("intervals", fails, None) is None
-    (finding,) = explanation.findings
+    reporter = Reporter(Listener(on_message=told.append))
+    assert reporter.attempt("intervals", lambda: 1, None) == 1
+    assert reporter.attempt("intervals", fails, None) is None
+    (finding,) = reporter.findings
     assert (finding.code, finding.subject) == (Code.PART_FAILED, "intervals")
     assert told == [one_line(finding)]
     assert f"LinAlgError, {CONVERGE}" in told[0]
@@ -46,17 +45,17 @@ def test_a_full_disk_is_no_part() -> None:
         raise OutputError("folder", "is full", "free some space")
 
     with pytest.raises(OutputError):
-        Explanation(lambda _: None).attempt("intervals", full, None)
+        Reporter().attempt("intervals", full, None)
 
 
 def test_a_finding_is_reported_once() -> None:
     told: list[str] = []
-    explanation = Explanation(told.append)
+    reporter = Reporter(Listener(on_message=told.append))
     finding = Finding(Code.SPINS_REVERSED, "warning", "motors")
-    explanation.report([finding])
-    explanation.add([finding])
+    reporter.report([finding])
+    reporter.add([finding])
     assert told == [one_line(finding)]
-    assert explanation.findings == (finding,)
+    assert reporter.findings == (finding,)
 
 
 def test_a_finding_holds_numbers_that_json_has() -> None:

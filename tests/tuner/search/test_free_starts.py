@@ -12,7 +12,7 @@ from tuner.objective.initial_conditions import ROWS, start_sd_of_spin
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import run_stages
 from tuner.search.optimisers import MAX_STATE_SD, estimated_states, need_relinearising
-from tuner.search.progress import Free, criterion_of, initial_progress
+from tuner.search.progress import criterion_of, initial_progress
 from tuner.search.stages import plan
 
 FREE = ("inertia_zz", "moment_constant", "rotor_drag_coefficient")
@@ -54,7 +54,7 @@ def test_a_search_ends_where_its_loss_is_least_from_the_start_that_it_found(away
         fit,
         (last,),
         initial_progress(fit, true[None] + away),
-        free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
+        free=Point(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={},
         on_progress=lambda _: None,
     )

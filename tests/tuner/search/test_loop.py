@@ -11,7 +11,7 @@ from tests.tuner.uncertainty.making import NOISE, problem, with_data
 from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import run_stages
-from tuner.search.progress import Free, Loop, initial_progress, loop_of, with_loop
+from tuner.search.progress import Loop, initial_progress, loop_of, with_loop
 from tuner.search.stages import schedule_of
 
 FRAME = {"marker_tilt_x": 0.0105, "marker_tilt_y": -0.0157, "motor_constant": 1.5e-5}
@@ -29,7 +29,7 @@ def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, 
         fit,
         schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=10),
         initial_progress(fit, np.asarray(fit.space.initial)[None]),
-        free=Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
+        free=Point(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={"sees_markers": np.ones(2, bool)},
         on_progress=lambda _: None,
     )
@@ -53,7 +53,7 @@ def test_who_sees_the_markers_is_tried_from_where_the_search_began():
         with_loop(with_data(with_loop(fit, seen), fit.start(fit.space.initial)), Loop()),
         stages[: at + 1],
         there,
-        free=Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
+        free=Point(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={"sees_markers": np.ones(2, bool)},
         on_progress=reports.append,
         start=start,
@@ -83,7 +83,7 @@ def test_saturation_feedback_is_decided_by_the_flights_that_clip(flown):
         fit,
         tuple(stages),
         initial_progress(fit, np.asarray(fit.space.initial)[None]),
-        free=Free(np.ones(1, bool), np.zeros((len(OFFSETS), 2), bool)),
+        free=Point(np.ones(1, bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={"saturation_feedback": np.array([False, True])},
         on_progress=lambda _: None,
     )

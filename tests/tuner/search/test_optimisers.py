@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
+from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import OPTIMISERS, run_stages
-from tuner.search.progress import Free, initial_progress
+from tuner.search.progress import initial_progress
 from tuner.search.stages import WHOLE_LENGTH, plan
 
 FREE = ("inertia_zz", "motor_constant", "moment_constant")
@@ -66,7 +67,7 @@ def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
         fit,
         tuple(stages),
         initial_progress(fit, start[None]),
-        free=Free(np.array([True, True, False]), np.zeros((len(OFFSETS), 2), bool)),
+        free=Point(np.array([True, True, False]), np.zeros((len(OFFSETS), 2), bool)),
         undecided={},
         on_progress=reports.append,
     )
@@ -83,7 +84,7 @@ def test_least_squares_reports_its_damping():
         fit,
         (stage,),
         initial_progress(fit, np.asarray(fit.space.initial)[None] + [[0.05], [0.06]]),
-        free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
+        free=Point(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={},
         on_progress=lambda _: None,
     )

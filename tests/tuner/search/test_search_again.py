@@ -8,8 +8,9 @@ import pytest
 
 from tests.tuner.uncertainty.making import FLIGHTS, NOISE, fitted_of, problem, truth
 from tuner.config import JobFile
+from tuner.objective.criterion import Point
 from tuner.search import estimation
-from tuner.search.progress import Free, Loop, initial_progress, loop_of, with_loop
+from tuner.search.progress import Loop, initial_progress, loop_of, with_loop
 from tuner.vehicle import ControllerFile
 
 PLAIN = ("motor_constant", "inertia_xx", "inertia_yy")
@@ -37,7 +38,7 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
         return replace(progress, loop=loop, scales=scales, losses=np.ones(1))
 
     monkeypatch.setattr(estimation, "run_stages", grown)
-    free = Free(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
+    free = Point(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
     said = {"free": free, "title": "again", "on_progress": lambda _: None}
     again = estimation.search_again(job, fitted, objective.space.initial, **said)
     assert asked == {"undecided": {choice: tell}, "loop": own}
@@ -57,7 +58,7 @@ def test_a_rough_fit_ends_where_a_linear_step_is_left(left, steps):
         settings=SimpleNamespace(job=JobFile(), controller=ControllerFile()),
         fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
     )
-    free = Free(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
+    free = Point(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
     again = estimation.polished(
         job,
         fitted,

@@ -30,7 +30,7 @@ from tuner.objective.space import space_of
 from tuner.recordings.flight import InitialState
 from tuner.search.estimation import free_offsets, polished
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, Free
+from tuner.search.progress import Fitted
 
 BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
 
@@ -118,6 +118,6 @@ def hovering(tilt: tuple[float, float], heading: float = 0.4) -> InitialState:
 
 
 def _fit(job: Job, fitted: Fitted) -> Fitted:
-    free = Free(np.ones(len(job.space), bool), free_offsets(job))
+    free = Point(np.ones(len(job.space), bool), free_offsets(job))
     end = polished(job, fitted, free=free, title="base", on_progress=lambda _: None)
     return replace(end, outcomes=())

@@ -8,6 +8,7 @@ import pytest
 
 from tests.tuner.terms.making import BASE, hovering, unfitted_with
 from tuner.config import JobFile
+from tuner.search.listener import Reporter
 from tuner.terms.candidates import with_terms
 from tuner.terms.selection import hover_tilt, with_first_terms, with_terms_selected
 from tuner.vehicle.selection_table import SelectionCode
@@ -65,7 +66,7 @@ def test_named_terms_are_free_from_the_start_and_stand_in_the_table(jobs):
         "marker_tilt_z",
     )
     fitted = with_free(fitted, begun.space.names[-4:], file)
-    rows = with_terms_selected(begun, fitted, lambda *_: None, lambda _: None).rows
+    rows = with_terms_selected(begun, fitted, Reporter()).rows
     assert [(row.group, row.kept, row.reason) for row in rows] == [
         ("fuselage_drag", True, SelectionCode.ASKED_FOR),
         ("marker_tilt", True, SelectionCode.ASKED_FOR),
@@ -84,7 +85,7 @@ def test_a_named_term_has_a_row_with_its_gain(jobs):
     for job, fitted in (jobs[(0.0, 0.001)], unfitted_with(0.05, seed=0, tilt=(0.0, 0.001))):
         begun = with_first_terms(with_file(job, file))
         there = with_free(fitted, ("fuselage_drag",), file)
-        (row,) = with_terms_selected(begun, there, lambda *_: None, lambda _: None).rows
+        (row,) = with_terms_selected(begun, there, Reporter()).rows
         worth.append((row.gain_fit, row.gain_holdout, row.scatter))
     (fit, held_out, scatter), (fit_there, held_out_there, scatter_there) = worth
     assert abs(fit) < 0.02

@@ -17,6 +17,7 @@ from tuner.disturbances.maximum_likelihood import MAX_STEPS
 from tuner.equation_error.omitted_laws import Law
 from tuner.findings.findings import Code, Finding
 from tuner.search.findings import unmatched_findings
+from tuner.search.listener import Listener, Reporter
 from tuner.search.problem import Job
 from tuner.search.progress import COLOURED_RATIO, Fitted
 from tuner.terms import refit_with_disturbances as disturbances
@@ -56,7 +57,7 @@ def test_nothing_is_fitted_again_without_need(fit: Fitted, asked: str) -> None:
     said: list[str] = []
     settings = SimpleNamespace(job=JobFile(disturbances=asked, terms="none"))
     job = cast(Job, SimpleNamespace(settings=settings))
-    assert with_disturbances(Selected(job, fit), lambda *_: None, said.append) is None
+    assert with_disturbances(Selected(job, fit), Reporter(Listener(on_message=said.append))) is None
     assert said == []
 
 
@@ -73,7 +74,7 @@ def test_flights_whose_gains_would_not_fit_are_left_to_the_intervals(monkeypatch
     said: list[str] = []
     with nullcontext() if says else pytest.raises(AttributeError):  # goes on with what lacks
         selected = Selected(job, fitted(2.0 * COLOURED_RATIO))
-        found = with_disturbances(selected, lambda *_: None, said.append)
+        found = with_disturbances(selected, Reporter(Listener(on_message=said.append)))
         assert found is None
     assert ("Disturbances are not estimated" in said[0]) == says
 
@@ -136,7 +137,7 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
 
     monkeypatch.setattr(disturbances, "_fit_innovations", descended)
     monkeypatch.setattr(disturbances.LinearisedInnovations, "of", seen)
-    assert with_disturbances(begin, lambda *_: None, lambda _: None) is None  # keeps no track
+    assert with_disturbances(begin, Reporter()) is None  # keeps no track
     assert taken == descents
     assert within[-1] == [group for group in called_for[: len(descents) - 1] if group]
 
@@ -151,7 +152,7 @@ def test_no_terms_are_selected_by_innovations_of_a_diverged_filter(monkeypatch):
     job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
     said: list[str] = []
     found = with_disturbances(
-        Selected(job, fitted(2.0 * COLOURED_RATIO)), lambda *_: None, said.append
+        Selected(job, fitted(2.0 * COLOURED_RATIO)), Reporter(Listener(on_message=said.append))
     )
     assert found is None
     assert said[-1] == disturbances.FILTER_LOST
@@ -173,7 +174,7 @@ def test_a_fit_with_a_lag_whose_filter_loses_a_flight_is_not_taken(monkeypatch):
         disturbances, "_with_lag_terms", lambda found, there, *_: (found, there, loses)
     )
     said: list[str] = []
-    assert with_disturbances(begin, lambda *_: None, said.append) is None
+    assert with_disturbances(begin, Reporter(Listener(on_message=said.append))) is None
     assert said[-1] == disturbances.FILTER_LOST
 
 
@@ -239,7 +240,7 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     monkeypatch.setattr(disturbances, "_with_lag_terms", with_lag_terms)
     monkeypatch.setattr(disturbances, "_estimates_agree", lambda *_: not lag)
     monkeypatch.setattr(disturbances, "_is_sharper", lambda *_: True)
-    assert with_disturbances(begin, lambda *_: None, lambda _: None) is not None
+    assert with_disturbances(begin, Reporter()) is not None
     assert polished == ["clocks", "simulated"][:titles]
     assert len(examined) == 2 - lag
     assert (examined[-1] is begin.fitted) == (titles == 1 and not lag)

@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 
 from tests.tuner.terms.making import unfitted_with
-from tuner.search.findings import Explanation
+from tuner.search.listener import Reporter
 from tuner.search.progress import COLOURED_RATIO, Fitted
 from tuner.terms import refit_with_disturbances, selection
 from tuner.terms.candidates import Selected
@@ -37,8 +37,7 @@ def ended_with(thrust: float, monkeypatch: pytest.MonkeyPatch) -> tuple[Selected
         job,
         cast(Path, None),
         resume=False,
-        on_progress=lambda *_: None,
-        on_message=lambda _: None,
+        reporter=Reporter(),
     )
     return found, tried
 
@@ -53,8 +52,8 @@ def followed(selected: Selected, monkeypatch: pytest.MonkeyPatch) -> bool:
 
     monkeypatch.setattr(refit_with_disturbances, "with_disturbances", following)
     monkeypatch.setattr(refit_with_disturbances, "hold_undetermined", lambda *_, **__: held)
-    silent = (lambda *_: None), (lambda _: None), Explanation(lambda _: None)
-    assert refit_with_disturbances.refit_and_examine(selected, *silent) == (selected, *held)
+    examined = refit_with_disturbances.refit_and_examine(selected, Reporter())
+    assert examined == (selected, held[1])
     return bool(tried)
 
 

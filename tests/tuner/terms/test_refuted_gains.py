@@ -34,5 +34,5 @@ def test_commands_take_back_gains_that_are_the_files(flies, found, refuted):
     fitted = making.fitted_of(objective, point)
     job = cast(Any, SimpleNamespace(fitted=tuple(flights)))
     selected = Selected(job, fitted, (ROW,))
-    assert refuted_by_commands(selected, fitted) == refuted
+    assert refuted_by_commands(selected) == refuted
     assert with_refuted(selected, refuted).kept == (() if refuted else ("rate_gain",))

@@ -9,6 +9,7 @@ from tests.tuner.terms.making import BASE, job_with, unfitted_with
 from tuner.config import JobFile
 from tuner.objective.criterion import units_of
 from tuner.report.result_texts import selection_in_words
+from tuner.search.listener import Listener, Reporter
 from tuner.terms import selection
 from tuner.terms import selection as terms
 from tuner.terms.linearisation import LinearisedFit
@@ -27,7 +28,8 @@ BLIND = SimpleNamespace(columns_of=lambda _: ())
 def selected(drag, *, seed=0, job=None, around=None):
     messages = []
     result = with_terms_selected(
-        *job_with(drag, seed=seed, job=job, around=around), lambda *_: None, messages.append
+        *job_with(drag, seed=seed, job=job, around=around),
+        Reporter(Listener(on_message=messages.append)),
     )
     return result, messages
 
@@ -138,7 +140,7 @@ def test_of_all_groups_only_the_battery_is_judged_as_one_that_a_recorded_signal_
     groups = {**term_groups(), "wind": ("wind_x", "wind_y")}
     job = SimpleNamespace(space=SimpleNamespace(names=BASE_IN_ORDER))
     standing = LinearisedFit(SimpleNamespace(residuals_at_noise_level=False), groups, BLIND)
-    selection.Selection(job, None, groups, print, print)._pruned(standing)
+    selection.Selection(job, None, groups, Reporter())._pruned(standing)
     assert judged == ["battery"]
 
 
@@ -166,7 +168,7 @@ def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
     monkeypatch.setattr(own, "_selection_shifts", lambda *_: {})
     monkeypatch.setattr(selection, "with_groups", lambda base, *_, **__: base)
     groups = {"fuselage_drag": ("fuselage_drag",)}
-    own(SimpleNamespace(), fitted, groups, print, print).run()
+    own(SimpleNamespace(), fitted, groups, Reporter()).run()
     assert bool(searched) is tried
 
 
@@ -185,7 +187,7 @@ def test_eliminated_groups_are_not_tried_again(monkeypatch):
     monkeypatch.setattr(own, "_rows", lambda _, __, dropped: rows.extend(dropped) or ())
     monkeypatch.setattr(own, "_selection_shifts", lambda *_: {})
     groups = {"fuselage_drag": ("fuselage_drag",), "linear_drag": ("linear_drag_x",)}
-    own(SimpleNamespace(), fitted, groups, print, print).run()
+    own(SimpleNamespace(), fitted, groups, Reporter()).run()
     assert wanted == ["linear_drag"]
     assert rows == ["fuselage_drag"]
 
@@ -203,7 +205,7 @@ def test_terms_free_from_the_beginning_are_in_the_table_with_their_gain(
     )
     standing = LinearisedFit(SimpleNamespace(residuals_at_noise_level=False), {}, BLIND)
     groups = {"fuselage_drag": ("fuselage_drag",)}
-    rows = selection.Selection(job, None, groups, print, print)._rows(standing, {})
+    rows = selection.Selection(job, None, groups, Reporter())._rows(standing, {})
     assert [(row.group, row.kept, row.reason) for row in rows] == [
         (LINEAR, True, SelectionCode.OPEN_LOOP),
         ("marker_tilt", True, SelectionCode.HOVERS_TILTED),
@@ -215,9 +217,7 @@ def test_terms_free_from_the_beginning_are_in_the_table_with_their_gain(
 
 def test_a_job_that_wants_no_terms_gets_none():
     for job in (JobFile(terms="none"), JobFile(free=BASE)):
-        without = with_terms_selected(
-            *unfitted_with(DRAG, seed=0, job=job), lambda *_: None, lambda _: None
-        )
+        without = with_terms_selected(*unfitted_with(DRAG, seed=0, job=job), Reporter())
         assert not without.rows
         assert without.job.space.names == BASE_IN_ORDER
 

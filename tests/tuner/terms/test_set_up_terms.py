@@ -4,6 +4,7 @@ import pytest
 
 from tests.tuner.terms.making import BASE, job_with
 from tests.tuner.uncertainty.making import problem
+from tuner.search.listener import Reporter
 from tuner.terms import selection
 from tuner.terms.selection import with_terms_selected
 from tuner.uncertainty.examination import examine
@@ -32,7 +33,7 @@ def selected(monkeypatch, groups=GROUPS, **given):
     monkeypatch.setattr(selection, "condition_groups", lambda *_, **__: {})
     monkeypatch.setattr(selection, "model_errors_of", lambda *_: None)  # no commands were recorded
     fit = job_with(0.0, seed=0, **given)
-    return with_terms_selected(*fit, lambda *_: None, lambda _: None)
+    return with_terms_selected(*fit, Reporter())
 
 
 @pytest.mark.long

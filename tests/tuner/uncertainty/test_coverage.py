@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import fitted_of, problem, truth, with_data
+from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import run_stages
-from tuner.search.progress import Free, initial_progress, point_of
+from tuner.search.progress import initial_progress, point_of
 from tuner.search.stages import plan
 from tuner.uncertainty.estimates import uncertainty_of
 
@@ -30,7 +31,7 @@ def test_intervals_cover_the_truth():
     exact = problem(FREE)
     right = exact.space.numbers(exact.space.initial)
     stages = plan("gradient", exact.samples, 200.0, windows=False, robust=True, steps=20)[-3:]
-    free = Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool))
+    free = Point(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool))
     covered = np.zeros((REPEATS, len(FREE)), bool)
     for repeat in range(REPEATS):
         noisy = with_data(exact, truth(exact), noise=np.random.default_rng(100 + repeat))

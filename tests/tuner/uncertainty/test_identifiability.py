@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.config import JobFile
+from tuner.search.listener import Listener, Reporter
 from tuner.terms.candidates import Selected
 from tuner.uncertainty import identifiability
 from tuner.uncertainty.identifiability import hold_undetermined, stand_ins_of
@@ -66,7 +67,7 @@ def test_coefficients_that_trade_off_are_held_only_where_that_costs_nothing(
     monkeypatch.setattr(identifiability, "hold", hold)
     said = []
     job = SimpleNamespace(settings=SimpleNamespace(job=JobFile()), fitted=())
-    rest, _ = hold_undetermined(job, fitted, lambda *_: None, said.append)
+    rest, _ = hold_undetermined(job, fitted, Reporter(Listener(on_message=said.append)))
     assert rest.held == (traded if is_held else {})
     assert ("all keep their values" in said[-1]) is not is_held
 
@@ -111,7 +112,7 @@ def test_a_term_at_its_bound_that_flights_do_not_identify_is_removed(
     terms = {"ground_effect": ("ground_effect",)}
     settings = SimpleNamespace(job=file)
     job, said = SimpleNamespace(settings=settings, first_terms=terms, fitted=()), []
-    rest, _ = hold_undetermined(job, fitted, lambda *_: None, said.append)
+    rest, _ = hold_undetermined(job, fitted, Reporter(Listener(on_message=said.append)))
     assert rest.held == (traded | {name: name} if goes else traded)
     assert any("taken out of the model" in line for line in said) is goes
 
@@ -119,7 +120,7 @@ def test_a_term_at_its_bound_that_flights_do_not_identify_is_removed(
         group=name, names=(name,), kept=True, reason=SelectionCode.PREDICTS_SECTIONS
     )
     asked = chosen.model_copy(update={"reason": SelectionCode.ASKED_FOR})
-    after, *others = Selected(job, rest, (chosen, asked)).rows_after_holding(rest.held)
+    after, *others = Selected(job, rest, (chosen, asked)).rows_after_holding
     assert after.kept is not goes
     assert (after.reason is SelectionCode.NO_INFORMATION) is goes
     assert others == [asked]
