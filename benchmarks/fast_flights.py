@@ -32,8 +32,7 @@ from tuner.equation_error.regression import convolved, summing
 from tuner.job.run import run
 from tuner.recordings.flight import Flight
 from tuner.result import RunResult
-from tuner.search.inlet_choice import regressors
-from tuner.search.job_flights import read_recordings
+from tuner.search.job_flights import read_recordings, regressors
 from tuner.vehicle import VehicleFile
 from tuner.vehicle.scaling_laws import INCH, Airframe, new_vehicle
 

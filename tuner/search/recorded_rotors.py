@@ -36,8 +36,7 @@ from tuner.objective.inlets import INLETS, linear_interpolation
 from tuner.objective.rotor_signals import Source, squared_speed
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import local_parabolas, states_at
-from tuner.search.inlet_choice import regressors
-from tuner.search.job_flights import Recording
+from tuner.search.job_flights import Recording, regressors
 from tuner.vehicle import VehicleFile
 
 BAND_HZ = (0.7, 8.0)

@@ -42,8 +42,7 @@ from tuner.equation_error.regression import (
 from tuner.evaluate.simulation_files import write_csv
 from tuner.job.prepare import of_rigid_body, with_accelerations
 from tuner.recordings.flight import Series
-from tuner.search.inlet_choice import predicts_turning, regressors
-from tuner.search.job_flights import read_recordings
+from tuner.search.job_flights import predicts_turning, read_recordings, regressors
 from tuner.search.problem import job_of
 
 SECONDS = 7.0

@@ -14,8 +14,7 @@ from tuner.objective.rotor_signals import MotorOrder
 from tuner.recordings.flight import Series
 from tuner.search import job_flights as recordings
 from tuner.search.estimation import search
-from tuner.search.inlet_choice import choose_inlet
-from tuner.search.job_flights import read_recordings
+from tuner.search.job_flights import choose_inlet, read_recordings
 from tuner.search.problem import job_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, values_of, with_values
 
@@ -103,7 +102,7 @@ def test_auto_keeps_commands_that_explain_the_turns(dense, updated):
 
 def test_commands_of_motors_in_another_order_need_not_be_logged_faster(dense, updated, monkeypatch):
     seen = MotorOrder((1, 0, 3, 2), reversed_spins=None)
-    monkeypatch.setattr("tuner.search.inlet_choice.motor_order", lambda *_: seen)
+    monkeypatch.setattr("tuner.search.job_flights.motor_order", lambda *_: seen)
     command = dense.series["command"]
     turned = Series(command.time, command.values[:, [1, 0, 3, 2]])
     inlet, finding = choose_inlet(

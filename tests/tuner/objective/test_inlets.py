@@ -12,7 +12,7 @@ from tuner.core.errors import RecordingError
 from tuner.objective.initial_conditions import STATES
 from tuner.objective.inlets import INLETS
 from tuner.recordings.inspector import inlet_reports
-from tuner.search.inlet_choice import inlet_for
+from tuner.search.job_flights import inlet_for
 from tuner.vehicle import COEFFICIENTS
 
 

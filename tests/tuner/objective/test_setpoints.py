@@ -9,7 +9,7 @@ import pytest
 from tuner.findings.findings import Code, one_line
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
 from tuner.recordings.flight import Series
-from tuner.search.inlet_choice import choose_inlet
+from tuner.search.job_flights import choose_inlet
 from tuner.vehicle import ControllerFile
 
 OURS = ControllerFile()

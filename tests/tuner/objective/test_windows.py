@@ -19,7 +19,7 @@ from tuner.objective.inlets import (
 from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.windows import windows_of
 from tuner.recordings.flight import Series
-from tuner.search.inlet_choice import inlet_for
+from tuner.search.job_flights import inlet_for
 
 
 def test_windows_follow_each_other_and_start_where_the_flight_is(flight):
