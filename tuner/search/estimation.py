@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -151,7 +151,9 @@ SAME_MINIMUM_TOLERANCE = 0.01
 """Relative difference of losses below which starts have reached the same minimum."""
 BOUND_MARGIN = 0.02
 """Share of its range by which a start keeps away from a bound."""
-BOTH_POLISHES, LAST_POLISH, FIRST_POLISH = slice(-2, None), slice(-1, None), slice(-2, -1)
+BOTH_POLISHES, LAST_POLISH, FIRST_POLISH, ALL_BUT_LAST = (
+    slice(*ends) for ends in ((-2, None), (-1, None), (-2, -1), (None, -1))
+)
 """Stages of a refit: the first polish finds the weights of the last."""
 ROUGH_TOLERANCE = 1e-3
 """Share of the loss that a rough fit leaves to a linear step: a tenth of a term's least gain."""
@@ -384,8 +386,12 @@ def polished(
     on_progress: Callable[[Progress], None],
     stages: slice = BOTH_POLISHES,
     left: float | None = None,
+    start: Array | None = None,
 ) -> Fitted:
-    """Return a fit polished again, by the last stages from its point.
+    """Return a fit searched again, by some stages from its point or from a start vector.
+
+    A search from a start forgets the bias by missing terms, such as a coefficient at its bound; the
+    loop's choices are tried both ways again.
 
     Parameters
     ----------
@@ -402,88 +408,35 @@ def polished(
     stages
         Which of the stages to run.
     left
-        Share of the loss that may be left to gain, for a rough fit.
+        Share of the loss that the last of them may leave to gain, for a rough fit.
+    start
+        (K,) vector to begin at; the fit's point by default.
     """
-    names, point = [flight.name for flight in job.fitted], fitted.point
-    last = fitted.iterations[-1].damping if fitted.iterations else None
-    progress = replace(
-        initial_progress(fitted.objective, point.coefficients[None]),
-        points=Point(point.coefficients[None], point.offsets[None]),
-        scales={
-            channel: np.array([fitted.scales[name][channel] for name in names])
-            for channel in fitted.objective.segments.measured
-        },
-        states=fitted.criterion.states,
-        losses=np.array([fitted.loss_best]),
-        iterations=fitted.iterations,
-        evaluations=fitted.evaluations,
-        damping=np.array([np.clip(last, MIN_DAMPING, 1.0) if last else 1.0]),
-    )
-    return _run_again(
-        job,
-        fitted,
-        progress,
-        [_rough(stage, left) for stage in stages_of(job, fitted.objective)[stages]],
-        free=free,
-        undecided={},
-        title=title,
-        on_progress=on_progress,
-    )
-
-
-def search_again(
-    job: Job,
-    fitted: Fitted,
-    vector: Array,
-    *,
-    free: Point,
-    title: str,
-    on_progress: Callable[[Progress], None],
-) -> Fitted:
-    """Return a rough fit by all stages but the last polish, from a start vector (K,).
-
-    The other arguments are those of `polished`. A search from the start forgets the bias by missing
-    terms, such as a coefficient at its bound; the loop's choices are tried both ways again.
-    """
-    progress = replace(
-        initial_progress(fitted.objective, vector[None]),
-        iterations=fitted.iterations,
-        evaluations=fitted.evaluations,
-        loop=loop_of(job.objective),
-    )
-    *stages, polish, _ = stages_of(job, fitted.objective)
-    return _run_again(
-        job,
-        fitted,
-        progress,
-        (*stages, _rough(polish, ROUGH_TOLERANCE)),
-        free=free,
-        undecided=job.undecided(fitted.objective),
-        title=title,
-        on_progress=on_progress,
-    )
-
-
-def _rough(stage: Stage, left: float | None) -> Stage:
-    if left is None:
-        return stage
-    return replace(stage, tolerance=max(stage.tolerance, left), rough=True)
-
-
-def _run_again(
-    job: Job,
-    fitted: Fitted,
-    progress: Progress,
-    stages: Sequence[Stage],
-    *,
-    free: Point,
-    undecided: Undecided,
-    title: str,
-    on_progress: Callable[[Progress], None],
-) -> Fitted:
-    stages = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in stages)
+    objective, point = fitted.objective, fitted.point
+    undecided: Undecided = {}
+    if start is None:
+        last = fitted.iterations[-1].damping if fitted.iterations else None
+        progress = replace(
+            initial_progress(objective, point.coefficients[None]),
+            points=Point(point.coefficients[None], point.offsets[None]),
+            scales={
+                channel: np.array([fitted.scales[flight.name][channel] for flight in job.fitted])
+                for channel in objective.segments.measured
+            },
+            states=fitted.criterion.states,
+            losses=np.array([fitted.loss_best]),
+            damping=np.array([np.clip(last, MIN_DAMPING, 1.0) if last else 1.0]),
+        )
+    else:
+        undecided = job.undecided(objective)
+        progress = replace(initial_progress(objective, start[None]), loop=loop_of(job.objective))
+    progress = replace(progress, iterations=fitted.iterations, evaluations=fitted.evaluations)
+    *first, end = stages_of(job, objective)[stages]
+    if left is not None:
+        end = replace(end, tolerance=max(end.tolerance, left), rough=True)
+    named = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in (*first, end))
     progress = run_stages(
-        fitted.objective, stages, progress, free=free, undecided=undecided, on_progress=on_progress
+        objective, named, progress, free=free, undecided=undecided, on_progress=on_progress
     )
-    end = _end(job, fitted.objective, stages[-1], progress)
-    return with_end_findings(job, replace(fitted, **end, polished=True))
+    changed = _end(job, objective, end, progress)
+    return with_end_findings(job, replace(fitted, **changed, polished=True))

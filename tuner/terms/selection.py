@@ -32,13 +32,13 @@ from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.objective.space import extended
 from tuner.recordings.flight import Flight
 from tuner.search.estimation import (
+    ALL_BUT_LAST,
     FIRST_POLISH,
     LAST_POLISH,
     ROUGH_TOLERANCE,
     free_offsets,
     polished,
     search,
-    search_again,
 )
 from tuner.search.listener import Reporter
 from tuner.search.problem import Job
@@ -267,20 +267,19 @@ class Selection:
         def on_progress(progress: Progress) -> None:
             self.reporter.on_progress(replace(self.job, space=objective.space), progress)
 
+        stages = FIRST_POLISH if roughly else LAST_POLISH
         if anew:
-            start[: len(self.job.space)] = self.job.space.initial
+            stages, start[: len(self.job.space)] = ALL_BUT_LAST, self.job.space.initial
             start = with_start_values(objective.space, start, wanted)
-            return search_again(
-                self.job, from_here, start, free=free_ones, title=title, on_progress=on_progress
-            )
         return polished(
             self.job,
             from_here,
             free=free_ones,
             title=title,
             on_progress=on_progress,
-            stages=FIRST_POLISH if roughly else LAST_POLISH,
+            stages=stages,
             left=ROUGH_TOLERANCE if roughly else None,
+            start=start if anew else None,
         )
 
     def linearised(self, fitted: Fitted, added: Groups) -> LinearisedFit:

@@ -40,7 +40,9 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
     monkeypatch.setattr(estimation, "run_stages", grown)
     free = Point(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
     said = {"free": free, "title": "again", "on_progress": lambda _: None}
-    again = estimation.search_again(job, fitted, objective.space.initial, **said)
+    again = estimation.polished(
+        job, fitted, start=objective.space.initial, stages=estimation.ALL_BUT_LAST, **said
+    )
     assert asked == {"undecided": {choice: tell}, "loop": own}
     assert loop_of(again.objective) == own.switched(choice)
     estimation.polished(job, again, **said)
