@@ -40,7 +40,6 @@ from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import (
     CLOCKS,
     OFFSETS,
-    FlightWindow,
     Segments,
     cut_windows,
     noise_of,
@@ -264,7 +263,7 @@ class _Group:
         if self.windowed:
             self._segments, pieces = self._window_segments(free_starts=False)
             self._windows = [
-                tuple(piece.window for piece in pieces if piece.number == number)
+                tuple(piece for piece in pieces if piece.number == number)
                 for number in range(len(flights))
             ]
             self._samples, self._limits = math.ceil((seconds + WINDOW_MARGIN_S) * rate), AIRBORNE
@@ -283,7 +282,7 @@ class _Group:
             for name in names
         }
 
-    def _window_segments(self, *, free_starts: bool) -> tuple[Segments, list[FlightWindow]]:
+    def _window_segments(self, *, free_starts: bool) -> tuple[Segments, list[Window]]:
         """Return the windows, with starts as recorded or, if free, near them."""
         flights = [recording.flight for recording in self._recordings]
         inlets = [self._inlet] * len(flights)

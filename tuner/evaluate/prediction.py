@@ -229,7 +229,7 @@ class FlightPredictor:
             free_starts=False,
             input_late={flight.name: input_late},
         )
-        begins = np.array([piece.window.begin for piece in self._pieces])
+        begins = np.array([piece.begin for piece in self._pieces])
         self._whole = np.flatnonzero(begins + seconds <= flight.duration + 1e-9)
         self.begins = begins[self._whole]
         self.ahead = np.arange(1, round(seconds * flight.rate) + 1) / flight.rate

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -263,24 +262,6 @@ def segments_of(
     )
 
 
-class FlightWindow(NamedTuple):
-    """A window of one of some flights.
-
-    Attributes
-    ----------
-    number
-        Of its flight.
-    window
-        As recorded.
-    flight
-        The window with its inputs on the clock of the compared channels.
-    """
-
-    number: int
-    window: Window
-    flight: Flight
-
-
 def cut_windows(
     flights: Sequence[Flight],
     *,
@@ -289,8 +270,10 @@ def cut_windows(
     stride: float | None = None,
     free_starts: bool = True,
     input_late: Mapping[str, float] = MappingProxyType({}),
-) -> list[FlightWindow]:
+) -> list[Window]:
     """Cut flights into the windows that `window_segments` lays out.
+
+    Their inputs are on the clock of the compared channels.
 
     Parameters
     ----------
@@ -312,14 +295,14 @@ def cut_windows(
         for window in windows_of(
             flight, seconds, fed=fed, stride=stride, smoothed_widely=free_starts
         ):
-            own = INLETS[name].fed(window.flight)
-            pieces.append(FlightWindow(number, window, stamped_earlier(window.flight, own, late)))
+            own = stamped_earlier(window.flight, INLETS[name].fed(window.flight), late)
+            pieces.append(Window(own, window.begin, number))
     return pieces
 
 
 def window_segments(
     flights: Sequence[Flight],
-    pieces: Sequence[FlightWindow],
+    pieces: Sequence[Window],
     *,
     inlets: Sequence[InletName],
     schedule: Schedule,
@@ -364,12 +347,8 @@ def window_segments(
         measured={name: _measured(cut, name, sd, weights) for name, sd in compared.items()},
         flight=np.asarray([piece.number for piece in pieces]),
         turning=np.stack([recent_command(flight, lag) for flight in cut], axis=-1),
-        begin=np.asarray([piece.window.begin for piece in pieces]),
-        log_voltage=log_voltage_of(
-            [flights[piece.number] for piece in pieces],
-            [piece.window for piece in pieces],
-            schedule,
-        ),
+        begin=np.asarray([piece.begin for piece in pieces]),
+        log_voltage=log_voltage_of([flights[piece.number] for piece in pieces], pieces, schedule),
         start_sd=of_all[free_rows] if free_starts else None,
         free_rows=tuple(free_rows.tolist()),
     )

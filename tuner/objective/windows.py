@@ -41,10 +41,13 @@ class Window:
         The stretch as a flight of its own, its time 0 at its beginning.
     begin
         s since the mission's start.
+    number
+        Of the flight, where windows of several lie side by side.
     """
 
     flight: Flight
     begin: float
+    number: int = 0
 
 
 def windows_of(
