@@ -105,7 +105,7 @@ def run_stages(
             before = stages[start.stage : progress.stage]
             progress = search.run_choices(stage, progress, undecided, start, before, last=last)
         else:
-            progress = search.run(stage, progress, last=last)
+            progress = _finished(*search.run(stage, progress, last=last))
     return progress
 
 
@@ -118,21 +118,17 @@ class _Search:
     on_progress: OnProgress
     seed: int
 
-    def run(self, stage: Stage, progress: Progress, *, last: bool) -> Progress:
-        """Run one stage to its end for every start at once."""
-        return _finished(*self.run_steps(stage, progress, last=last))
-
-    def run_steps(
+    def run(
         self, stage: Stage, progress: Progress, *, last: bool
-    ) -> tuple[StageProblem, Progress]:
-        """Return a stage's problem, and the progress after its last step."""
+    ) -> tuple[StageProblem, Progress, Iterate]:
+        """Run one stage for every start at once; return its problem, and its last step."""
         problem = _problem(self, stage, progress, last=last)
         for iterate in islice(OPTIMISERS[stage.optimiser](problem), stage.steps):
             progress = _advanced(problem, progress, iterate)
             self.on_progress(progress)
             if iterate.converged:
                 break
-        return problem, progress
+        return problem, progress, iterate
 
     def run_choices(
         self,
@@ -148,7 +144,7 @@ class _Search:
 
         Switched `RESTARTED_CHOICES` run the stages before it again, from the start.
         """
-        best = self.run_steps(stage, progress, last=last)
+        best = self.run(stage, progress, last=last)
         for choice, informative in choices.items():
             begin, earlier = (start, before) if choice in RESTARTED_CHOICES else (progress, ())
 
@@ -167,19 +163,19 @@ class _Search:
             other = replace(self, on_progress=on_progress)
             switched = replace(begin, loop=best[1].loop.switched(choice))
             for one in earlier:
-                switched = other.run(one, switched, last=False)
-            rival = other.run_steps(stage, switched, last=last)
+                switched = _finished(*other.run(one, switched, last=False))
+            rival = other.run(stage, switched, last=last)
             evaluations = best[1].evaluations + rival[1].evaluations - begin.evaluations
             own, others = (_loss_of(informative, *end) for end in (best, rival))
-            problem, end = best if own <= SWITCH_GAIN * others else rival
-            best = problem, replace(end, evaluations=evaluations)
+            problem, end, iterate = best if own <= SWITCH_GAIN * others else rival
+            best = problem, replace(end, evaluations=evaluations), iterate
         return _finished(*best)
 
 
-def _loss_of(flights: NDArray[np.bool_], problem: StageProblem, progress: Progress) -> float:
+def _loss_of(
+    flights: NDArray[np.bool_], problem: StageProblem, _: Progress, iterate: Iterate
+) -> float:
     """Return the loss of some flights (N,) after a step, priors left out."""
-    iterate = progress.iterate
-    assert iterate is not None, "a stage takes at least one step"
     assert iterate.sums is not None, "normal equations have been solved"
     losses = np.asarray(iterate.sums.loss)[int(np.argmin(iterate.losses))]
     return float(losses[flights[np.asarray(problem.objective.segments.flight)]].sum())
@@ -273,10 +269,9 @@ def _advanced(problem: StageProblem, progress: Progress, iterate: Iterate) -> Pr
     )
 
 
-def _finished(problem: StageProblem, progress: Progress) -> Progress:
+def _finished(problem: StageProblem, progress: Progress, iterate: Iterate) -> Progress:
     """Return the progress after the stage, with the next one's weights."""
-    stage, iterate = problem.stage, progress.iterate
-    assert iterate is not None, "a stage takes at least one step"
+    stage = problem.stage
     points, damping = iterate.points, np.ones(len(iterate.losses))
     if iterate.next_start is not None and not problem.last:
         points, damping = iterate.next_start

@@ -204,9 +204,8 @@ class Progress:
     @property
     def best_point(self) -> Point:
         """The best point so far, the stage under way included."""
-        if self.iterate is None:
-            return point_of(self.points, int(np.argmin(self.losses)))
-        return point_of(self.iterate.points, int(np.argmin(self.iterate.losses)))
+        now = self if self.iterate is None else self.iterate
+        return point_of(now.points, int(np.argmin(now.losses)))
 
 
 def initial_progress(objective: Objective, vectors: Array) -> Progress:
