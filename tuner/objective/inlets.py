@@ -8,7 +8,7 @@ one more class; `INLETS` lists them.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -72,23 +72,26 @@ def at_ticks(series: Series, update_rate: float) -> Series:
     return Series(ticks, series.values[rows])
 
 
+def _by_column(series: Series, read: Callable[[Array, Array], Array]) -> Array:
+    """Return what ``read`` makes of the times and values of each column's known samples, (m, k)."""
+    known = np.isfinite(series.values.T)
+    columns = zip(series.values.T, known, strict=True)
+    return np.column_stack([read(series.time[there], column[there]) for column, there in columns])
+
+
 def zero_order_hold(series: Series, clock: Array) -> Array:
     """Read a signal (n, k) that holds until its next sample, at (m,) times in s."""
-    columns = []
-    for column in series.values.T:
-        known = np.isfinite(column)
-        place = np.searchsorted(series.time[known], clock + 1e-9, side="right") - 1
-        columns.append(column[known][np.maximum(place, 0)])
-    return np.column_stack(columns)
+
+    def read(time: Array, values: Array) -> Array:
+        place = np.searchsorted(time, clock + 1e-9, side="right") - 1
+        return values[np.maximum(place, 0)]
+
+    return _by_column(series, read)
 
 
 def linear_interpolation(series: Series, clock: Array) -> Array:
     """Read a signal (n, k) that moves linearly between its samples, at (m,) times in s."""
-    columns = []
-    for column in series.values.T:
-        known = np.isfinite(column)
-        columns.append(np.interp(clock, series.time[known], column[known]))
-    return np.column_stack(columns)
+    return _by_column(series, lambda time, values: np.interp(clock, time, values))
 
 
 def mean_of_hold(series: Series, clock: Array) -> Array:
@@ -96,14 +99,13 @@ def mean_of_hold(series: Series, clock: Array) -> Array:
 
     The integral of a signal that holds until its next sample is linear between samples.
     """
-    columns = []
-    for column in series.values.T:
-        known = np.isfinite(column)
-        time, values = series.time[known], column[known]
+
+    def read(time: Array, values: Array) -> Array:
         ends = np.array([min(time[0], clock[0]), *time[1:], max(time[-1], clock[-1])])
         total = np.concatenate([[0.0], np.cumsum((values - values[0]) * np.diff(ends))])
-        columns.append(values[0] + np.diff(np.interp(clock, ends, total)) / np.diff(clock))
-    return np.column_stack(columns)
+        return np.asarray(values[0] + np.diff(np.interp(clock, ends, total)) / np.diff(clock))
+
+    return _by_column(series, read)
 
 
 def reference_points(flight: Flight, length: int) -> list[Array]:
