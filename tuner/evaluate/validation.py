@@ -16,7 +16,6 @@ from tuner.evaluate.comparison import Comparison, FlightErrors, Pose
 from tuner.evaluate.prediction import (
     ROTOR_INLETS,
     FlightPredictor,
-    Predictions,
     TorqueObserver,
     hold_state,
 )
@@ -189,14 +188,9 @@ def validate(job: Job, fitted: Fitted) -> Validation:
             seconds: best.worse_than(held, seconds) for seconds in HORIZONS_S
         }
         if "body_rate" in best.errors:
-            explained = 1.0 - _body_rate_mse(best) / _body_rate_mse(held)
-            validation.turning_explained[name] = explained
+            left, turned = (np.nanmean(of.errors["body_rate"][-1] ** 2) for of in (best, held))
+            validation.turning_explained[name] = 1.0 - float(left) / float(turned)
     return validation
-
-
-def _body_rate_mse(predictions: Predictions) -> float:
-    """Return the mean squared error of the body rate at the end of predictions."""
-    return float(np.nanmean(predictions.errors["body_rate"][-1] ** 2))
 
 
 MAX_RMSE_INCREASE = 0.01

@@ -228,13 +228,12 @@ def _regressed(
     name: str, initial: float, best: float, error: float, bounds: tuple[float, float]
 ) -> CoefficientResult:
     """Return a coefficient by regression of accelerations, its error that of the scaled number."""
-    row, std_error = COEFFICIENTS[name], error
-    unit: str | None = row.unit
-    relative = error / max(abs(best), 1e-300)
-    interval = (best - Z95 * error, best + Z95 * error)
-    if row.scale == "log":
+    if COEFFICIENTS[name].scale == "log":
         std_error, relative, unit = best * error, error, None
-        interval = (best * float(np.exp(-Z95 * error)), best * float(np.exp(Z95 * error)))
+        low, high = (best * float(np.exp(side * Z95 * error)) for side in (-1, 1))
+    else:
+        std_error, relative, unit = error, error / max(abs(best), 1e-300), COEFFICIENTS[name].unit
+        low, high = (best + side * Z95 * error for side in (-1, 1))
     verdict, reason = judge_by_error(
         error, relative, unit, known=ReasonCode.REGRESSED, roughly=ReasonCode.WIDE_INTERVAL
     )
@@ -245,7 +244,7 @@ def _regressed(
         verdict,
         reason,
         std_error=std_error,
-        ci95=(max(interval[0], min(bounds[0], best)), min(interval[1], max(bounds[1], best))),
+        ci95=(max(low, min(bounds[0], best)), min(high, max(bounds[1], best))),
         identifiable=reason.identifiable,
     )
 

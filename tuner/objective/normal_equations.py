@@ -528,9 +528,11 @@ def _evaluated(
     objective, criterion = some_segments(objective, criterion, together)
     point = Point(np.repeat(vectors, segments, axis=0), point.offsets)
     crash_time, blocks = objective.compare(point, criterion)
-    loss, squares = np.zeros(len(together)), {}
-    for name, measured in objective.segments.measured.items():
-        squares[name] = np.zeros((len(together), np.shape(measured.weight)[1]))
+    loss = np.zeros(len(together))
+    squares = {
+        name: np.zeros((len(together), np.shape(measured.weight)[1]))
+        for name, measured in objective.segments.measured.items()
+    }
     for name, block in blocks:
         scale = criterion.scale[name][objective.flight[block.segments]]
         scaled = block.errors / scale[:, None, None]

@@ -106,8 +106,10 @@ class Selection:
             gone = (name for name in self._worth_fitting(state, {}) if not is_lumped(name))
             dropped = dict.fromkeys(gone, SelectionCode.WORSE_AFTER_REFIT)
         for _ in range(MAX_ROUNDS):
-            wanted = self._wanted(state, dropped)
-            if not wanted:
+            # While terms are missing, those in the model make up for them, and even a true one may
+            # not seem to predict: all significant ones are fitted if one predicts. Then each has to
+            wanted = self._worth_fitting(state, dropped)
+            if not any(group_score.is_accepted for group_score in wanted.values()):
                 break
             grown = self._with_added(state, wanted, dropped)
             if grown is None:
@@ -135,15 +137,6 @@ class Selection:
         coefficients = [name for name in names if name not in conditions_of(self.candidates)]
         own = linear.columns_of(coefficients)
         return dict(zip(coefficients, moves[own].tolist(), strict=True))
-
-    def _wanted(self, state: LinearisedFit, dropped: Reasons) -> dict[str, Score]:
-        """Return the groups to fit next: all with significant gains, if one predicts.
-
-        While terms are missing, those in the model make up for them, and even a true one may not
-        seem to predict. After a fit with all others, each has to.
-        """
-        scores = self._worth_fitting(state, dropped)
-        return scores if any(group_score.is_accepted for group_score in scores.values()) else {}
 
     def _worth_fitting(self, state: LinearisedFit, dropped: Reasons) -> dict[str, Score]:
         """Return the groups with a significant gain in the fit, whether they predict or not."""
