@@ -383,7 +383,6 @@ def _flights_in(  # noqa: PLR0917 (a piece travels as a tuple)
     precision: Precision,
     forces: bool,
 ) -> Iterator[Simulation]:
-    """Fly a piece of a grid, and yield its flights."""
     clock = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
     fits = rate == round(rate) and round(controller.physics.rate) % rate == 0
     schedule = schedule_of(controller, log_rate=round(rate) if fits else None)
@@ -416,7 +415,6 @@ def _flights_in(  # noqa: PLR0917 (a piece travels as a tuple)
 
 
 def _grid_pieces(grid: Mapping[str, Array]) -> Iterator[dict[str, Array]]:
-    """Yield a grid in pieces of at most `MAX_LANES` vehicles."""
     count = len(next(iter(grid.values()))) if grid else 1
     for start in range(0, count, MAX_LANES):
         yield {name: np.asarray(column)[start : start + MAX_LANES] for name, column in grid.items()}

@@ -178,7 +178,6 @@ errors hardly move them."""
 FORCES_RATE_HZ = 50.0
 """Forces are only plotted, so that a lower rate than the log's will do."""
 GAUSS_NEWTON_STEPS = 3
-"""Gauss-Newton steps towards the most likely start."""
 
 
 class Comparison:

@@ -11,9 +11,7 @@ from tuner.core.errors import InputError
 from tuner.core.files import FiniteOrNone, Part, ResultFile, csv_text
 
 RMSE_UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
-"""Axis -> unit of its RMSE."""
 AXES = {"position": ("x", "y", "z"), "attitude": ("roll", "pitch", "yaw")}
-"""Signal -> its axes."""
 
 
 class AxesRmse(Part):

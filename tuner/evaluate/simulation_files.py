@@ -113,7 +113,6 @@ def _timed_messages(simulation: Simulation, messages: _Messages) -> Iterator[tup
 
 
 def _samples_at(simulation: Simulation, rows: NDArray[Any]) -> Simulation:
-    """Return some samples of a simulation."""
     signals = {name: values[rows] for name, values in simulation.signals.items()}
     return replace(simulation, time=simulation.time[rows], signals=signals)
 

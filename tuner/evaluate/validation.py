@@ -116,7 +116,6 @@ def comparison_of(job: Job, fitted: Fitted) -> Comparison:
 HORIZONS_S = (0.1, 0.5)
 """Times ahead at which predictions are compared."""
 STRIDE_S = 0.1
-"""Time from one prediction to the next."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +196,6 @@ MAX_RMSE_INCREASE = 0.01
 """A flight's RMSE may grow by this share in the fit without a finding."""
 
 UNITS: Mapping[Pose, str] = {"position": "m", "attitude": "degrees"}
-"""Signal of a flight's RMSE -> its unit."""
 
 
 def flights_worse(

@@ -70,7 +70,6 @@ flights of one vehicle differ by 1 %, real ones with one battery after the other
 HOVER_SPEED, HOVER_ACCELERATION, HOVER_SAMPLES = 1.0, 0.1, 31
 """Largest speed, m/s, and acceleration over gravity of a hover, and samples of its average."""
 MIN_POSE_GAP_S = 0.25
-"""Shortest gap of the pose that is reported."""
 
 
 def prepare(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:

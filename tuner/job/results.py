@@ -204,7 +204,6 @@ def _coefficients(
 def _judgements(
     job: Job, fitted: Fitted, uncertainty: Uncertainty | None
 ) -> dict[str, tuple[Verdict, Reason]]:
-    """Return the verdict on each free coefficient, and its reason."""
     values = job.space.numbers(fitted.point.coefficients)
     judgements = dict.fromkeys(values, (Verdict.NOT_EXAMINED, NOT_EXAMINED))
     if uncertainty is not None:

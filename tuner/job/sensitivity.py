@@ -174,7 +174,6 @@ def _write_requested(
     folder: Path,
     on_message: Callable[[str], None],
 ) -> None:
-    """Write the global indices and the profiles that were requested."""
     if options.global_ is not None:
         on_message(
             f"flying vehicles between the bounds for {options.global_.capitalize()}'s indices"

@@ -309,7 +309,6 @@ class Objective(eqx.Module):
 
 
 def _columns(moving: Mapping[str, int]) -> int:
-    """Return the number of columns of residuals."""
     return sum(moving.values()) + len(OFFSETS) * ("conditions" in moving)
 
 

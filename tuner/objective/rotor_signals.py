@@ -38,7 +38,6 @@ MAX_DELAY_S = 0.06
 SMOOTHING_SAMPLES = 3
 """Samples over which both are averaged against noise."""
 MIN_SAMPLES = 100
-"""Least number of samples of a comparison."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,6 @@ def _correlations(turning: Array, torque: Array) -> Array:
 
 
 TRIED_LAGS_S = (0.005, 0.015, 0.03, 0.06)
-"""Lags of rotors that are tried."""
 MAX_STAMP_ERROR_S = 0.4
 """Largest error of stamps that is tried, either way."""
 HIGH_PASS_HZ = 2.0

@@ -21,7 +21,6 @@ BEFORE_S = 1.2
 AFTER_S = 0.1
 """Time after a window whose samples help, too."""
 MIN_POSES = 8
-"""Least number of poses in a window."""
 MAX_UNFED_SHARE = 0.25
 """Longest gap of an input as a share of its window, or else two samples."""
 MIN_REGULAR_SHARE = 0.6

@@ -40,7 +40,6 @@ from tuner.search.progress import (
 from tuner.search.stages import Stage
 
 OPTIMISERS: dict[str, Optimiser] = {"gradient": descend, "cma": evolve}
-"""Name in a stage -> optimiser."""
 NEGLIGIBLE_OFFSET = np.array([0.0005, 0.0005, 0.002, 0.002, 0.002])
 """Offsets below which clocks, s, agree and gyros, rad/s, have no bias. A recording's clocks either
 share a source or differ by much more, and 0.1 ms of freedom costs a percent of inertia."""
@@ -182,7 +181,6 @@ def _loss_of(
 
 
 def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -> StageProblem:
-    """Return the problem of a stage's optimiser."""
     points, free, best = progress.points, search.free, int(np.argmin(progress.losses))
     kept = np.ones(points.offsets.shape[1:], bool)
     if stage.drops_offsets:  # per-flight conditions follow in later rows
@@ -249,7 +247,6 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
 
 
 def _advanced(problem: StageProblem, progress: Progress, iterate: Iterate) -> Progress:
-    """Return the progress after a step of the stage."""
     best = int(np.argmin(iterate.losses))
     iteration = Iteration(
         stage=problem.stage.name,

@@ -19,7 +19,6 @@ UNMATCHED_RATIO = 10.0
 MIN_TURNING_EXPLAINED = 0.9
 """Explained share of the turning below which moments of inertia are reported as effective ones."""
 MIN_REPORTED_LATENESS_S = 1e-3
-"""Least lateness of an input that is reported."""
 OUTLIER_RATIO = 3.0
 """Residuals over those of the median flight above which a flight is an outlier."""
 
@@ -56,7 +55,6 @@ def outlying_flights(scales: Scales) -> frozenset[str]:
 
 
 UNMATCHED_CODES = frozenset({Code.FLIGHT_UNMATCHED, Code.MODEL_UNMATCHED})
-"""Codes of `unmatched_findings`."""
 END_CODES = UNMATCHED_CODES | frozenset(
     {
         Code.SATURATION_FEEDBACK,

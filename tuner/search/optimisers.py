@@ -41,7 +41,6 @@ from tuner.search.stages import WINDOW_TOLERANCE
 MIN_GAIN_RATIO, GOOD_GAIN_RATIO = 0.05, 0.7
 """Least gain ratio of an accepted point, and of a smaller λ."""
 DAMPING_FACTOR = 5.0
-"""Factor on λ."""
 STALL_TOLERANCE = 1e-9
 """Change of a coordinate or of the loss, relative to the larger of it and one, that counts as 0."""
 MIN_COEFFICIENTS_PER_STATE = 8

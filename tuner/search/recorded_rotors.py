@@ -46,7 +46,6 @@ MEMORY_S = 0.1
 LAGS_S = np.arange(-24, 25) * 0.0025
 """Lags that are tried: five samples at 100 Hz, and as much again for a rotor's lag."""
 MAX_LAG_SD_S = 0.003
-"""Largest standard deviation of a lag that is used."""
 SIGNIFICANT_SD = 2.81
 """Standard deviations from zero of a significant lag: one flight of 200 has that by chance."""
 TRIMMED_SAMPLES = 10
@@ -284,7 +283,6 @@ RISE_RATIO = 0.8
 SHARE_SD = 3e-4
 """Standard deviation of a share in the best recordings."""
 MAX_AUTOREGRESSION = 0.95
-"""Largest autoregression from window to window."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ OFFSETS_FREE_FROM_S = 5.0
 CMA_HORIZONS_S = (0.8, 3.0)
 """Horizons at which CMA-ES searches for a start."""
 MAX_GENERATIONS = 60
-"""Largest number of CMA-ES generations in one stage."""
 CHOICES_AT_S = 3.0
 """Horizon at which the loop's choices are tried both ways."""
 WINDOW_TOLERANCE = 1e-3

@@ -333,7 +333,6 @@ class Selection:
     def _base_rows(
         self, state: LinearisedFit, groups: Groups, reason: SelectionCode
     ) -> list[SelectionRow]:
-        """Return the rows of groups of the base model."""
         return [
             row_of(group, names, self._score_of(state, names), reason, kept=True)
             for group, names in groups.items()
@@ -393,7 +392,6 @@ def _excludes_gusts(state: LinearisedFit, group: str) -> bool:
 
 
 MARKER_GROUPS = ("marker_offset", "marker_tilt")
-"""The groups of the motion capture's frame."""
 MIN_HOVER_TILT_RAD = 3e-3
 """Least mean tilt in hover, rad, that frees the markers' frame."""
 MIN_TILT_SE = 3.0

@@ -147,7 +147,6 @@ TAU_GRID_POINTS = 200
 TAU_MIN, TAU_MAX = 1e-3, 1e3
 """Range of the grid of τ; the largest is a factor on the observed one."""
 FREEDOM_RANGE = (1.0, 200.0)
-"""Range to which degrees of freedom are clipped."""
 BISECTIONS = 40
 
 

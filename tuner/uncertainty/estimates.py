@@ -485,7 +485,6 @@ MIN_MOVE_NAMED = 0.3
 SCALE_TOLERANCE = 0.1
 """Deviation of a direction's moves from those of a common factor below which it is one."""
 REPORTED_DIRECTIONS = 3
-"""Number of directions reported."""
 NULL_DIRECTION_ERROR = 1.0
 """Standard error along a direction above which the flights do not determine it."""
 

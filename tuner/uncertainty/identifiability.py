@@ -244,7 +244,6 @@ GRID_REACH_SE = 3.5
 MAX_GRID_REACH = 1.2
 """Largest distance of the outermost values in the scaled coordinate, a factor of three."""
 MAX_ITERATIONS = 12
-"""Iterations of refitting the others."""
 TOLERANCE = 0.01
 """Decrease of every point's χ² below which refitting stops."""
 

@@ -74,7 +74,6 @@ def refits(
 
 
 def _refit(task: tuple[Callable[[], tuple[Job, Fitted]], Draw], report: Report) -> Refit:
-    """Return one refit."""
     (job, fitted), draw = task[0](), task[1]
     held = set(fitted.held.values())
     end = polished(

@@ -208,7 +208,6 @@ def shortest_half(time: Array, effect: Array) -> tuple[float, float]:
 
 
 GRID_LEVELS = 4
-"""Number of levels of Morris' grid."""
 MIN_RMSE_SD = 1e-3
 """Lower limit of an RMSE in standard deviations, before its logarithm."""
 DEFAULT_SAMPLES = {"morris": 16, "sobol": 64}
@@ -263,7 +262,6 @@ def global_sensitivity(
 
 
 def _samples(problem: dict[str, Any], method: Method, count: int, seed: int) -> Array:
-    """Return the sampled scaled coordinates (S, K)."""
     if method == "morris":
         from SALib.sample import morris  # noqa: PLC0415 (pandas and scipy)
 
