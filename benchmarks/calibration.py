@@ -33,14 +33,14 @@ from tuner.config import Options, resolve_settings
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
-from tuner.objective.criterion import Point
+from tuner.objective.criterion import Point, picked
 from tuner.objective.normal_equations import Objective
 from tuner.objective.space import Space
 from tuner.search.continuation import run_stages
 from tuner.search.estimation import free_offsets
 from tuner.search.job_flights import read_recordings
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Fitted, criterion_of, initial_progress, point_of
+from tuner.search.progress import Fitted, criterion_of, initial_progress
 from tuner.search.stages import plan
 from tuner.terms.candidates import with_terms
 from tuner.uncertainty.estimates import uncertainty_of
@@ -236,7 +236,7 @@ def fitted(objective: Objective) -> Fitted:
         undecided={},
         on_progress=lambda _: None,
     )
-    point = point_of(progress.points, 0)
+    point = picked(progress.points, 0)
     return Fitted(
         objective=objective,
         point=point,

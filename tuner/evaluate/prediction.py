@@ -19,9 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import jax
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
 from sim_jax.environment import Disturbance
@@ -34,6 +32,7 @@ from tuner.equation_error.model_accelerations import ModelAccelerations
 from tuner.equation_error.recorded_accelerations import Steps, steps_by_inlet
 from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.objective.battery import with_reference_voltage
+from tuner.objective.criterion import picked
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import Segments, cut_windows, window_segments
 from tuner.objective.simulation import MOTION, fly
@@ -264,7 +263,7 @@ class FlightPredictor:
             noise={},
             free_starts=False,
         )
-        segments = _select(segments, self._whole)
+        segments = picked(segments, (..., self._whole))
         if observer is not None:
             fed = self.flight, self.inlet, self.input_late
             segments = replace(segments, disturbance=observer.disturbance(fed, self.begins))
@@ -307,7 +306,7 @@ def _simulated(
     for first in range(0, segments.count, PREDICTIONS_AT_ONCE):
         flown = fly(
             model,
-            _select(segments, np.arange(first, min(first + PREDICTIONS_AT_ONCE, segments.count))),
+            picked(segments, (..., slice(first, first + PREDICTIONS_AT_ONCE))),
             schedule,
             samples=int(np.ceil(place[-1] - 1e-6)) + 2,
             limits=AIRBORNE,
@@ -325,12 +324,6 @@ def _simulated(
     return {
         name: np.concatenate([part[name] for part in parts], axis=1) for name in PREDICTED_UNITS
     }
-
-
-def _select(segments: Segments, chosen: NDArray[np.intp]) -> Segments:
-    """Return some of the segments, which lie along the last axis."""
-    taken: Segments = jax.tree.map(lambda leaf: leaf[..., chosen], segments)
-    return taken
 
 
 def hold_state(

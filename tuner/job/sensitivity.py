@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -53,7 +53,12 @@ def unfitted(job: Job) -> Fitted:
         best = tried[0]
     findings = (
         *loop_findings(job, loop_of(best.objective), "info"),
-        *_unmatched_findings(best.scales),
+        *(
+            Finding(Code.POORLY_MET, "warning", name, {"noise_multiple": multiple}, (channel,))
+            for name, of_channels in best.scales.items()
+            for channel, multiple in [max(of_channels.items(), key=lambda item: item[1])]
+            if multiple > UNMATCHED_RATIO
+        ),
     )
     return replace(best, evaluations=len(tried), findings=findings)
 
@@ -81,13 +86,6 @@ def _simulated(job: Job, objective: Objective) -> Fitted:
         loss_best=float(np.sum(np.asarray(sums.loss))),
         converged=True,
     )
-
-
-def _unmatched_findings(scales: Mapping[str, Mapping[str, float]]) -> Iterator[Finding]:
-    for name, of_channels in scales.items():
-        worst, multiple = max(of_channels.items(), key=lambda item: item[1])
-        if multiple > UNMATCHED_RATIO:
-            yield Finding(Code.POORLY_MET, "warning", name, {"noise_multiple": multiple}, (worst,))
 
 
 @dataclass(frozen=True)

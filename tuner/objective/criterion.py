@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float, Shaped
 
@@ -14,6 +15,7 @@ from tuner.core.numerics import Array
 from tuner.objective.segments import OFFSETS
 from tuner.vehicle import REGISTRY, recording_offsets
 
+T = TypeVar("T")
 AnyArray: TypeAlias = Any
 """An array of NumPy, or of jax."""
 
@@ -21,6 +23,12 @@ OFFSET_UNIT = 0.01
 """s of a clock's offset, or rad/s of a gyro's, per unit of the search's coordinate."""
 (OFFSET_SD,) = {row.prior_sd / OFFSET_UNIT for row in recording_offsets().values()}
 """Prior standard deviation of per-flight parameters, in the search's coordinates."""
+
+
+def picked(tree: T, place: Any) -> T:
+    """Return a part of every array of a tree: that of a start, or segments by ``(..., which)``."""
+    part: T = jax.tree.map(lambda leaf: np.asarray(leaf)[place], tree)
+    return part
 
 
 def units_of(names: Sequence[str]) -> Array:

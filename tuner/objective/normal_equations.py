@@ -31,6 +31,7 @@ from tuner.objective.criterion import (
     Jacobian,
     Point,
     SegmentSums,
+    picked,
     units_of,
 )
 from tuner.objective.initial_conditions import eliminate_states
@@ -316,8 +317,8 @@ def some_segments(
     objective: Objective, criterion: Criterion, which: slice | NDArray[np.generic]
 ) -> tuple[Objective, Criterion]:
     """Return problem and criterion of some segments alone; flights keep their numbers."""
-    kept: Segments = jax.tree.map(lambda leaf: np.asarray(leaf)[..., which], objective.segments)
     states = None if criterion.states is None else criterion.states[:, which]
+    kept = picked(objective.segments, (..., which))
     return replace(objective, segments=kept), replace(criterion, states=states)
 
 

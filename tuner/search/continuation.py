@@ -11,12 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import scaled_inverse, scaled_solve
-from tuner.objective.criterion import OFFSET_UNIT, Point, SegmentSums
+from tuner.objective.criterion import OFFSET_UNIT, Point, SegmentSums, picked
 from tuner.objective.normal_equations import (
     Objective,
     downweighting,
@@ -34,7 +33,6 @@ from tuner.search.progress import (
     Progress,
     StageProblem,
     criterion_of,
-    point_of,
     with_loop,
 )
 from tuner.search.stages import Stage
@@ -222,9 +220,10 @@ def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> 
     Hessian. The least important one goes first.
     """
     objective, free = problem.objective, problem.free
-    here: SegmentSums = jax.tree.map(lambda leaf: np.asarray(leaf)[best], sums)
-    point = point_of(problem.points, best)
-    loss, gradient, hessian = normal_equations(objective, point, problem.criterion, here)
+    point = picked(problem.points, best)
+    loss, gradient, hessian = normal_equations(
+        objective, point, problem.criterion, picked(sums, best)
+    )
     moves = np.flatnonzero(free.packed)
     inverse = scaled_inverse(hessian[np.ix_(moves, moves)], RIDGE)
     late = point.packed[moves] - inverse @ gradient[moves]

@@ -22,7 +22,7 @@ from tuner.core.errors import InputError
 from tuner.core.files import read_arrays
 from tuner.core.numerics import Array
 from tuner.findings.findings import Code, Finding
-from tuner.objective.criterion import Point
+from tuner.objective.criterion import Point, picked
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
@@ -41,7 +41,6 @@ from tuner.search.progress import (
     criterion_of,
     initial_progress,
     loop_of,
-    point_of,
     with_loop,
 )
 from tuner.search.stages import Stage, plan, remaining_seconds
@@ -319,7 +318,7 @@ def _attempt(
 def _end(job: Job, objective: Objective, stage: Stage, progress: Progress) -> dict[str, Any]:
     """Return the fields of a `Fitted` at the end of a search's last stage."""
     best = int(np.argmin(progress.losses))
-    point = point_of(progress.points, best)
+    point = picked(progress.points, best)
     return {
         "objective": with_loop(objective, progress.loop),
         "point": point,

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from warnings import catch_warnings
 
 import jax
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tuner.core.numerics import Array
-from tuner.objective.criterion import Criterion, Point, SegmentSums
+from tuner.objective.criterion import Criterion, Point, SegmentSums, picked
 from tuner.objective.normal_equations import (
     MATCHED_RATIO,
     VECTORS_AT_ONCE,
@@ -35,7 +35,7 @@ from tuner.objective.normal_equations import (
     root_mean_squares,
     sums_at,
 )
-from tuner.search.progress import Iterate, StageProblem, point_of
+from tuner.search.progress import Iterate, StageProblem
 from tuner.search.stages import WINDOW_TOLERANCE
 
 MIN_GAIN_RATIO, GOOD_GAIN_RATIO = 0.05, 0.7
@@ -153,11 +153,11 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
         (K + offsets·N,) one for free parameters, zero for others; changes only at `initial_step`.
     """
     moves = np.flatnonzero(free)
-    each = [_of(before, start) for start in range(len(before.damping))]
+    each = [picked(before, start) for start in range(len(before.damping))]
 
     def quadratics(sums: SegmentSums) -> list[NormalEquations]:
         return [
-            normal_equations(objective, one.tried, criterion, _of(sums, start))
+            normal_equations(objective, one.tried, criterion, picked(sums, start))
             for start, one in enumerate(each)
         ]
 
@@ -175,7 +175,7 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     here = here or quadratics(sums)
     longest = DAMPING_FACTOR if objective.segments.windowed else DAMPING_FACTOR**3
     steps = [
-        _stepped(one, _of(sums, start), here[start], moves, longest)
+        _stepped(one, picked(sums, start), here[start], moves, longest)
         for start, one in enumerate(each)
     ]
     step: Step = jax.tree.map(lambda *leaves: np.stack(leaves), *steps)
@@ -251,10 +251,6 @@ def _solved(hessian: Array, gradient: Array, damping: float) -> Array:
         return np.full(len(gradient), np.nan)
 
 
-def _of(tree: Any, start: int) -> Any:
-    return jax.tree.map(lambda leaf: leaf[start], tree)
-
-
 def descend(problem: StageProblem) -> Iterator[Iterate]:
     """Minimise a stage's loss for every start; coefficients and flights' offsets move together.
 
@@ -273,7 +269,7 @@ def descend(problem: StageProblem) -> Iterator[Iterate]:
         best, channels = int(np.argmin(step.loss)), root_mean_squares(problem.objective, step.sums)
         # (S,) the median over flights of the worst channel's RMS, in σ
         worst = np.median(np.nan_to_num(list(channels.values())).max(axis=0), axis=-1)
-        estimated, here = estimated_states(step.best, best, states), _of(step.sums, best)
+        estimated, here = estimated_states(step.best, best, states), picked(step.sums, best)
         iterate = Iterate(
             points=step.point,
             losses=step.loss,
@@ -384,7 +380,7 @@ def evolve(problem: StageProblem) -> Iterator[Iterate]:
     import cma  # noqa: PLC0415 (takes its time)
 
     space, start = problem.objective.space, problem.best
-    point = point_of(problem.points, start)
+    point = picked(problem.points, start)
     moves = np.flatnonzero(problem.free.coefficients)
     sums = problem.objective.sums(point, problem.criterion, derivatives=False)
     coefficients, losses = np.array(problem.points.coefficients), np.array(problem.losses)

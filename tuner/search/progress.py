@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
 
 import equinox as eqx
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +18,7 @@ from sim_jax.control.gains import Controller
 from sim_jax.numeric import Scalar
 from tuner.core.numerics import Array
 from tuner.findings.findings import Finding
-from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
+from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums, picked
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.recordings.flight import Flight
@@ -205,7 +204,7 @@ class Progress:
     def best_point(self) -> Point:
         """The best point so far, the stage under way included."""
         now = self if self.iterate is None else self.iterate
-        return point_of(now.points, int(np.argmin(now.losses)))
+        return picked(now.points, int(np.argmin(now.losses)))
 
 
 def initial_progress(objective: Objective, vectors: Array) -> Progress:
@@ -259,12 +258,6 @@ def plain_criterion(
     return criterion_of(
         Stage("plain", horizon), scales or start.scales, start.points.offsets[0], start.states
     )
-
-
-def point_of(points: Point, start: int) -> Point:
-    """Return one of S points."""
-    picked: Point = jax.tree.map(lambda leaf: leaf[start], points)
-    return picked
 
 
 @dataclass(frozen=True)

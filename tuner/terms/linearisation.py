@@ -270,6 +270,7 @@ def linearise(
     parts, loss = [], 0.0
     half = replace(objective, memory=objective.memory // 2)
     for flights, batch in flight_batches(half, point, criterion):
+        scale = batch[2].scale
         jacobian = with_secants(
             batch[0].jacobian(*batch[1:]),
             batch[0].space,
@@ -288,7 +289,10 @@ def linearise(
                 alternatives=others,
             )
         )
-        loss += _loss_of(batch[0], batch[2], jacobian)
+        loss += sum(
+            0.5 * float(huber_loss(of / scale[name][batch[0].flight], criterion.huber).sum())
+            for name, of in jacobian.residuals.items()
+        )
     information = FisherInformation.joined(parts)
     rows = np.asarray(point.offsets)[len(point.offsets) - len(conditions) :]
     scaled = np.concatenate(
@@ -442,15 +446,6 @@ def linearised_from(
         names=names,
         neutral=neutral,
         readings=readings,
-    )
-
-
-def _loss_of(objective: Objective, criterion: Criterion, jacobian: Jacobian) -> float:
-    """Return half the robust sum of squares, as the search counts it."""
-    limit = criterion.huber
-    return sum(
-        0.5 * float(huber_loss(of / criterion.scale[name][objective.flight], limit).sum())
-        for name, of in jacobian.residuals.items()
     )
 
 

@@ -237,8 +237,7 @@ class Selection:
         """Return the fit with exactly these groups, from the last fit's end or from the start."""
         wanted, around = coefficients_of(groups), conditions_of(self.candidates)
         idle = tuple(name for name in around if name not in conditions_of(groups))
-        objective, start = self._problem(state.fitted, wanted)
-        names, vector = objective.space.names, _start_vector(state.fitted, objective, start)
+        objective, vector = self._problem(state.fitted, wanted)
         new = [group for group in groups if group not in state.added]
         new_ones = [name for group in new for name in groups[group] if name in wanted]
         from_here = replace(
@@ -252,7 +251,7 @@ class Selection:
         offsets = free_offsets(self.job)
         moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
         free_ones = Point(
-            np.ones(len(names), bool),
+            np.ones(len(vector), bool),
             np.vstack([offsets, np.tile(moves[:, None], offsets.shape[1])]),
         )
         title = f"with {len(new)} terms more" if new else f"with {len(groups)} terms"
@@ -260,10 +259,10 @@ class Selection:
         def on_progress(progress: Progress) -> None:
             self.reporter.on_progress(replace(self.job, space=objective.space), progress)
 
-        stages = FIRST_POLISH if roughly else LAST_POLISH
+        stages, start = FIRST_POLISH if roughly else LAST_POLISH, None
         if anew:
-            stages, start[: len(self.job.space)] = ALL_BUT_LAST, self.job.space.initial
-            start = with_start_values(objective.space, start, wanted)
+            stages = ALL_BUT_LAST
+            start = with_start_values(objective.space, objective.space.initial, wanted)
         return polished(
             self.job,
             from_here,
@@ -272,14 +271,13 @@ class Selection:
             on_progress=on_progress,
             stages=stages,
             left=ROUGH_TOLERANCE if roughly else None,
-            start=start if anew else None,
+            start=start,
         )
 
     def linearised(self, fitted: Fitted, added: Groups) -> LinearisedFit:
         """Return a fit linearised by all candidates."""
-        objective, start = self._problem(fitted, coefficients_of(self.candidates))
-        vector = _start_vector(fitted, objective, start)
-        at = Point(np.asarray(vector), offsets_of(fitted, objective))
+        objective, vector = self._problem(fitted, coefficients_of(self.candidates))
+        at = Point(vector, offsets_of(fitted, objective))
         linear = linearise(
             objective,
             at,
@@ -291,7 +289,7 @@ class Selection:
         return LinearisedFit(fitted, added, linear)
 
     def _problem(self, fitted: Fitted, names: Sequence[str]) -> tuple[Objective, Array]:
-        """Return a fit's base problem with some coefficients free, and its start vector (K,).
+        """Return the base problem with some coefficients free, and a fit's values in it (K,).
 
         The model has all candidate terms and conditions, at their neutral values.
         """
@@ -301,7 +299,8 @@ class Selection:
         objective = replace(objective, model=with_coefficients(objective.model, values))
         objective, point = with_terms(objective, self.fitted.point, names, self.job.settings.job)
         objective, point = with_conditions(objective, point, conditions_of(self.candidates))
-        return objective, np.array(point.coefficients)
+        own, pairs = fitted.vector, zip(objective.space.names, point.coefficients, strict=True)
+        return objective, np.array([own.get(name, neutral) for name, neutral in pairs])
 
     def _score(self, state: LinearisedFit, group: str) -> Score:
         """Return the score of a group beside the others in the model."""
@@ -377,12 +376,6 @@ class Selection:
         model = state.linear.columns_of([*self.job.space.names, *names_of(state.added)])
         own = state.linear.columns_of(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)
-
-
-def _start_vector(fitted: Fitted, objective: Objective, start: Array) -> list[float]:
-    """Return a start vector (K,) of a problem, with a fit's values where it has them."""
-    own, names = fitted.vector, objective.space.names
-    return [own.get(name, start[i]) for i, name in enumerate(names)]
 
 
 def _excludes_gusts(state: LinearisedFit, group: str) -> bool:

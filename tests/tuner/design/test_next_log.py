@@ -14,10 +14,11 @@ from tuner.core.numerics import errors_of
 from tuner.design import next_log
 from tuner.design.next_log import propose_logs
 from tuner.design.proposals import LogProposal, log_in_words
+from tuner.objective.criterion import picked
 from tuner.objective.information import information_at
 from tuner.recordings.flight import Series
 from tuner.search.problem import job_of
-from tuner.search.progress import criterion_of, initial_progress, point_of
+from tuner.search.progress import criterion_of, initial_progress
 from tuner.search.stages import WHOLE_LENGTH, Stage
 from tuner.vehicle import values_of
 
@@ -29,7 +30,7 @@ def at_truth(job, updated):
     vector = job.space.vector_of(values_of(updated))
     stage = Stage(WHOLE_LENGTH, job.objective.samples, 1.0, False, False, 1, 1e-3, True, False)
     start = initial_progress(job.objective, vector[None])
-    point = point_of(start.points, 0)
+    point = picked(start.points, 0)
     return ended(
         objective=job.objective,
         point=point,

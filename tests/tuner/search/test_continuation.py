@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
-from tuner.objective.criterion import Point
+from tuner.objective.criterion import Point, picked
 from tuner.objective.normal_equations import normal_equations, sums_at
 from tuner.objective.segments import OFFSETS
 from tuner.search import continuation, optimisers
 from tuner.search.continuation import _clocks_that_differ, run_stages
-from tuner.search.progress import criterion_of, initial_progress, point_of
+from tuner.search.progress import criterion_of, initial_progress
 from tuner.search.stages import schedule_of
 
 FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input_scaling")
@@ -87,7 +87,7 @@ def test_the_search_ends_within_a_tenth_of_a_standard_error_of_the_minimum(fit):
     iterate = last.iterate
     assert iterate.accepted[0]
     assert progress.points is iterate.points  # what it ends with was flown
-    point, here = point_of(iterate.points, 0), jax.tree.map(lambda leaf: leaf[0], iterate.sums)
+    point, here = picked(iterate.points, 0), jax.tree.map(lambda leaf: leaf[0], iterate.sums)
     criterion = criterion_of(stage, last.scales, np.asarray(point.offsets))
     count = len(fit.space)
     _, gradient, hessian = normal_equations(fit, point, criterion, here)

@@ -18,9 +18,9 @@ MODULE = '''
 import numpy as np
 
 from tuner.objective.normal_equations import evaluate
-from tuner.objective.criterion import Point
+from tuner.objective.criterion import Point, picked
 from tuner.search.continuation import OPTIMISERS
-from tuner.search.progress import Iterate, point_of
+from tuner.search.progress import Iterate
 
 
 def coordinate_search(problem):
@@ -29,7 +29,7 @@ def coordinate_search(problem):
     while True:
         reach = width * np.eye(len(vector))[problem.free.coefficients]
         tried = np.concatenate([vector[None], vector + reach, vector - reach])
-        point = point_of(problem.points, problem.best)
+        point = picked(problem.points, problem.best)
         losses = np.asarray(evaluate(problem.objective, tried, point, problem.criterion).loss)
         best = int(np.argmin(losses.sum(axis=-1)))
         width, vector = width if best else 0.5 * width, tried[best]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import fitted_of, problem, truth, with_data
-from tuner.objective.criterion import Point
+from tuner.objective.criterion import Point, picked
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import run_stages
-from tuner.search.progress import initial_progress, point_of
+from tuner.search.progress import initial_progress
 from tuner.search.stages import plan
 from tuner.uncertainty.estimates import uncertainty_of
 
@@ -39,7 +39,7 @@ def test_intervals_cover_the_truth():
         progress = run_stages(
             noisy, stages, progress, free=free, undecided={}, on_progress=lambda _: None
         )
-        uncertainty = uncertainty_of(fitted_of(noisy, point_of(progress.points, 0)))
+        uncertainty = uncertainty_of(fitted_of(noisy, picked(progress.points, 0)))
         for number, name in enumerate(FREE):
             low, high = uncertainty.estimates[name].ci95
             covered[repeat, number] = low <= float(right[name]) <= high
