@@ -431,19 +431,18 @@ def _run_flights(
     columns, *shared = inputs
     real = np.dtype(precision)
 
-    def argument_of(leaf: Array, *, lanes: bool, table: bool = False) -> Argument:
-        dtype = real if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
-        if lanes:
-            return Argument((), dtype, lanes=True)
-        return Argument(
-            ("ticks", *leaf.shape[1:]) if table and leaf.ndim else leaf.shape, dtype, False
-        )
+    def one(leaf: Array, shape: tuple[int | str, ...] = (), *, lanes: bool = False) -> Argument:
+        is_real = np.issubdtype(leaf.dtype, np.floating)
+        return Argument(shape, real if is_real else leaf.dtype, lanes)
+
+    def table(leaf: Array) -> Argument:
+        return one(leaf, ("ticks", *leaf.shape[1:]) if leaf.ndim else ())
 
     arguments = (
-        jax.tree.map(lambda leaf: argument_of(leaf, lanes=True), columns),
-        jax.tree.map(lambda leaf: argument_of(leaf, lanes=False), shared[0]),
-        jax.tree.map(lambda leaf: argument_of(leaf, lanes=False, table=True), shared[1]),
-        jax.tree.map(lambda leaf: argument_of(leaf, lanes=False), shared[2]),
+        jax.tree.map(partial(one, lanes=True), columns),
+        jax.tree.map(lambda leaf: one(leaf, leaf.shape), shared[0]),
+        jax.tree.map(table, shared[1]),
+        jax.tree.map(lambda leaf: one(leaf, leaf.shape), shared[2]),
     )
     program = program_of(
         _fly_lane,

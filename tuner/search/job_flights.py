@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tuner.config import Settings, TrajectorySettings
-from tuner.config.job import InletName
+from tuner.config.job import FlightSettings, InletName
 from tuner.core.disk import exists
 from tuner.core.errors import InputError, RecordingError, did_you_mean
 from tuner.core.numerics import Array
@@ -203,11 +203,9 @@ def recording_of(settings: Settings, flight: Flight, *, holdout: bool) -> Record
     ConfigError
         The mixer above an inlet cannot fly the vehicle's rotors.
     """
-    job, flight_settings = settings.job, settings.job.flights.get(flight.name)
-    inlet, offset = job.inlet, job.time_offset
-    if flight_settings is not None:
-        inlet = flight_settings.inlet or inlet
-        offset = offset if flight_settings.time_offset is None else flight_settings.time_offset
+    job = settings.job
+    own = job.flights.get(flight.name, FlightSettings())
+    offset = job.time_offset if own.time_offset is None else own.time_offset
     if has_stale_attitude(flight.series, flight.notes):
         raise RecordingError(
             flight.path,
@@ -224,7 +222,9 @@ def recording_of(settings: Settings, flight: Flight, *, holdout: bool) -> Record
         )
     flight = flight_in_rotor_order(flight, settings.vehicle)
     flight = with_speeds_in_si(with_commands(flight, settings.vehicle), settings.vehicle)
-    chosen, finding = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
+    chosen, finding = choose_inlet(
+        flight, own.inlet or job.inlet, settings.vehicle, settings.controller
+    )
     if not INLETS[chosen].closed_loop:
         seconds = window_seconds([chosen], job.search.window)
         require_windows(flight, seconds, INLETS[chosen].fed(flight))
@@ -240,8 +240,7 @@ def _with_fitted_inlet(
     Otherwise its turning would be simulated with coefficients that nothing was fitted to.
     """
     job, flight = settings.job, recording.flight
-    own = job.flights.get(flight.name)
-    requested = (None if own is None else own.inlet) or job.inlet
+    requested = job.flights.get(flight.name, FlightSettings()).inlet or job.inlet
     fitted = {other.inlet for other in recordings if not other.holdout}
     turns = recording.inlet in SIGNAL_OF_INLET and fitted == {"attitude"}
     if not (recording.holdout and requested == "auto" and turns):
@@ -256,13 +255,10 @@ def _with_fitted_inlet(
 
 def _with_reference(flight: Flight, settings: Settings) -> Flight:
     """Return a flight with the trajectory that the job file names, or else its side-car."""
-    flight_settings = settings.job.flights.get(flight.name)
-    if flight_settings is not None and flight_settings.trajectory is not None:
-        return with_named_reference(flight, flight_settings.trajectory)
-    if flight.trajectory is not None and not flight.has("reference_position"):
+    named = settings.job.flights.get(flight.name, FlightSettings()).trajectory
+    if named is None and flight.trajectory is not None and not flight.has("reference_position"):
         named = build(TrajectorySettings, flight.trajectory, f"side-car of {flight.path}")
-        return with_named_reference(flight, named)
-    return flight
+    return flight if named is None else with_named_reference(flight, named)
 
 
 def read_inertial_flights(

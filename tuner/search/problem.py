@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim_jax.state import AIRBORNE, Limits
 from tuner.config import CHANNELS, JobFile, Settings
-from tuner.config.job import ErrorKind, InletName
+from tuner.config.job import ErrorKind, FlightSettings, InletName
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.equation_error.estimate import Estimate
 from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
@@ -254,8 +254,7 @@ def _weights(
     """Return flight -> channel -> factor, zero for the position of a whole free yaw spin."""
     weights: dict[str, dict[str, float]] = {}
     for flight in flights:
-        flight_settings = settings.job.flights.get(flight.name)
-        factor = 1.0 if flight_settings is None else flight_settings.weight
+        factor = settings.job.flights.get(flight.name, FlightSettings()).weight
         of_channel = {name: factor * settings.job.weights.get(name, 1.0) for name in CHANNELS}
         if whole and flight.spins_freely:
             of_channel |= {name: 0.0 for name in CHANNELS if name not in SPIN_CHANNELS}
