@@ -152,16 +152,12 @@ def _sample_forces(inputs: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:
     rotor_speeds = tuple(speeds[i] for i in range(rotors))
     air = Air.around(vehicle, body_motion, ambient, tuple(accelerations[i] for i in range(rotors)))
     wrenches = wrench_of_each_term(vehicle, body_motion, rotor_speeds, air)
-    parts = {
-        name: (*_components(wrench.force), *_components(wrench.moment))
-        for name, wrench in wrenches.items()
-    }
+    acting = {name: (wrench.force, wrench.moment) for name, wrench in wrenches.items()}
     weight = air.up * (-GRAVITY * vehicle.body.mass)
-    none = jnp.zeros(())
-    parts[WEIGHT] = (*_components(weight), none, none, none)
+    acting[WEIGHT] = weight, Vec3.zeros(jnp.zeros(()))
     return {
-        name: jnp.stack([jnp.broadcast_to(value, ()) for value in values])
-        for name, values in parts.items()
+        name: jnp.stack([jnp.broadcast_to(value, ()) for value in jax.tree.leaves(vectors)])
+        for name, vectors in acting.items()
     }
 
 
@@ -179,10 +175,6 @@ def forces_of(vehicle: Vehicle, time: Array, signals: Mapping[str, Array]) -> Fo
     logged = (motion, signals["attitude"], signals["rotor_speed"])
     parts = forces_of_terms(vehicle, *(np.asarray(part, float)[None] for part in logged), rate=rate)
     return Forces(time, {name: part[0] for name, part in parts.items()})
-
-
-def _components(vector: Vec3) -> tuple[JaxArray, JaxArray, JaxArray]:
-    return vector.x, vector.y, vector.z
 
 
 #: A larger grid is taken for a mistake.

@@ -335,15 +335,14 @@ def flight_batches(
     measured = objective.segments.measured.values()
     compared = sum(int(np.prod(np.shape(m.weight)[:2])) for m in measured)
     sizes = np.bincount(objective.flight) * 8 * (columns + 1) * compared
-    first, taken = 0, 0
+    begins, taken = list[int](), 0
     for number, size in enumerate(sizes):
-        if number > first and taken + size > objective.memory:
-            flights = np.arange(first, number)
-            yield flights, flight_batch(objective, point, criterion, flights)
-            first, taken = number, 0
+        if taken and taken + size > objective.memory:
+            begins.append(number)
+            taken = 0
         taken += size
-    flights = np.arange(first, len(sizes))
-    yield flights, flight_batch(objective, point, criterion, flights)
+    for flights in np.split(np.arange(len(sizes)), begins):
+        yield flights, flight_batch(objective, point, criterion, flights)
 
 
 def flight_batch(

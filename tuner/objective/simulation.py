@@ -322,19 +322,19 @@ def recorded_of(
     channels
         Which are asked for.
     """
-    motion = log.motion
+    motion, parts = log.motion, jax.tree.leaves
     position, attitude = markers_of(model.vehicle).recorded(motion)
     rate = gyro_of(model.vehicle).reading(motion.body_rate)
     logged = {
-        "position": (position.x, position.y, position.z),
-        "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
-        "body_rate": _parts(rate),
+        "position": parts(position),
+        "attitude": parts(attitude),
+        "body_rate": parts(rate),
         "rotor_speed": log.rotor_speed if log.read_speed is None else log.read_speed,
         "command": log.command,
-        MOTION: (*_parts(motion.position), *_parts(motion.velocity), *_parts(motion.body_rate)),
+        MOTION: parts((motion.position, motion.velocity, motion.body_rate)),
         TRUE_ROTOR_SPEED: log.rotor_speed,
-        BODY_ATTITUDE: tuple(getattr(motion.attitude, axis) for axis in "wxyz"),
-        SETPOINTS: (*_parts(log.setpoints.rate), log.setpoints.thrust),
+        BODY_ATTITUDE: parts(motion.attitude),
+        SETPOINTS: (*parts(log.setpoints.rate), log.setpoints.thrust),
     }
     if "acceleration" in channels:
         logged["acceleration"] = accelerometer(
@@ -342,10 +342,6 @@ def recorded_of(
         )
     axis = min(jnp.ndim(position.x), 1)
     return {name: jnp.stack(logged[name], axis=axis) for name in channels}
-
-
-def _parts(vector: Vec3) -> tuple[JaxArray, JaxArray, JaxArray]:
-    return vector.x, vector.y, vector.z
 
 
 def beginning_of(
