@@ -57,8 +57,8 @@ from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import Selected
 from tuner.uncertainty.estimates import Uncertainty
-from tuner.uncertainty.examination import Examination, knowledge_of
-from tuner.uncertainty.records import Knowledge, Sources
+from tuner.uncertainty.examination import Examination
+from tuner.uncertainty.records import Sources
 from tuner.uncertainty.verdict import (
     NOT_EXAMINED,
     NOT_FITTED,
@@ -338,13 +338,6 @@ MARGIN = 1.0
 SHORTEST = 20.0
 """Length of a proposed flight, or twice, four times as long, whichever is nearest to the recorded
 ones; s. The publisher takes ten to wind up."""
-
-
-def write_knowledge(folder: Path, job: Job, examination: Examination, fitted: Fitted) -> Knowledge:
-    """Write the knowledge of each coefficient into a result folder, and return it."""
-    knowledge = knowledge_of(examination, job.space, fitted.point)
-    knowledge.write(folder)
-    return knowledge
 
 
 def write_next_flight(

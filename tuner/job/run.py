@@ -36,7 +36,7 @@ from tuner.exporters.export import export_formats_of_job
 from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.findings.findings import Finding, merge_alike, remedy, sentence
 from tuner.job.prepare import check_information, prepare
-from tuner.job.results import result_of, write_folder, write_knowledge, write_next_flight
+from tuner.job.results import result_of, write_folder, write_next_flight
 from tuner.report import render, write_search, write_traces
 from tuner.report.outcome import WRONG_INPUT_CODES
 from tuner.report.result_texts import export_sentence
@@ -56,7 +56,7 @@ from tuner.uncertainty.estimates import (
     flights_refute,
     term_findings,
 )
-from tuner.uncertainty.examination import Examination
+from tuner.uncertainty.examination import Examination, knowledge_of
 from tuner.uncertainty.model_error import model_error_findings
 from tuner.uncertainty.records import Sources
 from tuner.uncertainty.refits import bootstrap, cross_validate, jackknife_errors
@@ -183,11 +183,15 @@ class _Run:
                 next_log = reporter.attempt("what to log", propose, next_log)
         result = self.with_refits(selected, write(effective=effective, next_log=next_log))
         if examination is not None:
-            of_fit = folder, job, examination, fitted
-            reporter.attempt("knowledge", partial(write_knowledge, *of_fit), None)
+            known = partial(knowledge_of, examination, job.space, fitted.point)
+            reporter.attempt("knowledge", lambda: known().write(folder), None)
             if not selected.refuted:
                 reporter.on_message("Simulating which flight would be the most informative next.")
-                reporter.attempt("next flight", partial(write_next_flight, *of_fit), None)
+                reporter.attempt(
+                    "next flight",
+                    partial(write_next_flight, folder, job, examination, fitted),
+                    None,
+                )
         reporter.attempt("exports", self.export, None)
         findings = (*fitted.findings, *reporter.findings)
         if findings != result.findings:

@@ -16,7 +16,7 @@ from tuner.design.proposals import Proposals
 from tuner.design.ranking import Arena
 from tuner.evaluate.validation import comparison_of
 from tuner.findings.findings import Code, Finding
-from tuner.job.results import write_knowledge, write_next_flight
+from tuner.job.results import write_next_flight
 from tuner.objective.normal_equations import Objective, misfit, root_mean_squares, sums_at
 from tuner.options import ExaminationOptions
 from tuner.report import render
@@ -35,7 +35,7 @@ from tuner.search.progress import (
     with_loop,
 )
 from tuner.uncertainty.estimates import Uncertainty
-from tuner.uncertainty.examination import Examination, examine
+from tuner.uncertainty.examination import Examination, examine, knowledge_of
 from tuner.uncertainty.identifiability import profile_likelihood
 from tuner.uncertainty.model_error import alternatives_of
 from tuner.uncertainty.records import Knowledge, Profiles
@@ -154,7 +154,8 @@ def examine_vehicle(
             ],
         )
         about.write(out)
-        knowledge = write_knowledge(out, job, examination, fitted)
+        knowledge = knowledge_of(examination, job.space, fitted.point)
+        knowledge.write(out)
         on_message("simulating what could be flown next")
         proposals = write_next_flight(out, job, examination, fitted, room)
         _write_requested(options, job, fitted, examination, folder=out, on_message=on_message)

@@ -296,8 +296,7 @@ def with_start_values(space: Space, vector: ArrayLike, names: Collection[str]) -
         if other in values:
             moved[other] = max(values[other] - at, MIN_REMAINING_SHARE * values[other])
     there = space.vector_of({**values, **moved})
-    start = np.asarray(vector)
-    return np.where([name in moved for name in space.names], there, start)
+    return np.where([name in moved for name in space.names], there, np.asarray(vector))
 
 
 def with_secants(

@@ -138,7 +138,7 @@ class Objective(eqx.Module):
             samples=min(criterion.horizon, self.samples),
             limits=self.limits,
             coefficients=self.space.values(point.coefficients),
-            states=None if criterion.states is None else criterion.states,
+            states=criterion.states,
             conditions={name: values[self.flight] for name, values in conditions.items()},
             tangents=self._directions(point, moving) or None,
         )

@@ -19,6 +19,7 @@ from sim_jax.numeric import Array, Scalar
 from sim_jax.trajectory import TICK_RATE, Shape, publish, shapes
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
+from tuner.objective.criterion import picked
 from tuner.objective.simulation import CODE
 from tuner.recordings.flight import Flight
 
@@ -41,8 +42,7 @@ class Published:
     @property
     def start(self) -> Vec3:
         """The first point, m."""
-        first: Vec3 = jax.tree.map(lambda axis: np.asarray(axis)[0], self.inlet.points.position)
-        return first
+        return picked(self.inlet.points.position, 0)
 
     @property
     def signals(self) -> dict[str, NDArray[np.float64]]:

@@ -61,15 +61,6 @@ def condition_groups(objective: Objective, *, closed_loop: bool) -> Groups:
     }
 
 
-def free_groups(space: Space, others: Collection[str]) -> Groups:
-    """Return the groups of terms that are wholly free, but for others."""
-    return {
-        group: names
-        for group, names in term_groups().items()
-        if group not in others and set(names) <= set(space.free)
-    }
-
-
 def names_of(groups: Groups) -> tuple[str, ...]:
     """Return the names in some groups: coefficients and per-flight conditions."""
     return tuple(name for names in groups.values() for name in names)

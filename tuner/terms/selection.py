@@ -49,7 +49,6 @@ from tuner.terms.candidates import (
     coefficients_of,
     condition_groups,
     conditions_of,
-    free_groups,
     groups_named,
     is_lumped,
     names_of,
@@ -319,7 +318,11 @@ class Selection:
             else row_of(group, self.candidates[group], group_score, dropped.get(group), kept=False)
             for group, group_score in scores.items()
         ]
-        free = free_groups(self.job.space, self.job.first_terms)
+        free = {
+            group: names
+            for group, names in term_groups().items()
+            if group not in self.job.first_terms and set(names) <= set(self.job.space.free)
+        }
         rows += self._base_rows(state, free, SelectionCode.OPEN_LOOP)
         rows += self._base_rows(state, self.job.first_terms, SelectionCode.HOVERS_TILTED)
         return tuple(sorted(rows, key=lambda row: (not row.kept, -(row.gain_holdout or 0.0))))
