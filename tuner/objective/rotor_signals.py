@@ -123,11 +123,9 @@ def squared_speed(vehicle: VehicleFile, source: Source, values: Array) -> Array:
 def levers(vehicle: VehicleFile) -> Array:
     """Return (rotors, 3) moments about x, y and z in m of one newton of thrust at each rotor."""
     drag = vehicle.aerodynamics.moment_constant
-    rows = []
-    for rotor in vehicle.rotors:
-        x, y, _ = rotor.position
-        rows.append((y, -x, -drag if rotor.spin == "ccw" else drag))
-    return np.array(rows)
+    x, y, _ = np.transpose([rotor.position for rotor in vehicle.rotors])
+    about_z = [-drag if rotor.spin == "ccw" else drag for rotor in vehicle.rotors]
+    return np.stack([y, -x, about_z], axis=1)
 
 
 def _smoothed(values: Array) -> Array:

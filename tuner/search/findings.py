@@ -33,12 +33,11 @@ def unmatched(scales: Scales) -> dict[str, dict[str, float]]:
     scales
         Flight -> channel -> residual in multiples of the noise.
     """
-    flights = {}
-    for flight, channels in scales.items():
-        bad = {name: value for name, value in channels.items() if value > UNMATCHED_RATIO}
-        if len(bad) > len(channels) / 2:
-            flights[flight] = bad
-    return flights
+    bad = {
+        flight: {name: value for name, value in channels.items() if value > UNMATCHED_RATIO}
+        for flight, channels in scales.items()
+    }
+    return {flight: of for flight, of in bad.items() if len(of) > len(scales[flight]) / 2}
 
 
 def outlying_flights(scales: Scales) -> frozenset[str]:
@@ -72,14 +71,14 @@ def with_end_findings(job: Job, fitted: Fitted) -> Fitted:
     findings += loop_findings(job, loop_of(fitted.objective), "warning")
     findings += unmatched_findings(fitted.scales)
     offsets = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
-    for number, flight in enumerate(job.fitted):
-        for kind, value in zip(OFFSETS, offsets[:, number].tolist(), strict=True):
-            if value == 0.0:
-                continue
-            code, unit = (
-                (Code.CLOCK_OFFSET, "seconds") if kind in CLOCKS else (Code.GYRO_OFFSET, "rate")
-            )
-            findings.append(Finding(code, "info", flight.name, {unit: value}, (kind,)))
+    findings += [
+        Finding(Code.CLOCK_OFFSET, "info", flight.name, {"seconds": value}, (kind,))
+        if kind in CLOCKS
+        else Finding(Code.GYRO_OFFSET, "info", flight.name, {"rate": value}, (kind,))
+        for flight, of_flight in zip(job.fitted, offsets.T.tolist(), strict=True)
+        for kind, value in zip(OFFSETS, of_flight, strict=True)
+        if value != 0.0
+    ]
     return replace(fitted, findings=tuple(findings))
 
 

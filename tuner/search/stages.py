@@ -89,22 +89,20 @@ class Stage:
 
 def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:
     """Return the stages for flights of at most so many samples at a rate in Hz."""
-    stages = []
-    for seconds, noise_inflation in zip(HORIZONS_S, NOISE_INFLATION, strict=True):
-        horizon = round(seconds * rate)
-        if horizon < samples:
-            stages.append(
-                Stage(
-                    name=f"first {seconds:g} s",
-                    horizon=horizon,
-                    noise_inflation=noise_inflation,
-                    offsets=seconds >= OFFSETS_FREE_FROM_S,
-                    steps=min(16 if seconds < CHEAP_HORIZON_S else 8, steps),
-                    tolerance=0.005 if seconds < CHEAP_HORIZON_S else 0.02,
-                    target_loss=TARGET_LOSS if seconds < CHEAP_HORIZON_S else 0.0,
-                    tries_choices=seconds == CHOICES_AT_S,
-                )
-            )
+    stages = [
+        Stage(
+            name=f"first {seconds:g} s",
+            horizon=horizon,
+            noise_inflation=noise_inflation,
+            offsets=seconds >= OFFSETS_FREE_FROM_S,
+            steps=min(16 if seconds < CHEAP_HORIZON_S else 8, steps),
+            tolerance=0.005 if seconds < CHEAP_HORIZON_S else 0.02,
+            target_loss=TARGET_LOSS if seconds < CHEAP_HORIZON_S else 0.0,
+            tries_choices=seconds == CHOICES_AT_S,
+        )
+        for seconds, noise_inflation in zip(HORIZONS_S, NOISE_INFLATION, strict=True)
+        if (horizon := round(seconds * rate)) < samples
+    ]
     return (*stages, *_whole_stages(samples, robust=robust, steps=steps))
 
 

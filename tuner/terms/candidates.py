@@ -107,13 +107,8 @@ def prior_presence_of(names: Collection[str]) -> float:
 
 
 def neutral_values(names: Sequence[str]) -> dict[str, float]:
-    """Return the neutral value of each coefficient of a term."""
-    values = {}
-    for name in names:
-        neutral = COEFFICIENTS[name].neutral
-        assert neutral is not None, "a term's coefficient has a neutral value"
-        values[name] = neutral
-    return values
+    """Return the neutral values of some coefficients; each of a term has one."""
+    return {n: value for n in names if (value := COEFFICIENTS[n].neutral) is not None}
 
 
 def with_terms(
