@@ -8,6 +8,7 @@ import pytest
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.prediction import FlightPredictor, Predictions, hold_state
 from tuner.findings.sentences import PREDICTED_UNITS
+from tuner.objective.segments import stamped_earlier
 from tuner.recordings.flight import Series
 from tuner.recordings.states import MIN_HALF_WIDTH_S
 from tuner.search.job_flights import Recording
@@ -172,3 +173,22 @@ def test_errors_that_predictions_share_are_chance_but_once():
         disturbed = np.repeat(random.standard_normal(30), 10)  # 1 s each, all of 30 s
         found.append(of_attitude(0.1 + 0.02 * disturbed).worse_than(of_attitude([0.1] * 300), 0.5))
     assert 0.0 < np.mean([bool(names) for names in found]) < 0.06  # 2.5 % to one side
+
+
+def test_rotors_of_a_window_followed_the_commands_at_their_corrected_times(full_flight, updated):
+    """Stamps of commands that are late, by a lateness that is known, change no error."""
+    series, signals = (
+        {name: one for name, one in of.items() if name != "rotor_speed"}
+        for of in (full_flight.series, full_flight.signals)
+    )
+    flight = replace(full_flight, series=series, signals=signals)
+    late = stamped_earlier(flight, ["command"], -0.05)
+    plain, corrected = (
+        Comparison([recording], ControllerFile()).fly(updated)[flight.name].attitude.error
+        for recording in (
+            Recording(flight, "actuator"),
+            Recording(late, "actuator", input_late=0.05),
+        )
+    )
+    apart = np.abs(corrected - plain).max(axis=1)
+    assert np.median(apart) < 1e-9  # few windows lack the commands before them
