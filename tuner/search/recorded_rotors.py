@@ -78,7 +78,8 @@ def with_input_lags(recordings: Sequence[Recording], vehicle: VehicleFile) -> tu
         same = [recording for recording in recordings if recording.inlet == inlet]
         if not INLETS[inlet].starts_recorded:
             continue
-        signal, is_measured = INLETS[inlet].needs[0], "actuator_latency" in INLETS[inlet].bypasses
+        is_measured = "actuator_latency" in INLETS[inlet].bypasses
+        signal: Source = "rotor_speed" if is_measured else "command"
         lags = [
             (recording.flight, lag)
             for recording in same
@@ -150,7 +151,7 @@ def _innovation_variance(answer: Array, columns: Array, complete: Mask, order: i
     return left / len(filtered)
 
 
-def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
+def input_lag(flight: Flight, signal: Source, vehicle: VehicleFile) -> Lag | None:
     """Return the lag of a flight's rotor speeds or commands behind its state.
 
     Parameters
@@ -181,7 +182,7 @@ def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
     turning = np.gradient(state.body_rate, clock, axis=0)
     if not (np.isfinite(force).all() and np.isfinite(turning).all()):
         return None
-    thrust = _thrust_like(linear_interpolation(rows, clock), signal, vehicle)
+    thrust = squared_speed(vehicle, signal, linear_interpolation(rows, clock))
     place = np.array([rotor.position for rotor in vehicle.rotors])
     spin = np.array([1.0 if rotor.spin == "ccw" else -1.0 for rotor in vehicle.rotors])
     driven = np.column_stack(
@@ -203,14 +204,6 @@ def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
         ]
     )
     return _likeliest_lag(of_axes / CORRELATED_FREQUENCIES)
-
-
-def _thrust_like(inputs: Array, signal: str, vehicle: VehicleFile) -> Array:
-    """Return the rotors' thrust (n, 4) up to a factor."""
-    if signal == "command":
-        motor = vehicle.motor
-        inputs = motor.zero_position_armed + motor.input_scaling * inputs
-    return inputs**2
 
 
 def _likelihoods(answer: Array, driven: Array, damping: Array, rate: float) -> Array:
