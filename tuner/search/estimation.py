@@ -407,7 +407,7 @@ def polished(
     stages
         Which of the stages to run.
     left
-        Share of the loss that the last of them may leave to gain, for a rough fit.
+        Share of the loss that each of them may leave to gain, of a start the last, for a rough fit.
     start
         (K,) vector to begin at; the fit's point by default.
     """
@@ -430,12 +430,17 @@ def polished(
         undecided = job.undecided(objective)
         progress = replace(initial_progress(objective, start[None]), loop=loop_of(job.objective))
     progress = replace(progress, iterations=fitted.iterations, evaluations=fitted.evaluations)
-    *first, end = stages_of(job, objective)[stages]
+    planned = stages_of(job, objective)[stages]
+    named = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in planned)
     if left is not None:
-        end = replace(end, tolerance=max(end.tolerance, left), rough=True)
-    named = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in (*first, end))
+        exact = 0 if start is None else len(named) - 1
+        rough = (
+            replace(stage, tolerance=max(stage.tolerance, left), rough=True)
+            for stage in named[exact:]
+        )
+        named = (*named[:exact], *rough)
     progress = run_stages(
         objective, named, progress, free=free, undecided=undecided, on_progress=on_progress
     )
-    changed = _end(job, objective, end, progress)
+    changed = _end(job, objective, named[-1], progress)
     return with_end_findings(job, replace(fitted, **changed, polished=True))
