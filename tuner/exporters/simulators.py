@@ -220,6 +220,11 @@ def with_linear_thrust(vehicle: VehicleFile, *, idle: bool) -> VehicleFile:
     idle
         Whether the commanded thrust follows from the rotor speed (by a parabola through zero
         command, hover and full command); otherwise it is proportional to the command.
+
+    Raises
+    ------
+    ExportError
+        Such a parabola falls at small commands.
     """
     aerodynamics, motor = vehicle.aerodynamics, vehicle.motor
     if aerodynamics.thrust_law == "linear":
@@ -227,14 +232,18 @@ def with_linear_thrust(vehicle: VehicleFile, *, idle: bool) -> VehicleFile:
     speed, thrust = hover_speed(vehicle), vehicle.mass * GRAVITY / len(vehicle.rotors)
     unit = speed / thrust
 
-    def asked_thrust(command: float) -> float:
-        return unit * aerodynamics.motor_constant * rotor_speed(vehicle, command) ** 2
-
     low, full, bend = 0.0, unit * full_thrust(vehicle), 0.0
     hover = hover_command(vehicle)
     if idle and hover is not None:
-        low = asked_thrust(0.0)
+        low = unit * aerodynamics.motor_constant * rotor_speed(vehicle, 0.0) ** 2
         bend = ((full - low) - (speed - low) / hover) / (1.0 - hover)
+        if bend >= full - low:
+            raise ExportError(
+                vehicle.name,
+                "has rotors that stand still at small commands: no parabola rises through its "
+                "thrust at zero command, hover and full command",
+                "correct input_offset or zero_position_armed, or export json",
+            )
     return vehicle.replace(
         motor=motor.replace(
             input_scaling=full - low - bend,

@@ -47,6 +47,13 @@ def test_every_number_of_a_mujoco_model_is_read_back(vehicle, tmp_path):
     assert draft.faults(path, {}) == ["rotor_0 gear[2] is -1.0, not 1.0"]
 
 
+def test_rotors_that_stand_still_at_small_commands_are_refused_for_mujoco(vehicle):
+    dead = vehicle.replace(motor=vehicle.motor.replace(input_offset=-0.2))
+    target = target_of("mujoco")
+    with pytest.raises(ExportError, match="stand still at small commands"):
+        target.draft(dead, "by a test", target.simulator, None)
+
+
 @EVERY
 def test_laws_applied_twice_change_nothing(kind, vehicle):
     target = target_of(kind)
