@@ -94,3 +94,14 @@ def test_held_coefficients_and_reported_flights_are_left_out():
     gain = ControllerEstimate("roll", "P", 0.6, 0.01, differs=True, flight="a")
     examination.model_errors = ModelErrors((), None, (gain,))
     assert not flights_disagree(fitted, examination)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"), [("motor_constant", True), ("marker_offset_z", False)], ids=["seen", "hidden"]
+)
+def test_gusts_are_no_second_value_of_what_set_points_hide(name, said):
+    fitted, examination = fit_of(0, 0.1)
+    examination.uncertainty.names = ("inertia_xx", name, "moment_constant")
+    assert flights_disagree(fitted, examination)
+    fitted.findings = (Finding(Code.DISTURBANCES_FOLLOWED, "info", "flights", {}),)
+    assert bool(flights_disagree(fitted, examination)) is said
