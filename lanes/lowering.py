@@ -53,6 +53,8 @@ from lanes.values import (
 )
 
 I64 = ir.IntType(64)
+LINE_BYTES = 64
+"""bytes of a line of the cache."""
 MAX_IN_REGISTERS = 512
 """Elements up to which an array may lie in registers."""
 MAX_COLUMNS = 15
@@ -744,18 +746,29 @@ class Lowering:
         places = (self.b.gep(begins, [constant(I64, lane)]) for lane in range(self.e.width))
         return [self.b.gep(pointer, [self.b.load(place)]) for place in places]
 
-    def _lay(self, vectors: list[ir.Value], lanes: Sequence[ir.Value], place: ir.Value) -> None:
+    def _lay(
+        self,
+        vectors: list[ir.Value],
+        lanes: Sequence[ir.Value],
+        place: ir.Value,
+        *,
+        whole_lines: bool = False,
+    ) -> None:
         """Write numbers, a power of two of them, side by side in each lane's part.
 
-        Where as many follow, their memory is asked for.
+        Whole lines of the cache go to memory past it. Otherwise, where as many follow, their
+        memory is asked for.
         """
         count, turned = len(vectors), self._transposed(vectors)
         for number, lane in enumerate(lanes):
             row = self._some_lanes(turned[number % count], number - number % count, count)
             begin = self.b.gep(lane, [place])
-            pointer = self.b.bitcast(begin, row.type.as_pointer())
-            self.b.store(row, pointer).align = _bytes(base(row.type))
-            if count > 1:
+            store = self.b.store(row, self.b.bitcast(begin, row.type.as_pointer()))
+            store.align = LINE_BYTES if whole_lines else _bytes(base(row.type))
+            if whole_lines:
+                once = self.e.module.add_metadata([constant(ir.IntType(32), 1)])
+                store.set_metadata("nontemporal", once)
+            elif count > 1:
                 self.e.fetch(self.b.gep(begin, [constant(I64, 2 * count - 1)]))
 
     def rows_of(self, memory: Memory) -> Memory | None:
@@ -819,13 +832,33 @@ class Lowering:
         lanes = self._in_lanes(into, begins)
         vectors = self.b.bitcast(rows, self.e.vector(stored).as_pointer())
 
-        def lay(place: ir.Value, number: int) -> None:
+        def lay(place: ir.Value, number: int, *, whole_lines: bool = False) -> None:
             each = (self.b.add(place, constant(I64, i)) for i in range(number))
-            self._lay([self.b.load(self.b.gep(vectors, [i])) for i in each], lanes, place)
+            rows = [self.b.load(self.b.gep(vectors, [i])) for i in each]
+            self._lay(rows, lanes, place, whole_lines=whole_lines)
 
         together = self._side_by_side(stored)
         whole = self.b.and_(count, constant(I64, -together))
-        self.count(constant(I64, 0), whole, together, lambda place: lay(place, together))
+
+        def lay_whole(*, lines: bool) -> None:
+            self.count(
+                constant(I64, 0),
+                whole,
+                together,
+                lambda place: lay(place, together, whole_lines=lines),
+            )
+
+        if together * _bytes(stored) == LINE_BYTES:
+            places = reduce(self.b.or_, (self.b.ptrtoint(lane, I64) for lane in lanes))
+            within = self.b.and_(places, constant(I64, LINE_BYTES - 1))
+            aligned = self.b.icmp_unsigned("==", within, constant(I64, 0))
+            with self.b.if_else(aligned) as (yes, no):
+                with yes:
+                    lay_whole(lines=True)
+                with no:
+                    lay_whole(lines=False)
+        else:
+            lay_whole(lines=False)
         self.count(whole, count, 1, lambda place: lay(place, 1))
         self.b.ret_void()
         self.e.b = outside

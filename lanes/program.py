@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
 from itertools import pairwise
-from math import lcm
+from math import lcm, prod
 from typing import Any, TypeAlias
 
 import jax
@@ -27,7 +27,7 @@ import lanes.control
 import lanes.structural  # noqa: F401 (both fill in rules)
 from lanes.dependence import dependent
 from lanes.layout import Argument, Lengths, is_laid_by_loop, module_text
-from lanes.lowering import MAX_COLUMNS
+from lanes.lowering import LINE_BYTES, MAX_COLUMNS
 from lanes.machine import (
     Code,
     UnknownError,
@@ -449,7 +449,7 @@ class _Compiled:
             own = tuple(sizes.get(n, n) for n in shape.shape)
             if moved:
                 own = (columns, *own)
-            found.append(np.empty((lanes, *own), shape.dtype))
+            found.append(_on_whole_lines((lanes, *own), shape.dtype))
         ins, outs = _addresses(given), _addresses(found)
         values = (ctypes.c_int64 * max(len(self.lengths), 1))(
             *[lengths[name] for name in self.lengths]
@@ -498,6 +498,15 @@ class _Compiled:
         return Run(
             jax.tree.unflatten(structure, found[:half]), jax.tree.unflatten(structure, by_column)
         )
+
+
+def _on_whole_lines(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+    """Return an uninitialised array that begins with a line of the cache."""
+    size = prod(shape) * np.dtype(dtype).itemsize
+    memory = np.empty(size + LINE_BYTES, np.uint8)
+    first = -memory.ctypes.data % LINE_BYTES
+    found: NDArray[Any] = memory[first : first + size].view(dtype).reshape(shape)
+    return found
 
 
 def _block_layout(

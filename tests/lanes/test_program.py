@@ -18,6 +18,7 @@ from jax import lax
 
 import lanes.program
 from lanes import Argument, Program, dependent, joined, keep_code_in
+from lanes.lowering import LINE_BYTES
 from lanes.machine import object_code
 
 RANDOM = np.random.default_rng(1)
@@ -76,11 +77,12 @@ def program():
     return Program(filtered, ARGUMENTS)
 
 
-@pytest.mark.parametrize(("count", "turns"), [(1, 7), (3, 20), (8, 1), (19, 33), (64, 2)])
+@pytest.mark.parametrize(("count", "turns"), [(1, 7), (3, 20), (8, 1), (19, 32), (19, 33), (64, 2)])
 def test_one_program_serves_every_length_and_every_number_of_lanes(program, count, turns):
     values, tangents = given(count, turns)
     assert program.is_kernel
     got = program(values, tangents, lanes=count, turns=turns)
+    assert all(leaf.ctypes.data % LINE_BYTES == 0 for leaf in jax.tree.leaves(got.values))
     want = program.by_xla(values, tangents, turns=turns)
     for mine, theirs in zip(flat(got), flat(want), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13)
