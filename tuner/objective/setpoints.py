@@ -139,7 +139,8 @@ def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Findi
     for name, axis in zip(AXES, match.axes, strict=True):
         if axis.spread < MIN_SPREAD or axis.correlation < MIN_CORRELATION:
             continue
-        if not 1.0 / MAX_GAIN_RATIO < axis.gain < MAX_GAIN_RATIO:
+        # the truth is between both regressions, as both sides have noise (Frisch 1934)
+        if axis.gain > MAX_GAIN_RATIO or axis.gain < axis.correlation**2 / MAX_GAIN_RATIO:
             numbers = {"gain": round(axis.gain, 2), "correlation": round(axis.correlation, 2)}
             names = (name, _guess(axis.gain, controller))
             findings.append(Finding(Code.SETPOINTS_SCALED, "warning", flight.name, numbers, names))

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tuner.findings.findings import Code, one_line
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
@@ -58,6 +59,18 @@ def test_a_gain_and_a_bias_are_distinguished(flight):
     (finding,) = setpoint_findings(with_setpoints(flight, lambda v: v + np.eye(3)[0] * 0.2), OURS)
     assert (finding.code, finding.names) == (Code.SETPOINTS_BIASED, ("roll",))
     assert finding.numbers["bias"] == pytest.approx(0.2, abs=0.01)
+
+
+def test_a_noisy_attitude_is_no_smaller_gain(flight):
+    """Its noise makes the computed set-points larger than those that were recorded."""
+    series = flight.series["attitude"]
+    noise = Rotation.from_rotvec(0.25 * np.random.default_rng(0).normal(size=(len(series.time), 3)))
+    turned = Rotation.from_quat(series.values, scalar_first=True) * noise
+    read = Series(series.time, turned.as_quat(scalar_first=True))
+    noisy = replace(flight, series={**flight.series, "attitude": read})
+    roll, pitch, _ = match_setpoints(noisy, OURS).axes
+    assert max(roll.gain, pitch.gain) < 1.0 / 1.4
+    assert not any(f.code is Code.SETPOINTS_SCALED for f in setpoint_findings(noisy, OURS))
 
 
 def test_set_points_that_answer_an_old_state_are_reported(flight):
