@@ -203,9 +203,9 @@ def read_signals(options: ReadOptions) -> Signals:
             raw[name] = replace(raw[name], values=raw[name].values[:, columns])
         names = (order_in_words([column + 1 for column in columns]),)
         notes.append(Note(NoteCode.MOTOR_ORDER_GIVEN, "info", names=names))
-    series, epoch, dropped = _clean(raw)
-    topics = {signal: data.topic for signal, data in raw.items()}
-    damage = tuple(part.later(_stamp_delay(raw, contents, epoch)) for part in contents.damage)
+    topics = {signal: places[signal].topic for signal in raw}
+    series, dropped = _clean(raw, topics)
+    damage = tuple(part.later(_stamp_delay(raw, topics, contents)) for part in contents.damage)
     notes += dropped
     if no_pose is None and is_position_frozen(series):
         del series["position"]
@@ -232,13 +232,15 @@ def _notes_of_places(places: Mapping[str, Place]) -> list[Note]:
     return notes
 
 
-def _stamp_delay(raw: Mapping[str, RawSignal], contents: ReadResult, epoch: int) -> float:
-    """Return the s from the recorder's clock to that of the stamps, counted from `epoch` ns."""
+def _stamp_delay(
+    raw: Mapping[str, RawSeries], topics: Mapping[str, str], contents: ReadResult
+) -> float:
+    """Return the s from the recorder's clock to that of the series."""
     first = "position" if "position" in raw else min(raw, default=None)
     if first is None:
         return 0.0
-    arrival = contents.samples[raw[first].topic].receive
-    return (float(np.median(raw[first].time)) - float(np.median(arrival)) - epoch) * 1e-9
+    arrival = float(np.median(contents.samples[topics[first]].receive))
+    return float(np.median(raw[first].time)) - arrival * 1e-9
 
 
 def read_content(options: ReadOptions) -> Content:
@@ -275,36 +277,35 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     return Content(**read, missions=missions)
 
 
-def _with_times_in_us(raw: dict[str, RawSignal]) -> tuple[dict[str, RawSignal], list[Note]]:
+def _with_times_in_us(raw: dict[str, RawSeries]) -> tuple[dict[str, RawSeries], list[Note]]:
     """Return signals with times divided by 1000, if gravity shows that their unit is us, not ms."""
-    if not is_too_slow({name: data.in_seconds(0) for name, data in raw.items()}):
+    if not is_too_slow(raw):
         return raw, []
-    quick = {name: replace(data, time=data.time // 1000) for name, data in raw.items()}
+    quick = {name: replace(data, time=1e-3 * data.time) for name, data in raw.items()}
     return quick, [Note(NoteCode.TIME_READ, count=len(next(iter(raw.values())).time))]
 
 
-def _clean(raw: Mapping[str, RawSignal]) -> tuple[dict[str, Series], int, list[Note]]:
-    first = [raw["position"]] if "position" in raw else list(raw.values())
-    epoch = min((int(data.time.min()) for data in first), default=0)
+def _clean(
+    raw: Mapping[str, RawSeries], topics: Mapping[str, str]
+) -> tuple[dict[str, Series], list[Note]]:
     series, units = {}, list[Note]()
     notes: dict[tuple[object, ...], Note] = {}
-    recorded = {signal: data.in_seconds(epoch) for signal, data in raw.items()}
-    read = {s: unit_of(s, raw[s].topic, scale) for s, scale in scales_of(recorded).items()}
-    read |= units_of_references(recorded, read)
+    read = {signal: unit_of(signal, topics[signal], of) for signal, of in scales_of(raw).items()}
+    read |= units_of_references(raw, read)
     for signal, data in raw.items():
-        seconds, measured = recorded[signal].time, recorded[signal].values
+        seconds, measured = data.time, data.values
         if signal in read:
             unit, read_so = read[signal]
             measured = to_si(measured, unit)
             units += [] if read_so is None else [replace(read_so, count=len(seconds))]
-        time, values, dropped = clean(signal, data.topic, seconds, measured)
+        time, values, dropped = clean(signal, topics[signal], seconds, measured)
         for note in dropped:  # signals of one message lack the same samples
             alike = (note.code, note.topic, note.count, tuple(note.numbers.items()))
             before = notes[alike].names if alike in notes else ()
             notes[alike] = replace(note, names=(*before, *note.names))
         if len(time):
             series[signal] = Series(time, values)
-    return series, epoch, [*units, *notes.values()]
+    return series, [*units, *notes.values()]
 
 
 MIN_COMMAND_RANGE = 0.05
@@ -372,36 +373,17 @@ def _choose_missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mi
     return (Mission(start, end, "the side-car"),) if end > start else ()
 
 
-@dataclass(frozen=True)
-class RawSignal:
-    """One signal as recorded, in SI units and the axes of a `Flight`.
-
-    Attributes
-    ----------
-    time
-        (n,) ns; in the order of the file, with its defects.
-    values
-        (n, k) in the columns of `SIGNALS`; NaN where not measured.
-    """
-
-    topic: str
-    time: Nanoseconds
-    values: Array
-
-    def in_seconds(self, epoch: int) -> RawSeries:
-        """Return the samples with their times in s since some ns."""
-        return RawSeries(np.asarray((self.time - epoch) * 1e-9, dtype=np.float64), self.values)
-
-
 def extract(
     recording: Recording, places: Mapping[str, Place], clocks: tuple[Clock, ...] = ()
-) -> tuple[dict[str, RawSignal], ReadResult, tuple[Note, ...]]:
+) -> tuple[dict[str, RawSeries], ReadResult, tuple[Note, ...]]:
     """Read every located signal.
 
     Returns
     -------
     tuple
-        Signal -> its raw values, the messages they come from, and notes.
+        Signal -> its samples in SI units and the axes of a `Flight`, in the order of the file, with
+        its defects and times since the first position (without one, since the first sample); the
+        messages they come from; and notes.
     """
     wanted: dict[str, list[str]] = {}
     for place in places.values():
@@ -413,7 +395,8 @@ def extract(
     kinds = {t: {s for s, place in places.items() if place.topic == t} for t in wanted}
     slow_topics = {topic for topic, held in kinds.items() if held <= SLOW_SIGNALS}
     times, notes = message_times(contents.samples, receive_only, slow_topics)
-    signals: dict[str, RawSignal] = {}
+    stamps: dict[str, Nanoseconds] = {}
+    read: dict[str, Array] = {}
     inferred: list[Note] = []
     for signal in sorted(
         places, key=lambda name: name in ATTITUDES
@@ -423,34 +406,43 @@ def extract(
         if samples is None or not len(samples.receive):
             continue
         time = times[place.topic]
-        values = np.column_stack([samples.fields[name] for name in place.fields])
-        raw = RawSignal(place.topic, time, values)
-        unit = _recorded_unit(recording, signal, place, raw, signals.get("position"))
+        recorded = np.column_stack([samples.fields[name] for name in place.fields])
+        epoch = int(time[0])
+        position = (
+            _in_seconds(stamps["position"], read["position"], epoch) if "position" in read else None
+        )
+        raw = _in_seconds(time, recorded, epoch)
+        unit = _recorded_unit(recording, signal, place, raw, position)
         if unit and unit != place.unit:
             count, names = len(time), (signal, UNIT_PHRASES[unit])
             inferred.append(Note(NoteCode.UNIT_READ, "warning", place.topic, count, names=names))
-        values = _in_flight_axes(samples, signal, place, to_si(values, unit or "si"))
+        values = _in_flight_axes(samples, signal, place, to_si(recorded, unit or "si"))
         if is_tabular(recording.format):  # a row without the signal is no sample of it
             there = np.isfinite(values).any(axis=1)
             time, values = time[there], values[there]
         if len(time):
-            signals[signal] = RawSignal(place.topic, time, values)
-    ordered = {signal: signals[signal] for signal in places if signal in signals}
-    return ordered, contents, (*notes, *inferred)
+            stamps[signal], read[signal] = time, values
+    first = [stamps["position"]] if "position" in stamps else list(stamps.values())
+    epoch = min((int(time.min()) for time in first), default=0)
+    signals = {s: _in_seconds(stamps[s], read[s], epoch) for s in places if s in read}
+    return signals, contents, (*notes, *inferred)
+
+
+def _in_seconds(time: Nanoseconds, values: Array, epoch: int) -> RawSeries:
+    """Return samples with their times in s since some ns."""
+    return RawSeries(np.asarray((time - epoch) * 1e-9, dtype=np.float64), values)
 
 
 def _recorded_unit(
-    recording: Recording, signal: str, place: Place, recorded: RawSignal, position: RawSignal | None
+    recording: Recording, signal: str, place: Place, recorded: RawSeries, position: RawSeries | None
 ) -> str:
     """Return the unit of recorded numbers: the map's, else the plausible one, empty if none is."""
     if place.source.unit is not None:
         return place.unit
     if signal not in ATTITUDES or place.source.quaternion != "rpy":
         return unit_by_range(signal, recorded.values, place.unit)
-    epoch = int(recorded.time[0])
-    where = None if position is None else position.in_seconds(epoch)
     required = signal == "attitude" and position is not None  # else no flight is made of it
-    return unit_of_angles(recording.path, recorded.in_seconds(epoch), where, required=required)
+    return unit_of_angles(recording.path, recorded, position, required=required)
 
 
 def _in_flight_axes(samples: Samples, signal: str, place: Place, values: Array) -> Array:
