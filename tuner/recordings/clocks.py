@@ -252,16 +252,22 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
         return None
     turning = smooth(body_rate_of(on_clock(series, "attitude", clock)), AVERAGING_WINDOW_S)
     gyro = smooth(on_clock(series, "body_rate", clock), AVERAGING_WINDOW_S)
-    if rms(gyro) < MIN_TURN_RATE:
-        return None
+    return None if rms(gyro) < MIN_TURN_RATE else lag_between(turning, gyro)
+
+
+def lag_between(one: Array, other: Array) -> float | None:
+    """Return the delay in s of one signal (n, k) against another, both at `RATE_HZ`.
+
+    None if they are not alike; 0 if another delay makes them hardly more so.
+    """
     # The best whole lag first, then a parabola through the three highest points.
     max_lag = round(MAX_POSE_OFFSET_S * RATE_HZ)
     lags = np.arange(-max_lag, max_lag + 1)
-    count = len(clock)
+    count = len(one)
     score = np.array(
-        [  # of the attitude moved back by a lag
+        [  # of the one moved back by a lag
             correlation(
-                turning[max(0, lag) : count + min(0, lag)], gyro[max(0, -lag) : count - max(0, lag)]
+                one[max(0, lag) : count + min(0, lag)], other[max(0, -lag) : count - max(0, lag)]
             )
             for lag in lags.tolist()
         ]

@@ -19,6 +19,7 @@ import numpy as np
 
 from sim_jax.constants import GRAVITY
 from tuner.core.numerics import Array
+from tuner.recordings.clocks import lag_between
 from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import (
     body_rate_of,
@@ -28,6 +29,7 @@ from tuner.recordings.interpolation import (
     on_clock,
     rms,
     rotate,
+    runs,
     smooth,
     upward,
 )
@@ -50,6 +52,8 @@ DOUBTS = (
     NoteCode.VELOCITY_DOUBTED,
     NoteCode.AXIS_DOUBTED,
     NoteCode.AXES_TURNED,
+    NoteCode.SIGNAL_LATE,
+    NoteCode.CLOCK_DOUBTED,
 )
 """Notes on signals that no reading explains."""
 MIN_ACCELERATION = 0.3
@@ -84,6 +88,13 @@ MIN_SIGN_CORRELATION, MIN_SIZE_CORRELATION = 0.7, 0.97
 MIN_AXES_ANGLE_RAD, MIN_SINGULAR_VALUE_RATIO = 0.1, 0.05
 """Body axes may be turned by less, as markers were defined; and the second singular value must be
 at least so large beside the first for a rotation to show."""
+
+MAX_LAG_S = 0.08
+"""An estimator's velocity is late by less against the position."""
+MAX_CLOCK_DIFFERENCE = 0.05
+"""Ratios of two signals to the changes of others are of one clock if they differ by less."""
+MIN_SATURATED_RUN, MIN_SATURATED = 3, 12
+"""Samples in a row, and in all, at the limit of a gyro that saturates."""
 
 Flown = Mapping[str, Array]
 """Signal -> (n, k) on one clock; NaN where unknown."""
@@ -199,7 +210,45 @@ def correct_frames(
         if covering is not None and not doubts and not covering & {note.code for note in notes}:
             doubts = _single_axis_doubts(signal, flown)
         notes += [replace(doubt, topic=topic) for doubt in doubts]
-    return fixed, tuple(notes)
+    if "body_rate" in fixed:
+        notes += _saturation(fixed["body_rate"], topics.get("body_rate", ""))
+    return fixed, tuple(_with_clock_doubted(notes))
+
+
+def _with_clock_doubted(notes: Sequence[Note]) -> Sequence[Note]:
+    """Return notes with one on the clock in place of doubts on the sizes of two signals."""
+    times = {
+        signal: float(np.median(found))
+        for signal in ("body_rate", "velocity")
+        if (found := [n.numbers["times"] for n in notes if _is_axis_doubt(n, signal)])
+    }
+    turned, moved = times.get("body_rate", 0.0), times.get("velocity", np.inf)
+    if not 0.0 < abs(turned - moved) <= MAX_CLOCK_DIFFERENCE * turned:
+        return notes
+    others = [note for note in notes if note.code is not NoteCode.AXIS_DOUBTED]
+    numbers = {"times": turned}
+    return [*others, Note(NoteCode.CLOCK_DOUBTED, numbers=numbers, names=tuple(times))]
+
+
+def _is_axis_doubt(note: Note, signal: str) -> bool:
+    return note.code is NoteCode.AXIS_DOUBTED and note.names[0] == signal
+
+
+def _saturation(gyro: Series, topic: str) -> list[Note]:
+    """Return a note on a gyro that stays at one largest rate, both to the left and to the right."""
+    limit = float(np.abs(gyro.values).max(initial=0.0))
+    stays = [
+        (first, behind, column)
+        for column, values in enumerate(gyro.values.T)
+        for sign in (1.0, -1.0)
+        for first, behind in runs(sign * values >= (1.0 - 1e-6) * limit)
+        if behind - first >= MIN_SATURATED_RUN
+    ]
+    signs = {float(np.sign(gyro.values[first, column])) for first, _, column in stays}
+    count = sum(behind - first for first, behind, _ in stays)
+    if limit < CLEAR_TURN_RATE or len(signs) < 2 or count < MIN_SATURATED:
+        return []
+    return [Note(NoteCode.GYRO_SATURATED, "warning", topic, count, {"limit": limit})]
 
 
 def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
@@ -305,6 +354,11 @@ def _single_axis_doubts(signal: str, flown: Flown) -> list[Note]:
     pair, doubts = PAIRS[signal], list[Note]()
     for compared in pair.compared:
         change, recorded = compared(flown)
+        if signal == "velocity" and min(rms(change), rms(recorded)) > pair.min_motion:
+            late = lag_between(change, recorded) or 0.0
+            if abs(late) > MAX_LAG_S:
+                numbers = {"seconds": late}
+                return [Note(NoteCode.SIGNAL_LATE, numbers=numbers, names=(signal, pair.other))]
         doubts = doubts or list(_axis_doubts(change, recorded, (signal, pair.other)))
     angle = _angle_between(change, recorded) if signal == "body_rate" else 0.0
     if angle > MIN_AXES_ANGLE_RAD and all(note.numbers["times"] > 0 for note in doubts):

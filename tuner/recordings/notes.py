@@ -171,6 +171,21 @@ class NoteCode(Worded):
         "axis_doubted",  # names: the signal, its axis, whose change it is
         "{first} along {second} is {times:.2f} times the change of {third}: check axes, unit, time",
     )
+    SIGNAL_LATE = (
+        "signal_late",  # names: the signal, the one whose change it is
+        "{second} is {milliseconds:+.0f} ms late against {first}, by correlation: check its stamps",
+    )
+    CLOCK_DOUBTED = (
+        "clock_doubted",  # names: the two signals
+        "the times run {times:.2f} times as long as {first} and {second} say: check their unit",
+    )
+    GYRO_SATURATED = (
+        "gyro_saturated",
+        (
+            "{count} samples stay at plus or minus {limit:.3g} rad/s, where the gyro saturates: "
+            "turn slower, or set it to a wider range"
+        ),
+    )
     AXES_TURNED = (
         "axes_turned",
         "the attitude's body axes are turned by {degrees:.0f}° against the gyro's: check markers",

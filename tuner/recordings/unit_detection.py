@@ -140,6 +140,9 @@ READINGS: Mapping[str, tuple[Reading, ...]] = {
     "velocity": (
         Reading("in body axes", lambda v, q: rotate(q, v)),
         Reading("in NED axes", lambda v, _: to_enu_flu(v, "velocity")),
+        Reading(  # gravity alone does not tell these two apart
+            "in kilometres per hour, not feet per second", lambda v, _: v / 3.6 / UNITS["ft"][0]
+        ),
     ),
     "acceleration": (
         Reading("in FRD axes", lambda a, _: to_enu_flu(a, "acceleration")),
@@ -260,9 +263,7 @@ def is_too_slow(recorded: Mapping[str, RawSeries]) -> bool:
     step = np.diff(np.sort(recorded["position"].time))
     if not len(step) or np.median(step) < MIN_SLOW_STEP_S:
         return False
-    quick = {
-        name: RawSeries(1e-3 * samples.time, samples.values) for name, samples in recorded.items()
-    }
+    quick = {name: replace(samples, time=1e-3 * samples.time) for name, samples in recorded.items()}
     slowly, quickly = (
         fits_gravity(signals["position"], signals["attitude"]) for signals in (recorded, quick)
     )

@@ -235,6 +235,7 @@ RECORDED: dict[str, Callable[[np.ndarray, Rotation], np.ndarray]] = {
     "in world axes": lambda values, attitude: attitude.apply(values),
     "in body axes": lambda values, attitude: attitude.inv().apply(values),
     "in NED axes": lambda values, _: values[:, [1, 0, 2]] * [1.0, 1.0, -1.0],
+    "in kilometres per hour, not feet per second": lambda values, _: 3.6 * 0.3048 * values,
     "with x and y swapped": lambda values, _: values[:, [1, 0, 2]],
     "in axes turned left about z": lambda values, _: values[:, [1, 0, 2]] * [1.0, -1.0, 1.0],
     "in axes turned right about z": lambda values, _: values[:, [1, 0, 2]] * [-1.0, 1.0, 1.0],

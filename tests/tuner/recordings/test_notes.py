@@ -20,6 +20,7 @@ NUMBERS = dict.fromkeys(
         "number",
         "drift",
         "degrees",
+        "limit",
     ],
     0.5,
 ) | {"times": 39.4, "median": 1225.0}

@@ -501,6 +501,49 @@ def test_single_axes_that_deny_the_pose_are_named(content, said: set, tmp_path: 
     assert all(note.kind == "warning" for note in notes)
 
 
+def _late(prefix: str, seconds: float) -> str:
+    """Return the flight with the columns of some names late."""
+    table = dict(ways.flown())
+    late = {f"{prefix}{a}": table[f"{prefix}{a}"] for a in ways.XYZ}
+    late = {n: np.interp(table["time"] - seconds, table["time"], v) for n, v in late.items()}
+    return ways.text(table | late)
+
+
+@pytest.mark.parametrize(("prefix", "seconds", "late"), [("", 0.2, 0.2), ("v", 0.15, -0.15)])
+def test_a_position_that_is_late_by_itself_is_named(
+    prefix: str, seconds: float, late: float, tmp_path: Path
+) -> None:
+    flight = read(tmp_path, _late(prefix, seconds))
+    notes = [n for n in flight.notes if n.code is NoteCode.SIGNAL_LATE]
+    assert ("velocity", "position") in {note.names for note in notes}
+    assert [n.numbers["seconds"] for n in notes] == [pytest.approx(late, abs=0.03)] * len(notes)
+    assert not [n for n in read(tmp_path, _late("v", 0.05)).notes if n.kind == "warning"]
+
+
+@pytest.mark.parametrize("times", [0.5, 2.0])
+def test_a_clock_of_another_rate_is_named_once(times: float, tmp_path: Path) -> None:
+    notes = read(tmp_path, ways.changed({"time": lambda t: times * t})).notes
+    (note,) = [n for n in notes if n.code is NoteCode.CLOCK_DOUBTED]
+    assert note.numbers["times"] == pytest.approx(times, abs=0.05)
+    assert NoteCode.AXIS_DOUBTED not in {n.code for n in notes}
+
+
+def test_speeds_in_kilometres_per_hour_are_read(tmp_path: Path) -> None:
+    flight = read(tmp_path, ways.changed({"v": lambda v: 3.6 * v}))
+    assert flight.series["velocity"].values[:, 0] == pytest.approx(ways.flown()["vx"], abs=1e-3)
+    (note,) = [n for n in flight.notes if n.code is NoteCode.FRAME_TURNED]
+    assert note.names == ("velocity", "in kilometres per hour, not feet per second")
+
+
+@pytest.mark.parametrize(("share", "said"), [(1.0, False), (0.6, True)])
+def test_a_gyro_that_saturates_is_named(share: float, said: bool, tmp_path: Path) -> None:
+    limit = share * np.abs(ways.flown()["wx"]).max()
+    flight = read(tmp_path, ways.changed({"w": lambda w: np.clip(w, -limit, limit)}))
+    notes = [n for n in flight.notes if n.code is NoteCode.GYRO_SATURATED]
+    assert [n.numbers["limit"] for n in notes] == [pytest.approx(limit)] * said
+    assert all(n.kind == "warning" and n.count > 12 for n in notes)
+
+
 @pytest.mark.parametrize(("wobble", "doubted"), [(0.1, ""), (1.0, "y")])
 def test_a_spin_seen_by_tilted_markers_is_not_another_size(wobble: float, doubted: str) -> None:
     """Of a fast spin, two degrees of tilt show a part about y as large as a small wobble."""
