@@ -156,6 +156,7 @@ class Content(Signals):
     missions: tuple[Mission, ...]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of corrupt numbers, which are dropped as such
 def read_signals(options: ReadOptions) -> Signals:
     """Read and clean all signals that a topic map finds in a recording.
 

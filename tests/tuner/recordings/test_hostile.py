@@ -11,6 +11,7 @@ import struct
 import subprocess
 import sys
 import tracemalloc
+import warnings
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -23,11 +24,13 @@ import pytest
 from pyarrow import parquet
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
-from tests.tuner.recordings import fuzz, making
+from tests.tuner.recordings import fuzz, making, ways
 from tuner.core.errors import InputError
 from tuner.ground.propeller import read_static_table
 from tuner.ground.rig_data import open_table
+from tuner.recordings.flight import Series
 from tuner.recordings.inspection import inspect_recordings
+from tuner.recordings.interpolation import with_gaps_filled
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause, NoteCode
 from tuner.recordings.ros.container import (
@@ -259,6 +262,18 @@ def test_index_of_a_chunk_that_names_other_connections() -> None:
     start = np.zeros(1, dtype=np.int64)
     with pytest.raises(DamagedError, match="points nowhere"):
         read_wanted(FileBytes(io.BytesIO(bytes(100))), Chunk(0, 100), {7: (start, start)}, [8])
+
+
+def test_corrupt_numbers_warn_of_no_overflow(tmp_path: Path) -> None:
+    cells = [f"{value:.9f}" for value in ways.flown()["wx"]]
+    cells[700], cells[703] = "1e308", "-1e308"
+    path = tmp_path / "corrupt.csv"
+    path.write_text(ways.text(dict(ways.flown()) | {"wx": cells}))
+    time = np.delete(np.arange(20) * 0.01, 10)
+    tiny = Series(time, np.where(time > 0.05, 5e-324, 0.0)[:, None].cumsum(axis=0))
+    with warnings.catch_warnings(action="error"):
+        assert load_flight(path, cache=False).duration > 10.0
+        assert len(with_gaps_filled(tiny).time) == 20
 
 
 def test_table_with_a_line_without_end(tmp_path: Path) -> None:
