@@ -124,6 +124,21 @@ def test_the_mean_lateness_of_commands_is_the_vehicles_own_lag(broadband, update
     assert second.input_late - first.input_late == pytest.approx(0.012, abs=0.002)
 
 
+def test_the_lag_of_commands_is_found_by_the_whole_curve_of_the_rotors(broadband, updated):
+    speed = broadband.series["rotor_speed"].values
+    lags = []
+    for quadratic, offset in ((0.0, 0.0), (900.0, 0.1)):
+        motor = updated.motor.replace(quadratic=quadratic, input_offset=offset)
+        lift = (speed - motor.zero_position_armed) / motor.input_scaling
+        command = 2.0 * lift / (1.0 + np.sqrt(1.0 + 4.0 * quadratic / motor.input_scaling * lift))
+        series = {"command": Series(broadband.series["command"].time, command - offset)}
+        flight = replace(broadband, series=dict(broadband.series) | series)
+        lags.append(input_lag(flight, "command", updated.replace(motor=motor)))
+    straight, bent = lags
+    assert bent.seconds == pytest.approx(straight.seconds, abs=1e-6)
+    assert bent.sd == pytest.approx(straight.sd, rel=1e-3)
+
+
 @pytest.mark.parametrize("source", ["command", "rotor_speed"])
 @pytest.mark.parametrize("late", [-0.2, 0.0, 0.1, 0.3])
 def test_a_signal_that_is_stamped_late_is_named(source, late, broadband, updated):
