@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import subprocess
+import sys
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -54,8 +56,7 @@ class MatlabTable(TabularRecording):
     def __init__(self, path: Path) -> None:
         with path.open("rb") as stream:
             newer = stream.read(len(MAGIC_7_3)) == MAGIC_7_3
-        content = _load_hdf5(path) if newer else _load(path)
-        self._columns = dict(_columns("", content, 0))
+        self._columns, whole = _described(_load_hdf5(path)) if newer else _load(path)
         if not self._columns:
             raise RecordingError(
                 path,
@@ -67,7 +68,6 @@ class MatlabTable(TabularRecording):
         clocks = {time for time in self._times.values() if time is not None}
         columns = [*([ANY_TIME] if len(clocks) > 1 else []), *self._columns]
         super().__init__(path, "table", columns)
-        whole = [name for name, value in content.items() if _is_matrix(value)]
         if len(whole) == 1 and len(self._columns) > 1 and not clocks:
             name, count = whole[0], len(self._columns)
             remedy = (
@@ -115,10 +115,12 @@ class MatlabTable(TabularRecording):
         return Samples(time[known], time[known], values), notes
 
 
-def _load(path: Path) -> Mapping[str, Any]:
-    """Read a file of version 5 to 7."""
-    from scipy.io import loadmat  # noqa: PLC0415 (slow to import)
+Described = tuple[dict[str, Array], list[str]]
+"""Columns by their names, and the names of whole matrices."""
 
+
+def _load(path: Path) -> Described:
+    """Read a file of version 5 to 7, in a process of its own: scipy may crash on a hostile one."""
     data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
     size, arrays = 0 if data else MAX_BYTES + 1, 0
     for piece in _decompressed(data):
@@ -132,14 +134,37 @@ def _load(path: Path) -> Mapping[str, Any]:
         raise RecordingError(
             path, f"holds more than {MAX_ARRAYS} arrays", "save each signal as one array"
         )
+    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()"]
+    done = subprocess.run(command, input=data, capture_output=True, check=False)
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise _unreadable(path, said if done.returncode == 1 else "its reader crashed")
+    with np.load(io.BytesIO(done.stdout)) as held:
+        names, whole, *columns = (held[f"arr_{number}"] for number in range(len(held.files)))
+    return dict(zip(names.tolist(), columns, strict=True)), whole.tolist()
+
+
+def main() -> None:
+    """Write the columns of the MATLAB file on standard input to standard output, as npz."""
+    from scipy.io import loadmat  # noqa: PLC0415 (slow to import)
+
     try:
-        return dict(loadmat(io.BytesIO(data), simplify_cells=True))
+        data = io.BytesIO(sys.stdin.buffer.read())
+        columns, whole = _described(loadmat(data, simplify_cells=True))
     except Exception as err:  # whatever a hostile file makes of the library
-        raise _unreadable(path, err) from None
+        sys.exit(short_reason(err))
+    written = io.BytesIO()
+    np.savez(written, np.array(list(columns), str), np.array(whole, str), *columns.values())
+    sys.stdout.buffer.write(written.getbuffer())
 
 
-def _unreadable(path: Path, err: Exception) -> RecordingError:
-    what = f"is no readable MATLAB file ({short_reason(err)})"
+def _described(content: Mapping[str, Any]) -> Described:
+    whole = [name for name, value in content.items() if _is_matrix(value)]
+    return dict(_columns("", content, 0)), whole
+
+
+def _unreadable(path: Path, reason: str) -> RecordingError:
+    what = f"is no readable MATLAB file ({reason})"
     return RecordingError(path, what, "save it again")
 
 
@@ -182,7 +207,7 @@ def _load_hdf5(path: Path) -> Mapping[str, Any]:
     except RecordingError:
         raise
     except Exception as err:  # whatever a hostile file makes of the library
-        raise _unreadable(path, err) from None
+        raise _unreadable(path, short_reason(err)) from None
 
 
 def _group_arrays(h5py: Any, group: Any, read: list[int], depth: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import sys
 from pathlib import Path
@@ -362,8 +363,18 @@ def _nested(depth: int) -> bytes:
     return MAGIC.ljust(124) + b"\0\1IM" + b"".join(reversed(parts))
 
 
+def _of_type(kind: int) -> bytes:
+    """Return a MATLAB file whose numbers say that they are of a type."""
+    written = io.BytesIO()
+    savemat(written, {"t": np.arange(50.0)})
+    return written.getvalue().replace(struct.pack("<II", 9, 400), struct.pack("<II", kind, 400))
+
+
 @pytest.mark.parametrize("content", [
     _nested(30_000),
+    _of_type(8),
+    _of_type(14),
+    _of_type(20),
     MAGIC.ljust(124) + b"\0\1IM" + struct.pack("<II", 15, 40) + b"x" * 40,
     MAGIC.ljust(124) + b"\0\1IM",
     MAGIC,
