@@ -103,7 +103,7 @@ class Panel:
     levels: Sequence[tuple[float, str]] = ()
     """Horizontal lines and what they mean."""
     x_labels: Sequence[str] = ()
-    """Of the places 0, 1, … along the x axis, in place of numbers."""
+    """Of the places 0, 1, … along the x axis of a page, in place of numbers."""
 
 
 @dataclass(frozen=True)

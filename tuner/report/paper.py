@@ -218,8 +218,6 @@ def _draw(panel: Panel, place: Axes) -> None:
                 place.set_xlim(0.5 * least, 2.0 * largest)
             place.set_xscale("log")
             _label_decades(place.xaxis)
-    if panel.x_labels:
-        place.set_xticks(range(len(panel.x_labels)), panel.x_labels)
     if panel.equal:
         place.set_aspect("equal", adjustable="datalim")
     for value, text in panel.levels:
