@@ -418,8 +418,10 @@ def _jobs(file: ClusterFile, jobs: JobQueue, *, submit: bool = True) -> Abstract
         "local_directory": jobs.scratch,
         "log_directory": None if jobs.logs is None else str(Path(jobs.logs).expanduser()),
     }
+    scheduler = dask.config.get(f"jobqueue.{jobs.system}.scheduler-options", {})
     cluster: AbstractContextManager[Any] = kind(
         n_workers=file.workers if submit else 0,
+        scheduler_options={"dashboard_address": "127.0.0.1:0", **scheduler},
         cores=file.cores,
         processes=1,
         worker_extra_args=["--nthreads", "1"] if file.cores > 1 else [],

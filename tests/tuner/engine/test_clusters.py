@@ -1,5 +1,8 @@
+import contextlib
+import socket
 import sys
 
+import dask.config
 import pytest
 
 from tuner.cli import main
@@ -75,6 +78,19 @@ def test_other_batch_systems_have_scripts(tmp_path, system):
     path = tmp_path / "cluster.yaml"
     path.write_text(f"memory: 2GiB\njobs: {{system: {system}, walltime: '00:30'}}")
     assert "distributed.cli.dask_worker" in job_script_for(str(path))
+
+
+def test_a_job_script_needs_no_port_of_its_own():
+    with socket.socket() as other:
+        with contextlib.suppress(OSError):  # it is taken already
+            other.bind(("", 8787))  # where Dask's dashboard would be
+            other.listen()
+        assert "#SBATCH" in job_script_for(str(FOLDER / "slurm.yaml"))
+
+
+def test_the_scheduler_has_the_options_of_dasks_own_file():
+    with dask.config.set({"jobqueue.slurm.scheduler-options": {"port": 0, "host": "127.0.0.2"}}):
+        assert "tcp://127.0.0.2:" in job_script_for(str(FOLDER / "slurm.yaml"))
 
 
 def test_a_dry_run_without_a_batch_system_is_one_line():
