@@ -276,6 +276,15 @@ def test_a_flight_read_as_declared_raises_no_doubt(seed: int) -> None:
     assert correct_frames(flown_at_random(seed), {})[1] == ()
 
 
+def test_a_vehicle_that_shakes_raises_no_doubt_of_its_gyro() -> None:
+    quick, still = 2.0 * np.pi * 15.0, np.zeros((len(TIME), 3))
+    pitch = np.outer(0.014 * np.sin(quick * TIME), [0.0, 1.0, 0.0])
+    rate = np.outer(0.014 * quick * np.cos(quick * TIME), [0.0, 1.0, 0.0])
+    attitude = Rotation.from_rotvec(pitch).as_quat(scalar_first=True)
+    signals = {"position": still, "attitude": attitude, "body_rate": rate}
+    assert correct_frames({n: Series(TIME, v) for n, v in signals.items()}, {})[1] == ()
+
+
 def test_a_moment_is_no_certainty() -> None:
     assert contradiction(circle(np.pi), (Mission(0.0, 4.0, "the first command"),)) is None
     assert contradiction(circle(np.pi), ()) is None
