@@ -65,7 +65,7 @@ EFFECTS = (
     "derivative_filter",
 )
 """As they are drawn: a seed's effect goes with their order."""
-UNKNOWN = ("rotor_damage", "translational_lift", "attitude_gain", "derivative_filter")
+UNKNOWN = ("rotor_damage", "translational_lift", "derivative_filter")
 KNOWN = tuple(name for name in EFFECTS if name not in UNKNOWN)
 """Groups of terms."""
 CHOICE = os.environ.get("TUNE_LAB_EFFECT", "drawn")
@@ -86,8 +86,8 @@ class Effect:
     size
         Of what this project's simulator does not fly: share of its thrust that a rotor loses; s of
         the filter through which rotor speeds went before they were logged; gain of thrust per
-        squared air velocity across the rotors, s²/m²; factor on the attitude controller's time
-        constant, or on the cutoff of the filter of the differentiated rate.
+        squared air velocity across the rotors, s²/m²; factor on the cutoff of the filter of the
+        differentiated rate.
     rotor, flight, begin
         Which rotor loses thrust, in which flight, from which s on.
     several
@@ -145,6 +145,7 @@ def effect_of(seed: int, *, seconds: float, flights: int, log_rate: float) -> Ef
         begin=float(random.uniform(0.4, 0.8) * seconds),
     )
     kept = _kept(sizes["tachometer_lag"], log_rate)
+    values["attitude_gain"] = {"attitude_gain": 1.0 / sizes.pop("attitude_gain")}
     values["integral_gain"] = {"integral_gain": sizes.pop("integral_gain")}
     values["gyro_filter"] = {"gyro_cutoff_factor": sizes.pop("gyro_filter")}
     late = kept / (1.0 - kept) / log_rate
@@ -175,9 +176,6 @@ def _kept(seconds: float, rate: float) -> float:
 def controller_with(effect: Effect, file: ControllerFile) -> ControllerFile:
     """Return the controller that flies, which is not the file's."""
     for part in effect.each:
-        if part.name == "attitude_gain":
-            slower = part.size * file.attitude.time_constant
-            file = file.replace(attitude=file.attitude.replace(time_constant=slower))
         if part.name == "derivative_filter":
             cutoff = part.size * (file.filters.dgyro_cutoff or 0.0)
             file = file.replace(filters=file.filters.replace(dgyro_cutoff=cutoff))

@@ -88,18 +88,20 @@ def with_gains_of(controller: Controller, vehicle: Vehicle) -> Controller:
     """Return the controller that flies a vehicle whose effects say how it differs from its file.
 
     K of the rates is times ``rate_gain_roll_pitch`` and ``rate_gain_yaw``, I times
-    ``integral_gain``, the gyro filter's cut-off times ``gyro_cutoff_factor``: parameters that were
-    changed since, or scaled by an autotune or by the battery (PX4 MC_BAT_SCALE_EN).
+    ``integral_gain``, the gyro filter's cut-off times ``gyro_cutoff_factor``, the attitude's gain
+    times ``attitude_gain``: parameters that were changed since, or scaled by an autotune or by the
+    battery (PX4 MC_BAT_SCALE_EN).
     """
     names = ("rate_gain_roll_pitch", "rate_gain_yaw", "integral_gain", "gyro_cutoff_factor")
-    if not vehicle.effects.keys() & set(names):
+    if not vehicle.effects.keys() & {*names, "attitude_gain"}:
         return controller
     across, about, integral, filtered = (vehicle.effects.get(name, 1.0) for name in names)
     rate, cutoff = controller.rate, controller.filters.gyro_cutoff
     changed: Controller = eqx.tree_at(
-        lambda c: (c.rate.k, c.rate.i, c.filters.gyro_cutoff),
+        lambda c: (c.attitude.time_constant, c.rate.k, c.rate.i, c.filters.gyro_cutoff),
         controller,
         (
+            controller.attitude.time_constant / vehicle.effects.get("attitude_gain", 1.0),
             Vec3(rate.k.x * across, rate.k.y * across, rate.k.z * about),
             rate.i * integral,
             None if cutoff is None else cutoff * filtered,

@@ -293,6 +293,10 @@ def _gyro_filter(numbers: Numbers) -> str:
     return f"The gyro's low-pass filter cuts off {excess} than in the controller file."
 
 
+def _attitude_gain(numbers: Numbers) -> str:
+    return f"The attitude controller's gain is {_excess(numbers, 'attitude_gain')} than its file's."
+
+
 def _autopilot_tilt(numbers: Numbers) -> str:
     parts = [
         f"{math.degrees(numbers[name]):+.2f} ± {math.degrees(numbers[f'{name}_error']):.2f}° "
@@ -350,6 +354,10 @@ TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
         "Compare it with the autopilot's parameters (MC_ROLLRATE_I, MC_PITCHRATE_I, MC_YAWRATE_I).",
     ),
     "gyro_filter": (_gyro_filter, "Compare it with the autopilot's IMU_GYRO_CUTOFF."),
+    "attitude_gain": (
+        _attitude_gain,
+        "Compare it with the autopilot's parameters (MC_ROLL_P, MC_PITCH_P).",
+    ),
     "autopilot_tilt": (
         _autopilot_tilt,
         "Mount it straight, or calibrate its level (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF).",

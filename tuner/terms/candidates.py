@@ -13,6 +13,7 @@ import numpy as np
 from tuner.config import JobFile
 from tuner.core.numerics import Array, scaled_solve, symmetric_eigen
 from tuner.objective.criterion import Point
+from tuner.objective.inlets import bypassed_by
 from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.objective.space import Space, extended
 from tuner.search.continuation import RIDGE
@@ -31,9 +32,9 @@ PRIOR_PRESENCE_OF_LUMPED = 0.1
 
 
 def candidate_groups(job: Job) -> Groups:
-    """Return the groups none of whose coefficients is given, free or fixed."""
+    """Return the groups that act, none of whose coefficients is given, free or fixed."""
     values, groups = values_of(job.settings.vehicle), term_groups()
-    taken = {*job.space.free, *job.settings.job.fixed}
+    taken = {*job.space.free, *job.settings.job.fixed, *bypassed_by(job.inlets, job.fitted)}
     return {
         group: names
         for group, names in groups.items()

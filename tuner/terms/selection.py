@@ -160,7 +160,9 @@ class Selection:
             f"{len(groups)} groups of terms, to see which can go."
         )
         trial = self._pruned(self._refitted(base, groups, anew=True))
-        if trial.added and self._predicts_better(trial, base, by_flight=True):
+        reasons = [self._score(trial, group).reason for group in trial.added]
+        by_flight = SelectionCode.PREDICTS_FLIGHTS in reasons
+        if trial.added and self._predicts_better(trial, base, by_flight=by_flight):
             return trial
         return None
 

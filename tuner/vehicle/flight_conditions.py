@@ -161,6 +161,15 @@ SURROUNDING_ROWS = (
         bounds=3.0,
         prior_sd=0.3,
     ),
+    _factor(
+        "attitude_gain",
+        "gain of the attitude controller over that of its file",
+        "PX4 MC_ROLL_P, MC_PITCH_P; parameters changed since",
+        group="attitude_gain",
+        part="estimate",
+        bounds=2.0,
+        prior_sd=0.1,
+    ),
     Coefficient(
         name="tachometer_lag",
         unit="s",
