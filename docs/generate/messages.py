@@ -117,8 +117,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "before it: they were filtered, or are stamped otherwise than the gyro. Intervals hold what "
     "that moves.",
     Code.TERM_SHOWS: "A term that was found says something of the vehicle or its files: thrust "
-    "grows with another power of the rotor speed than the second, the rate controller's gains are "
-    "not those of the file, the autopilot sits askew, or its gyro's scale is off.",
+    "grows with another power of the rotor speed than the second, motors have a second lag, gains "
+    "or filters are not those of the controller file, the autopilot sits askew, its gyro's scale "
+    "is off, or rotor speeds were filtered. The line says by how much, and what to compare.",
     Code.ROTOR_CHANGED: "From some time of this flight a rotor gives less, or more, thrust at the "
     "same speed than before: the flight is used up to there. Look at its propeller, motor and "
     "mount before you fly again.",
@@ -127,6 +128,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "often as the rate loop runs.",
     Code.SETPOINTS_SCALED: "The recorded rate set-points are a multiple of the controller file's. "
     "Check its gains and its attitude.law.",
+    Code.SETPOINTS_BIASED: "Recorded rate set-points are off the controller file's by a constant, "
+    "as where the recorded attitude is tilted against the one that was controlled. Check how the "
+    "motion capture's rigid body is aligned with the vehicle (marker_tilt).",
     Code.SETPOINTS_FOREIGN: "Another controller flew, or another reference: the recorded rate "
     "set-points do not follow from reference, state and controller file. Give the controller that "
     "flew (--controller), or enter below it (inlet: body_rate).",

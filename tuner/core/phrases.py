@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import StrEnum
 from typing import Any, Self
+
+MIN_ERROR = 1e-9
+"""Least error whose first digit is shown."""
 
 
 class Worded(StrEnum):
@@ -50,6 +54,12 @@ def quantity(value: float, unit: str | None) -> str:
     if unit == "s":
         value, unit = 1e3 * value, "ms"
     return f"{value:.2g} {unit}".strip()
+
+
+def with_error(value: float, error: float) -> str:
+    """Return "value ± error", both to the first digit of the error."""
+    digits = max(-math.floor(math.log10(max(error, MIN_ERROR))), 0)
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def clause(sentence: str) -> str:

@@ -202,9 +202,9 @@ class Code(Worded):
         "Check the stamps of pose and set-points; the fit takes it for estimate_latency.",
     )
     SETPOINTS_BIASED = (
-        "setpoints_biased",  # bias (rad/s); names: the axis
-        "The recorded {first} rate set-points are {bias:+.3f} rad/s off the controller file's.",
-        "",
+        "setpoints_biased",  # axis -> bias (rad/s)
+        sentences.setpoints_biased,
+        "Check how the motion capture's rigid body is aligned with the vehicle (marker_tilt).",
     )
     SETPOINTS_FOREIGN = (
         "setpoints_foreign",  # axis -> correlation
@@ -285,10 +285,10 @@ class Code(Worded):
     SEES_MARKERS = (
         "sees_markers",  # seen: 1 if position and attitude control see them, else 0
         (
-            "The recordings agree with controllers that see {frame}, not with the controller "
-            "file's. The fit simulated the ones that agree."
+            "Position and attitude control saw {frame}, as recordings show, and not what the "
+            "controller file has them see. The fit simulates what they saw."
         ),
-        "Set sensing.sees_markers: {seen_flag} (in the controller file).",
+        "Set sensing.sees_markers: {seen_flag} in the controller file.",
     )
     CLOCK_OFFSET = (
         "clock_offset",  # seconds; names: the clock
@@ -644,7 +644,7 @@ def _placeholders(finding: Finding) -> dict[str, object]:
     )
     values |= {"mixer": mixer, "flag": str(feedback).lower()}
     seen = bool(numbers.get("seen"))
-    frame = "that frame" if seen else "the centre of mass and the body's axes"
+    frame = "the markers' frame" if seen else "the centre of mass and the body's axes"
     values |= {"frame": frame, "seen_flag": str(seen).lower()}
     lower = "ended lower, and its result was kept" if numbers.get("changed") else "ended no lower"
     return values | {"second_search": f"CMA-ES then searched more widely and {lower}"}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from tuner.core.phrases import as_sentence, listed, percent
+from tuner.core.phrases import as_sentence, listed, percent, with_error
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode, damage_sentence, note_in_words
 
 if TYPE_CHECKING:
@@ -124,6 +124,15 @@ def setpoints_scaled(finding: Finding) -> str:
     return f"{axis.capitalize()} rate set-points are {factor} times the controller file's{so}."
 
 
+def setpoints_biased(finding: Finding) -> str:
+    """Return by how much the rate set-points of each axis are off."""
+    off = listed([f"{bias:+.3f} rad/s in {axis}" for axis, bias in finding.numbers.items()])
+    return (
+        f"Recorded rate set-points are off the controller file's by {off}, as where the recorded "
+        "attitude is tilted against the one that was controlled."
+    )
+
+
 def setpoints_foreign(finding: Finding) -> str:
     """Return on which axes set-points do not follow."""
     alike = " and ".join(f"{value:.2f} in {axis}" for axis, value in finding.numbers.items())
@@ -190,17 +199,18 @@ def missing_law(finding: Finding) -> str:
     share = finding.numbers["share"]
     if feature == "rotor_speed":
         slower = "less" if share < 0.0 else "more"
-        law = f"thrust grows {slower} with rotor speed than its law has it"
+        law = f"thrust that grows {slower} with rotor speed than its law has it"
     else:
         goes = "against" if share < 0.0 else "with"
         kind = "force along" if what == "force" else "moment about"
         with_what = FEATURE_PHRASES[feature]
         if feature == "airspeed_across" and axis == "force_z":
-            with_what = "the square of the airspeed across it"
-        law = f"there is a {kind} body {along} that goes {goes} {with_what}"
+            lift = ", as translational lift does" if share > 0.0 else ""
+            with_what = f"the square of the airspeed across it{lift}"
+        law = f"a {kind} body {along} that goes {goes} {with_what}"
     return (
-        f"Recorded accelerations hold what the model does not: {law}, of {percent(abs(share))} of "
-        f"what varies there. It may have moved {listed(moved)}, whose intervals hold that."
+        f"The model lacks {law}: it makes {percent(abs(share))} of what varies there in the "
+        f"recorded accelerations. It may have moved {listed(moved)}, whose intervals hold that."
     )
 
 
@@ -210,7 +220,7 @@ def missing_law_remedy(finding: Finding) -> str:
     terms = TERMS_OF_LAW.get((axis[:-2], feature))
     if terms is None:
         return "No term has that law: judge the fit by the held-out flights."
-    return f"Of that kind are {listed(terms)}: name what the vehicle has under terms in the job."
+    return f"Name under terms in the job what of that kind the vehicle has: {listed(terms)}."
 
 
 def controller_gains_differ(finding: Finding) -> str:
@@ -219,8 +229,7 @@ def controller_gains_differ(finding: Finding) -> str:
     numbers = finding.numbers
     if part == "late":
         parts = [
-            f"{axis} answers its gyro {1e3 * abs(numbers[axis]):.2g} ± "
-            f"{1e3 * numbers[f'{axis}_error']:.1g} ms "
+            f"{axis} answers its gyro {_milliseconds(numbers, axis)} "
             f"{'later' if numbers[axis] > 0.0 else 'earlier'}"
             for axis in axes
         ]
@@ -260,18 +269,15 @@ def _thrust_exponent(numbers: Numbers) -> str:
     value, error = numbers["thrust_exponent"], numbers["thrust_exponent_error"]
     slower = "slower" if value < 2.0 else "faster"
     return (
-        f"Thrust and drag torque grow as the rotor speed to the power {value:.3g} ± {error:.1g}, "
+        f"Thrust and drag torque grow as the rotor speed to the power {with_error(value, error)}, "
         f"{slower} than with its square."
     )
 
 
 def _motor_lag(numbers: Numbers) -> str:
-    value, error = numbers["time_constant_second"], numbers["time_constant_second_error"]
-    before = "a second lag" if value > 0.0 else "a lead"
-    return (
-        f"Rotors follow as if {before} of {1e3 * abs(value):.2g} ± {1e3 * error:.1g} ms stood "
-        "before their own."
-    )
+    before = "a second lag" if numbers["time_constant_second"] > 0.0 else "a lead"
+    of = _milliseconds(numbers, "time_constant_second")
+    return f"Rotors follow as if {before} of {of} stood before their own."
 
 
 def _rate_gain(numbers: Numbers) -> str:
@@ -285,7 +291,8 @@ def _rate_gain(numbers: Numbers) -> str:
 
 
 def _integral_gain(numbers: Numbers) -> str:
-    return f"The rate controller's I acts {_excess(numbers, 'integral_gain')} than its file's."
+    excess = _excess(numbers, "integral_gain")
+    return f"The rate controller's I is {excess} than in the controller file."
 
 
 def _gyro_filter(numbers: Numbers) -> str:
@@ -294,13 +301,14 @@ def _gyro_filter(numbers: Numbers) -> str:
 
 
 def _attitude_gain(numbers: Numbers) -> str:
-    return f"The attitude controller's gain is {_excess(numbers, 'attitude_gain')} than its file's."
+    excess = _excess(numbers, "attitude_gain")
+    return f"The attitude controller's gain is {excess} than in the controller file."
 
 
 def _autopilot_tilt(numbers: Numbers) -> str:
     parts = [
-        f"{math.degrees(numbers[name]):+.2f} ± {math.degrees(numbers[f'{name}_error']):.2f}° "
-        f"about the axis that points {axis}"
+        f"by {with_error(*(math.degrees(numbers[key]) for key in (name, f'{name}_error')))}° about "
+        f"the axis that points {axis}"
         for name, axis in (("autopilot_tilt_x", "forward"), ("autopilot_tilt_y", "left"))
         if name in numbers
     ]
@@ -310,15 +318,16 @@ def _autopilot_tilt(numbers: Numbers) -> str:
 def _gyro_scale(numbers: Numbers) -> str:
     axes = {"gyro_scale_x": "roll", "gyro_scale_y": "pitch", "gyro_scale_z": "yaw"}
     parts = [
-        f"in {axis} {_excess(numbers, name)}" for name, axis in axes.items() if name in numbers
+        f"{_excess(numbers, name, ('more', 'less'))} in {axis}"
+        for name, axis in axes.items()
+        if name in numbers
     ]
-    return f"The gyro's readings are {listed(parts)} than how the recorded attitude turns."
+    return f"The gyro reads {listed(parts)} than the recorded attitude turns."
 
 
 def _tachometer_lag(numbers: Numbers) -> str:
-    value, error = numbers["tachometer_lag"], numbers["tachometer_lag_error"]
-    late = f"{1e3 * abs(value):.2g} ± {1e3 * error:.1g} ms"
-    if value > 0.0:
+    late = _milliseconds(numbers, "tachometer_lag")
+    if numbers["tachometer_lag"] > 0.0:
         return (
             f"Recorded rotor speeds are {late} behind the rotors that turn the vehicle: they look "
             "filtered."
@@ -329,17 +338,21 @@ def _tachometer_lag(numbers: Numbers) -> str:
     )
 
 
-def _excess(numbers: Numbers, name: str) -> str:
+def _excess(numbers: Numbers, name: str, words: tuple[str, str] = ("higher", "lower")) -> str:
     """Return the difference of a factor from one, in percent with its standard error."""
-    more = 100.0 * (numbers[name] - 1.0)
-    error = 100.0 * numbers[f"{name}_error"]
-    return f"{abs(more):.2g} ± {error:.1g} % {'higher' if more > 0.0 else 'lower'}"
+    more, error = 100.0 * (numbers[name] - 1.0), 100.0 * numbers[f"{name}_error"]
+    return f"{with_error(abs(more), error)} % {words[more <= 0.0]}"
+
+
+def _milliseconds(numbers: Numbers, name: str) -> str:
+    """Return the size of a time in ms with its standard error."""
+    return f"{with_error(1e3 * abs(numbers[name]), 1e3 * numbers[f'{name}_error'])} ms"
 
 
 TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
     "thrust_exponent": (
         _thrust_exponent,
-        "A simulator without such a term has the right thrust at the hover alone.",
+        "Check it on a thrust stand; simulators without such a term are right at the hover alone.",
     ),
     "motor_lag": (
         _motor_lag,
@@ -356,7 +369,7 @@ TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
     "gyro_filter": (_gyro_filter, "Compare it with the autopilot's IMU_GYRO_CUTOFF."),
     "attitude_gain": (
         _attitude_gain,
-        "Compare it with the autopilot's parameters (MC_ROLL_P, MC_PITCH_P).",
+        "Compare attitude.time_constant with the controller that flew (MC_ROLL_P, MC_PITCH_P).",
     ),
     "autopilot_tilt": (
         _autopilot_tilt,
@@ -372,9 +385,9 @@ def flights_disagree(finding: Finding) -> str:
     """Return by how much another value of a coefficient some flights call for."""
     difference, (name,) = finding.numbers["difference"], finding.names
     return (
-        f"Flights disagree: these call for a {name} that is {100.0 * abs(difference):.2g} ± "
-        f"{100.0 * finding.numbers['error']:.1g} % {'higher' if difference > 0.0 else 'lower'} "
-        "than the others'."
+        f"Flights disagree: these call for a {name} that is "
+        f"{with_error(100.0 * abs(difference), 100.0 * finding.numbers['error'])} % "
+        f"{'higher' if difference > 0.0 else 'lower'} than the others'."
     )
 
 

@@ -135,7 +135,7 @@ def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Findi
             for name, axis in zip(AXES[:2], match.axes[:2], strict=True)
         }
         return (Finding(Code.SETPOINTS_FOREIGN, "warning", flight.name, correlations),)
-    findings = []
+    findings, biases = list[Finding](), dict[str, float]()
     for name, axis in zip(AXES, match.axes, strict=True):
         if axis.spread < MIN_SPREAD or axis.correlation < MIN_CORRELATION:
             continue
@@ -145,8 +145,9 @@ def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Findi
             names = (name, _guess(axis.gain, controller))
             findings.append(Finding(Code.SETPOINTS_SCALED, "warning", flight.name, numbers, names))
         elif abs(axis.bias) > MIN_REPORTED_BIAS:
-            numbers = {"bias": round(axis.bias, 3)}
-            findings.append(Finding(Code.SETPOINTS_BIASED, "info", flight.name, numbers, (name,)))
+            biases[name] = round(axis.bias, 3)
+    if biases:
+        findings.append(Finding(Code.SETPOINTS_BIASED, "info", flight.name, biases))
     if (
         match.delay > MIN_REPORTED_DELAY_S
         and max(axis.spread for axis in match.axes[:2]) > MIN_SPREAD

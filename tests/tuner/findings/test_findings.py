@@ -83,7 +83,7 @@ MADE = {
         {"gain": 2.0, "correlation": 0.98},
         ("roll", "rotation_matrix"),
     ),
-    Code.SETPOINTS_BIASED: Finding(Code.SETPOINTS_BIASED, "info", "a", {"bias": 0.08}, ("pitch",)),
+    Code.SETPOINTS_BIASED: Finding(Code.SETPOINTS_BIASED, "info", "a", {"pitch": 0.08}),
     Code.SETPOINTS_LATE: Finding(Code.SETPOINTS_LATE, "info", "a", {"seconds": 0.06}),
     Code.SETPOINTS_FOREIGN: Finding(
         Code.SETPOINTS_FOREIGN, "warning", "a", {"roll": 0.1, "pitch": 0.2}
@@ -276,6 +276,8 @@ def test_numbers_stand_in_the_unit_that_people_use():
     assert "-12.00 ms late" in sentence(MADE[Code.CLOCK_OFFSET])
     assert "flight controller clock" in sentence(MADE[Code.CLOCK_OFFSET])
     assert "0.2 ms" in remedy(MADE[Code.FINER_THAN_STEPS])
+    assert "to the power 1.930 ± 0.004, slower" in sentence(MADE[Code.TERM_SHOWS])
+    assert "a motor_constant that is 1.90 ± 0.06 % lower" in sentence(MADE[Code.FLIGHTS_DISAGREE])
     assert "--fix mass" in remedy(MADE[Code.SINGULAR_DIRECTION])
     assert "CMA-ES then searched more widely and ended lower" in sentence(
         MADE[Code.STARTS_DISAGREE]
@@ -285,7 +287,7 @@ def test_numbers_stand_in_the_unit_that_people_use():
 @pytest.mark.parametrize(
     ("lag", "says"),
     [
-        (0.015, "rotor speeds are 15 ± 0.8 ms behind the rotors that turn the vehicle"),
+        (0.015, "rotor speeds are 15.0 ± 0.8 ms behind the rotors that turn the vehicle"),
         (-0.0025, "turning comes 2.5 ± 0.8 ms later than recorded rotor speeds say: the gyro"),
     ],
 )
