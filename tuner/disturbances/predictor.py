@@ -47,7 +47,7 @@ from tuner.objective.inlets import INLETS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.recordings.flight import Flight
-from tuner.vehicle.model import coefficients_in, with_terms_computed
+from tuner.vehicle.model import Model, coefficients_in, with_terms_computed
 
 PARAMETERS_AT_ONCE = 16
 """Number of parameters differentiated by at a time."""
@@ -336,7 +336,7 @@ class Predictor:
         error -> the problem simulated with it changed; gains stay. Derivatives by the strengths
         (`Slopes.moved`) are changes, too: see `with_strengths`.
         """
-        moved = np.flatnonzero(~hidden_by_setpoints(objective.space.names))
+        moved = np.flatnonzero(~hidden_by_setpoints(objective.space.names, objective.model))
         offsets = np.arange(len(point.offsets)) + len(objective.space)
         own = Point(point.coefficients, self.inputs.offsets)
 
@@ -487,17 +487,22 @@ def slopes_of(here: Filtered, beside: Iterable[Filtered], steps: Array) -> Slope
     return Slopes(slope, sum(part @ part.T for part in flat), moves)
 
 
-def hidden_by_setpoints(names: Sequence[str]) -> NDArray[np.bool_]:
+def hidden_by_setpoints(names: Sequence[str], model: Model) -> NDArray[np.bool_]:
     """Return (K,) which coefficients act upstream of recorded set-points, without effect here.
 
-    And the markers' height: a closed loop holds its height to the millimetre, whereas a filter
-    starts at the height of the first sample.
+    And the markers' height, where the loop holds that of the centre of mass: to the millimetre,
+    whereas a filter starts at the height of the first sample. A loop that sees the markers holds
+    their own height, which then says nothing of where they sit.
     """
-    return np.isin(names, [*INLETS["body_rate"].bypasses, "marker_offset_z"])
+    height = [] if float(model.controller.sees_markers) > 0.5 else ["marker_offset_z"]
+    return np.isin(names, [*INLETS["body_rate"].bypasses, *height])
 
 
 def with_hidden_coefficients(
-    predicted: FisherInformation, looped: FisherInformation, names: Sequence[str], fitted: int
+    predicted: FisherInformation,
+    looped: FisherInformation,
+    upstream: NDArray[np.bool_],
+    fitted: int,
 ) -> FisherInformation:
     """Return the information of innovations, with least squares' of coefficients hidden from them.
 
@@ -508,13 +513,12 @@ def with_hidden_coefficients(
     ----------
     predicted, looped
         Information of innovations, and of the closed-loop simulation, in the same channels.
-    names, fitted
-        The K coefficients, and how many of them, the first, were fitted.
+    upstream, fitted
+        (K,) which coefficients are hidden, and how many of them, the first, were fitted.
     """
-    upstream = hidden_by_setpoints(names)
     others = np.flatnonzero(~upstream[:fitted])
     upper = looped.total[np.ix_(others, np.flatnonzero(upstream))]
-    clear = np.eye(len(names))
+    clear = np.eye(len(upstream))
     clear[np.ix_(np.flatnonzero(upstream), others)] = -scaled_solve(
         looped.total[np.ix_(others, others)], upper
     ).T

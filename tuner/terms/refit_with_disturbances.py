@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
@@ -256,7 +257,8 @@ def _fit_innovations(
     moves = np.isin(names, full.fitted) & ~np.isin(names, list(fitted.held.values()))
     offsets = free_offsets(job)
     enter = offsets & (np.arange(len(offsets)) != FLIGHT_CONTROLLER)[:, None]
-    free = np.concatenate([moves & ~hidden_by_setpoints(names), enter.ravel()])
+    seen = ~hidden_by_setpoints(names, full.objective.model)
+    free = np.concatenate([moves & seen, enter.ravel()])
     problem = full.objective, point, fitted.criterion
     predictor, point = maximise_likelihood(predictor, job.fitted, problem, free, steps)
     return replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)), predictor
@@ -530,7 +532,7 @@ class LinearisedInnovations:
             row.group: row.names
             for row in self.selected.rows
             if row.reason in (ACCEPTED if row.kept else REJECTED_BY_LEAST_SQUARES)
-            and not hidden_by_setpoints(row.names).any()
+            and not self._hidden(row.names).any()
             and not set(row.names) & set(condition_rows())
             and all(COEFFICIENTS[name].begin is None for name in row.names)
         }
@@ -547,8 +549,11 @@ class LinearisedInnovations:
         return self._columns([name for name in names if name not in self.fitted.held])
 
     def _columns(self, names: Sequence[str]) -> Columns:
-        seen = ~hidden_by_setpoints(self.space.names)
+        seen = ~self._hidden(self.space.names)
         return np.flatnonzero(np.isin(self.space.names, list(names)) & seen)
+
+    def _hidden(self, names: Sequence[str]) -> NDArray[np.bool_]:
+        return hidden_by_setpoints(names, self.fitted.objective.model)
 
 
 def groups_left_out(selected: Selected) -> Groups:

@@ -66,7 +66,7 @@ def flights_disagree(fitted: Fitted, examination: Examination) -> tuple[Finding,
     names = uncertainty.names
     information = examination.information.about(np.arange(len(names)))
     followed = any(finding.code is Code.DISTURBANCES_FOLLOWED for finding in fitted.findings)
-    hidden = hidden_by_setpoints(names) & followed
+    hidden = hidden_by_setpoints(names, fitted.objective.model) & followed
     searched = [i for i, name in enumerate(names) if name not in fitted.held and not hidden[i]]
     splits = _splits(information, searched, len(uncertainty.flights))
     if not splits:

@@ -10,7 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Z95, Array, scaled_solve
-from tuner.disturbances.predictor import Predictor, with_hidden_coefficients, with_strengths
+from tuner.disturbances.predictor import (
+    Predictor,
+    hidden_by_setpoints,
+    with_hidden_coefficients,
+    with_strengths,
+)
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.normal_equations import Objective, flight_batch, flight_batches
@@ -126,7 +131,7 @@ def examine(
                 FisherInformation.joined(predicted), slopes.information, predictor.strengths
             ),
             information,
-            objective.space.names,
+            hidden_by_setpoints(objective.space.names, objective.model),
             len(full_problem.fitted),
         )
     gains = {} if model_errors is None else model_errors.gains

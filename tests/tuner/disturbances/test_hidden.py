@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from tests.tuner.uncertainty import making
 from tuner.disturbances.disturbances import MAX_STRENGTHS, MIN_STRENGTHS, STRENGTHS
 from tuner.disturbances.predictor import (
     hidden_by_setpoints,
@@ -14,10 +16,13 @@ from tuner.disturbances.predictor import (
 )
 from tuner.objective.information import Change, FisherInformation
 from tuner.uncertainty.estimates import _shares
+from tuner.vehicle import ControllerFile
+from tuner.vehicle.model import model_of
 
 NAMES = ("inertia_xx", "estimate_latency", "motor_constant", "moment_constant")
 FITTED, HIDDEN = 3, 1
 """The last one is fixed: what is known of it does not count."""
+UPSTREAM = np.arange(len(NAMES)) == HIDDEN
 
 
 def looped() -> FisherInformation:
@@ -47,7 +52,7 @@ def predicted() -> FisherInformation:
 
 
 def test_its_error_is_that_of_least_squares_with_all_others_free():
-    joined = with_hidden_coefficients(predicted(), looped(), NAMES, FITTED)
+    joined = with_hidden_coefficients(predicted(), looped(), UPSTREAM, FITTED)
     own = np.linalg.inv(joined.total[:FITTED, :FITTED])[HIDDEN, HIDDEN]
     beside = np.linalg.inv(looped().total[:FITTED, :FITTED])[HIDDEN, HIDDEN]
     # the prior of the others counts for a little of what they leave
@@ -55,7 +60,7 @@ def test_its_error_is_that_of_least_squares_with_all_others_free():
 
 
 def test_what_innovations_say_of_the_others_stays():
-    joined, others = with_hidden_coefficients(predicted(), looped(), NAMES, FITTED), [0, 2, 3]
+    joined, others = with_hidden_coefficients(predicted(), looped(), UPSTREAM, FITTED), [0, 2, 3]
     np.testing.assert_array_equal(
         joined.blocks[..., others, :][..., others], predicted().blocks[..., others, :][..., others]
     )
@@ -63,9 +68,13 @@ def test_what_innovations_say_of_the_others_stays():
     np.testing.assert_array_equal(joined.score[..., others], predicted().score[..., others])
 
 
-def test_how_high_markers_sit_is_told_by_the_loop_alone():
+@pytest.mark.parametrize("sees_markers", [False, True])
+def test_a_loop_tells_how_high_markers_sit_if_it_does_not_see_them(sees_markers: bool) -> None:
+    file = ControllerFile()
+    file = file.replace(sensing=file.sensing.replace(sees_markers=sees_markers))
     names = ("inertia_xx", "estimate_latency", "marker_offset_x", "marker_offset_z")
-    assert hidden_by_setpoints(names).tolist() == [False, True, False, True]
+    hidden = hidden_by_setpoints(names, model_of(making.vehicle_file(), file))
+    assert hidden.tolist() == [False, True, False, not sees_markers]
 
 
 def test_what_strengths_take_is_taken_from_the_flights_and_shares_still_add_up() -> None:

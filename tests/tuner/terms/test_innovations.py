@@ -29,6 +29,7 @@ USUAL = {
     "fuselage_drag": COEFFICIENTS["fuselage_drag"].prior_sd,
     "thrust_inflow_coefficient": COEFFICIENTS["thrust_inflow_coefficient"].prior_sd,
 }
+MARKERS_UNSEEN = SimpleNamespace(controller=SimpleNamespace(sees_markers=0.0))
 STEPS, STRETCHES, FLIGHTS = 50, 40, 4
 TOLD = 10.0
 """By how many of a row's noise a usual coefficient moves a row."""
@@ -91,7 +92,11 @@ def seen(
     loss = 0.5 * FLIGHTS * STRETCHES * STEPS
     fitted = cast(
         Fitted,
-        SimpleNamespace(objective=SimpleNamespace(space=wide_space(kept)), held={}, findings=()),
+        SimpleNamespace(
+            objective=SimpleNamespace(space=wide_space(kept), model=MARKERS_UNSEEN),
+            held={},
+            findings=(),
+        ),
     )
     base = (NOBODY, NOBODY)
     selected = Selected(cast(Job, NOBODY), fitted, tuple(rows), selection_shifts or {}, base)

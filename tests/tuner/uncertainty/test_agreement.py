@@ -54,7 +54,9 @@ def fit_of(
     examination = SimpleNamespace(
         uncertainty=uncertainty, information=information, model_errors=None
     )
-    return SimpleNamespace(findings=(), held={}), examination
+    controller = SimpleNamespace(sees_markers=0.0)
+    objective = SimpleNamespace(model=SimpleNamespace(controller=controller))
+    return SimpleNamespace(findings=(), held={}, objective=objective), examination
 
 
 def test_flights_of_another_vehicle_are_named_with_the_coefficient():
