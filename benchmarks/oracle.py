@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -94,7 +95,9 @@ def simulate_like(
         None where a flight crashed.
     """
     model = objective.model_at(vector)
-    pushing = _air(objective, model, random) if gusts else None
+    pushing = _air(objective, model, random if gusts else np.random.default_rng(0))
+    if not gusts:  # one program flies both
+        pushing = jax.tree.map(jnp.zeros_like, pushing)
     flown = objective
     if log_voltage is not None:
         segments = replace(objective.segments, log_voltage=jnp.asarray(log_voltage))

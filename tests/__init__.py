@@ -13,13 +13,19 @@ program does (``TUNE_TESTS_OPTIMISED``).
 """
 
 import os
-
-from beartype import BeartypeConf, beartype
+from typing import Any
 
 from tuner.core.disk import cache_folder
 from tuner.core.runtime import collect_rarely, set_environment
 
-checked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int passes for a float
+
+def __getattr__(name: str) -> Any:
+    if name != "checked":
+        raise AttributeError(name)
+    from beartype import BeartypeConf, beartype  # noqa: PLC0415 (tests' child processes need none)
+
+    return beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int passes for a float
+
 
 if not os.environ.get("TUNE_TESTS_OPTIMISED"):
     cheap = (

@@ -5,6 +5,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -20,9 +21,11 @@ from benchmarks.lab_flights import (
     ROTORS,
     SECONDS,
     UNKNOWN,
+    Beyond,
     Effect,
     drawn,
     effect_of,
+    inlet_with,
 )
 from sim_jax.constants import GRAVITY
 from sim_jax.schedule import Schedule
@@ -78,6 +81,16 @@ def test_several_effects_are_two_or_three_of_them(monkeypatch):
         assert {g for g in drawn(seed, effect).groups if g in KNOWN} == {*names} & {*KNOWN}
 
 
+def with_all(effect, inlet):
+    """Return an inlet with what it lacks at neutral values, so that one program flies them all."""
+    made = inlet_with(effect, inlet)
+    usual = {"loss": jnp.zeros((ROTORS, len(inlet.spins))), "begin": jnp.asarray(0.0)}
+    usual["lift"] = jnp.asarray(0.0)
+    given = {name: getattr(made, name, None) for name in usual}
+    beyond = {name: usual[name] if own is None else own for name, own in given.items()}
+    return Beyond(inlet.points, inlet.spins, inlet.yaw_rate, inlet.level_held, **beyond)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_what_no_coefficient_describes_changes_the_recordings(monkeypatch, tmp_path, name):
@@ -86,6 +99,7 @@ def test_what_no_coefficient_describes_changes_the_recordings(monkeypatch, tmp_p
     monkeypatch.setattr(lab_flights, "METER", 0.0)
     monkeypatch.setattr(lab_flights, "PHYSICS", 400)
     monkeypatch.setattr(lab_flights, "SAGS", 1)
+    monkeypatch.setattr(lab_flights, "inlet_with", with_all)
     effect = effect_of(0, seconds=SECONDS, flights=3, log_rate=100.0)
     flown = []
     monkeypatch.setattr(lab_flights, "write_bag", lambda simulation, _: flown.append(simulation))
