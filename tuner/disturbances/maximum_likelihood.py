@@ -143,7 +143,7 @@ def _equations(
     size = count + kinds
     by_kind = free[count:].reshape(kinds, flights).any(axis=1)
     moved = [*np.flatnonzero(free[:count]), *(count + np.flatnonzero(by_kind))]
-    slope, information, moves = predictor.slopes(objective, point)
+    slope, information, moves, _ = predictor.slopes(objective, point)
     by_strengths = samples_of_ticks(moves, predictor.inputs.widths, predictor.rows)
     del moves  # derivatives take most of the memory
     jacobian = predictor.jacobian(objective, point, moved)

@@ -174,26 +174,50 @@ class Predictor:
         share = np.count_nonzero(whole[:some]) / max(int(np.count_nonzero(whole)), 1)
         steps = difference_steps(self.strengths)
         here = self.found.first(some)
-        slope, information, moved = slopes_of(
-            here, self._with_steps(objective, point, steps, some), steps
+        strengths = self.strengths[:, None] + np.diag(steps)
+        slope, information, moved, sizes = slopes_of(
+            here, self._with_strengths(objective, point, strengths, some), steps
         )
         ticks = np.zeros((len(moved), *whole.shape))
         np.divide(moved, share, out=ticks[:, :some])
-        return Slopes(slope / share, information / share, ticks)
+        return Slopes(slope / share, information / share, ticks, sizes / share)
 
-    def _with_steps(
-        self, objective: Objective, point: Point, steps: Array, ticks: int
+    def coupling(self, objective: Objective, point: Point, sizes: Array) -> Array:
+        """Return (7, P) what the sizes of innovations say of strengths and coefficients together.
+
+        Strengths are forces and moments; innovations show the accelerations, by mass and moments
+        of inertia. So an error of these makes an error of the strengths.
+
+        Parameters
+        ----------
+        objective, point
+            As of `slopes`.
+        sizes
+            `Slopes.sizes` there.
+        """
+        assert self.found is not None
+        ticks, names = sizes.shape[1], objective.space.names
+        here, vector = self.found.first(ticks), np.asarray(point.coefficients)
+        coupling = np.zeros((len(sizes), len(names)))
+        for index in np.flatnonzero(np.isin(names, ACCELERATED)):
+            moved = vector + STEP * (np.arange(len(names)) == index) / objective.space.slope(vector)
+            beside = Point(moved, point.offsets)
+            (there,) = self._with_strengths(objective, beside, self.strengths[:, None], ticks)
+            coupling[:, index] = np.tensordot(sizes, change_of_size(here, there, STEP), 3)
+        return coupling
+
+    def _with_strengths(
+        self, objective: Objective, point: Point, strengths: Array, ticks: int
     ) -> Iterator[Filtered]:
-        """Yield the filter's results for the first ticks with each strength a step away.
+        """Yield the filter's results for the first ticks with each column of strengths (7, n).
 
         Filters run side by side as far as they fill a kernel's block of segments.
         """
         count = self.inputs.offsets.shape[-1]
         inputs = self._inputs_at(point)
         samples = jax.tree.map(lambda rows: rows[:ticks], inputs.samples)
-        strengths = self.strengths[:, None] + np.diag(steps)
         together = max(SEGMENTS_AT_ONCE // count, 1)
-        for first in range(0, len(steps), together):
+        for first in range(0, strengths.shape[1], together):
             some = strengths[:, first : first + together]
             tiled = jax.tree.map(
                 lambda rows, times=some.shape[1]: np.tile(rows, times),
@@ -435,7 +459,9 @@ def unscaled(criterion: Criterion) -> Criterion:
 
 
 STEP = 0.02
-"""Step of a strength's logarithm in finite differences."""
+"""Step of a strength's logarithm, and of a scaled coefficient, in finite differences."""
+ACCELERATED = ("mass", "inertia_xx", "inertia_yy", "inertia_zz")
+"""Coefficients by which forces and moments of disturbances become accelerations."""
 
 
 class Slopes(NamedTuple):
@@ -449,11 +475,20 @@ class Slopes(NamedTuple):
         (7, 7) Fisher information.
     moved
         (7, T, m, F) derivatives of the innovations in units of their standard deviations.
+    sizes
+        (7, t, m, F) those of the logarithms of these standard deviations, times √2, in the ticks
+        that strengths are estimated from.
     """
 
     slope: Array
     information: Array
     moved: Array
+    sizes: Array
+
+
+def change_of_size(here: Filtered, there: Filtered, step: float) -> Array:
+    """Return the derivative of the innovations' sizes by a step, as of `Slopes.sizes`."""
+    return np.asarray(np.sqrt(0.5) * ((there.root / here.root) ** 2 - 1.0) / step)
 
 
 def difference_steps(strengths: Array) -> Array:
@@ -478,13 +513,13 @@ def slopes_of(here: Filtered, beside: Iterable[Filtered], steps: Array) -> Slope
     for number, (there, step) in enumerate(zip(beside, steps.tolist(), strict=True)):
         turn = there.root / here.root
         moves[number] = (turn * there.white - here.white) / step
-        spreads[number] = np.sqrt(0.5) * (turn**2 - 1.0) / step
+        spreads[number] = change_of_size(here, there, step)
         bend = np.sum(moves[number] ** 2) + np.sum(spreads[number] ** 2)
         slope[number] = (
             float(np.sum(there.loss)) - loss
         ) / step - 0.5 * step * bend  # where it begins
     flat = (part.reshape(len(steps), -1) for part in (moves, spreads))
-    return Slopes(slope, sum(part @ part.T for part in flat), moves)
+    return Slopes(slope, sum(part @ part.T for part in flat), moves, spreads)
 
 
 def hidden_by_setpoints(names: Sequence[str], model: Model) -> NDArray[np.bool_]:
@@ -538,7 +573,11 @@ def with_hidden_coefficients(
 
 
 def with_strengths(
-    information: FisherInformation, of_strengths: Array, strengths: Array
+    information: FisherInformation,
+    of_strengths: Array,
+    strengths: Array,
+    coupling: Array,
+    fitted: int,
 ) -> FisherInformation:
     """Return the information about coefficients with the strengths of disturbances eliminated.
 
@@ -546,6 +585,11 @@ def with_strengths(
     all, which trade off with the strength of turbulence. Elimination subtracts A B⁻¹ Aᵀ from the
     information of all flights, with A the information about both together and B that about the
     strengths.
+
+    Coefficients are fitted to innovations alone, strengths to their sizes, too, which also depend
+    on coefficients (`Predictor.coupling`, C). With E the information that elimination leaves, and
+    S = E - A B⁻¹ C, the covariance of such estimates is S⁻¹ E S⁻ᵀ (the sandwich of estimating
+    equations: Godambe, "An optimum property of regular maximum likelihood estimation", 1960).
 
     Parameters
     ----------
@@ -555,9 +599,18 @@ def with_strengths(
         (7, 7) B, the innovations' covariance included.
     strengths
         (7,) logarithms: one at its bound is fixed.
+    coupling, fitted
+        C (7, P), and how many of the P coefficients, the first, were fitted.
     """
     learnt = np.flatnonzero((strengths > MIN_STRENGTHS) & (strengths < MAX_STRENGTHS))
     changes = dict(information.changes)
     across = np.array([changes.pop(name).gradient for name in STRENGTHS])[learnt]
     own = of_strengths[np.ix_(learnt, learnt)] + np.eye(len(learnt)) / STRENGTH_PRIOR_SD**2
-    return replace(information, lost=across.T @ scaled_solve(own, across), changes=changes)
+    follow, coupled = scaled_solve(own, across), coupling[learnt]
+    lost = across.T @ follow
+    left, own_follow = (information.total - lost)[:fitted, :fitted], follow[:, :fitted]
+    both = follow.T @ coupled
+    lost = (
+        lost + both + both.T - coupled.T @ own_follow @ scaled_solve(left, own_follow.T) @ coupled
+    )
+    return replace(information, lost=lost, changes=changes)

@@ -103,7 +103,8 @@ def examine(
     informations, sensitivities, predicted = [], [], []
     slopes = None
     if predictor is not None:
-        slopes = predictor.slopes(objective, Point(point.coefficients, predictor.inputs.offsets))
+        at = Point(point.coefficients, predictor.inputs.offsets)
+        slopes = predictor.slopes(objective, at)
     residuals: list[Residual] = []
     for flights, batch in flight_batches(objective, point, criterion):
         flight_names = [names[number] for number in flights]
@@ -128,7 +129,11 @@ def examine(
     if predictor is not None and slopes is not None:
         information = with_hidden_coefficients(
             with_strengths(
-                FisherInformation.joined(predicted), slopes.information, predictor.strengths
+                FisherInformation.joined(predicted),
+                slopes.information,
+                predictor.strengths,
+                predictor.coupling(objective, at, slopes.sizes),
+                len(full_problem.fitted),
             ),
             information,
             hidden_by_setpoints(objective.space.names, objective.model),

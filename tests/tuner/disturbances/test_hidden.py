@@ -10,6 +10,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.disturbances.disturbances import MAX_STRENGTHS, MIN_STRENGTHS, STRENGTHS
 from tuner.disturbances.predictor import (
+    STRENGTH_PRIOR_SD,
     hidden_by_setpoints,
     with_hidden_coefficients,
     with_strengths,
@@ -77,19 +78,39 @@ def test_a_loop_tells_how_high_markers_sit_if_it_does_not_see_them(sees_markers:
     assert hidden.tolist() == [False, True, False, not sees_markers]
 
 
-def test_what_strengths_take_is_taken_from_the_flights_and_shares_still_add_up() -> None:
-    """Nothing of it counts as the priors'."""
-    random, said = np.random.default_rng(1), looped()
+def coupled_with_strengths(size: float) -> tuple[FisherInformation, FisherInformation, np.ndarray]:
+    """Return information without and with strengths eliminated, and the whole covariance."""
+    random, said, count = np.random.default_rng(1), looped(), len(STRENGTHS)
     nothing = np.zeros((1, 3, 1))
     across = {
         name: Change(5.0 * random.standard_normal((1, 3, 1, len(NAMES))), nothing, nothing)
         for name in STRENGTHS
     }
+    coupling = size * random.standard_normal((count, len(NAMES)))
     learnt = with_strengths(
         replace(said, changes=across),
-        100.0 * np.eye(len(STRENGTHS)),
+        100.0 * np.eye(count),
         0.5 * (MIN_STRENGTHS + MAX_STRENGTHS),
+        coupling,
+        len(NAMES),
     )
+    both = np.array([across[name].gradient for name in STRENGTHS])
+    own = (100.0 + STRENGTH_PRIOR_SD**-2) * np.eye(count)
+    scatter = np.block([[said.total, both.T], [both, own]])
+    slope = np.linalg.inv(np.block([[said.total, both.T], [both + coupling, own]]))
+    return said, learnt, slope @ scatter @ slope.T
+
+
+@pytest.mark.parametrize("size", [0.0, 30.0])
+def test_errors_are_those_of_innovations_and_their_sizes_as_equations(size: float) -> None:
+    _, learnt, covariance = coupled_with_strengths(size)
+    known = covariance[: len(NAMES), : len(NAMES)]
+    np.testing.assert_allclose(np.linalg.inv(learnt.total), known, rtol=1e-9, atol=1e-12)
+
+
+def test_what_strengths_take_is_taken_from_the_flights_and_shares_still_add_up() -> None:
+    """Nothing of it counts as the priors'."""
+    said, learnt, _ = coupled_with_strengths(0.0)
     assert not learnt.changes
     error, wider = (np.sqrt(np.diag(np.linalg.inv(i.total))) for i in (said, learnt))
     assert (wider > error).all()

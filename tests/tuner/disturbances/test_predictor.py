@@ -161,7 +161,8 @@ def test_errors_are_those_of_coefficients_and_strengths_that_are_learnt_together
     slopes, criterion = predictor.slopes(problem, point), making.fitted_of(problem, point).criterion
     fixed = predictor.information(problem, point, criterion)
     moving = predictor.information(problem, point, criterion, by_strengths=slopes.moved)
-    learnt = with_strengths(moving, slopes.information, predictor.strengths)
+    uncoupled = np.zeros((len(NAMED), len(FREE)))
+    learnt = with_strengths(moving, slopes.information, predictor.strengths, uncoupled, len(FREE))
     assert learnt.changes.keys() == fixed.changes.keys()
     alone, together = (np.linalg.inv(found.total) for found in (fixed, learnt))
     free = np.flatnonzero(
@@ -198,7 +199,8 @@ def test_an_examination_counts_that_strengths_are_learnt_of_all_flights_together
     at_once = examine(fit, predictor=predictor).information
     slopes = predictor.slopes(problem, point)
     moving = predictor.information(problem, point, fit.criterion, by_strengths=slopes.moved)
-    learnt = with_strengths(moving, slopes.information, predictor.strengths)
+    coupling = predictor.coupling(problem, point, slopes.sizes)
+    learnt = with_strengths(moving, slopes.information, predictor.strengths, coupling, len(FREE))
     lost = learnt.lost
     for found in (at_once, in_turns):
         known = found.lost[: len(FREE), : len(FREE)]
@@ -272,12 +274,24 @@ def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitt
 
     steps = difference_steps(predictor.strengths)
     beside = [alone(predictor.strengths + step) for step in np.diag(steps)]
-    slope, information, moved = slopes_of(alone(predictor.strengths), beside, steps)
+    slope, information, moved, _ = slopes_of(alone(predictor.strengths), beside, steps)
     found = predictor.slopes(problem, point)
     most = information.max()  # of commands, of which none were recorded, there is none
     np.testing.assert_allclose(found.slope, slope, atol=1e-6 * np.sqrt(most))
     np.testing.assert_allclose(found.information, information, atol=1e-6 * most)
     np.testing.assert_allclose(found.moved, moved, atol=1e-5 * np.abs(moved).max())
+
+
+def test_a_larger_inertia_and_a_stronger_turbulence_are_alike_in_sizes(fitted) -> None:
+    """Of flights in which only one axis turns fast, the other inertias are alike to strengths."""
+    problem, predictor, point = fitted
+    sizes = predictor.slopes(problem, point).sizes
+    coupling = predictor.coupling(problem, point, sizes)
+    own = np.sqrt(np.sum(sizes**2, axis=(1, 2, 3)))
+    turbulence = NAMED.index("turbulence")
+    of_inertias = coupling[turbulence, :2] / own[turbulence]
+    assert (of_inertias < -1.0).all()
+    assert not coupling[:, 2:].any()
 
 
 def test_noise_that_a_wrong_beginning_took_for_more_is_taken_back(fitted) -> None:

@@ -64,7 +64,7 @@ def test_the_likelihoods_slope_is_that_of_its_differences() -> None:
         (filtered(at + 1e-4 * axis).loss - filtered(at - 1e-4 * axis).loss) / 2e-4
         for axis in np.eye(7)
     ]
-    slope, information, _ = differenced(filtered, at)
+    slope, information, *_ = differenced(filtered, at)
     error = 1.0 / np.sqrt(np.diag(information))  # of a strength by itself
     np.testing.assert_allclose(slope * error, differences * error, atol=0.1)
 
