@@ -23,6 +23,7 @@ from tuner.recordings.clocks import lag_between
 from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import (
     body_rate_of,
+    both_known,
     correlation,
     derivative,
     middle_clock,
@@ -39,7 +40,6 @@ from tuner.recordings.unit_detection import (
     IN_WORLD_AXES,
     INVERSE,
     READINGS,
-    RawSeries,
     Reading,
     force_and_tilt,
     to_enu_flu,
@@ -207,8 +207,7 @@ def correct_frames(
         if reading is not None:
             measured = series[signal]
             values = reading.read(measured.values, on_clock(fixed, "attitude", measured.time))
-            known = np.isfinite(values).all(axis=1)
-            fixed[signal] = Series(measured.time[known], values[known])
+            fixed[signal] = replace(measured, values=values).complete()
             flown[signal] = on_clock(fixed, signal, clock)
             count, names = len(measured.time), (signal, reading.name)
             notes.append(Note(NoteCode.FRAME_TURNED, topic=topic, count=count, names=names))
@@ -295,9 +294,9 @@ def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
 
 def _residual_share(change: Array, recorded: Array) -> float:
     """Return the share of a change (n, 3) that is left after subtraction of the recorded one."""
-    known = np.isfinite(change).all(axis=1) & np.isfinite(recorded).all(axis=1)
-    size = rms(change[known])
-    return rms((change - recorded)[known]) / size if size > 0.0 else np.inf
+    change, recorded = both_known(change, recorded)
+    size = rms(change)
+    return rms(change - recorded) / size if size > 0.0 else np.inf
 
 
 def _judge_attitude(_: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
@@ -385,14 +384,13 @@ def _axis_doubts(motion: Array, recorded: Array, names: tuple[str, str]) -> Iter
     names
         The signal, and the one whose derivative it is.
     """
-    known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
-    pair = PAIRS[names[0]]
+    (motion, recorded), pair = both_known(motion, recorded), PAIRS[names[0]]
     for axis, name in enumerate("xyz"):
-        a, b = (values[known, axis : axis + 1] for values in (motion, recorded))
-        if not known.any() or min(rms(a), rms(b)) < pair.min_motion:
+        a, b = (values[:, axis : axis + 1] for values in (motion, recorded))
+        if not len(motion) or min(rms(a), rms(b)) < pair.min_motion:
             continue
         alike, times = correlation(a, b), rms(b) / rms(a)
-        mixed_in = MIN_AXES_ANGLE_RAD * rms(np.delete(motion[known], axis, axis=1))
+        mixed_in = MIN_AXES_ANGLE_RAD * rms(np.delete(motion, axis, axis=1))
         of_another_size = (
             alike > MIN_SIZE_CORRELATION
             and not pair.min_size < times < 1.0 / pair.min_size
@@ -411,8 +409,7 @@ def _angle_between(motion: Array, recorded: Array) -> float:
 
     The rotation is that of least squares (Kabsch 1976).
     """
-    known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
-    a, b = motion[known], recorded[known]
+    a, b = both_known(motion, recorded)
     if len(a) < 2 or min(rms(a), rms(b)) < CLEAR_TURN_RATE:
         return 0.0
     left, sizes, right = np.linalg.svd(b.T @ a)
@@ -466,10 +463,7 @@ def contradiction_in(notes: Sequence[Note]) -> Note | None:
 
 def _tilt_contradiction(series: Mapping[str, Series]) -> float | None:
     """Return the correlation of tilt and acceleration if one does not follow from the other."""
-    position, attitude = (
-        RawSeries(series[name].time, series[name].values) for name in ("position", "attitude")
-    )
-    force, tilt = force_and_tilt(position, attitude)
+    force, tilt = force_and_tilt(series["position"], series["attitude"])
     agreement, force_rms, weight_rms = correlation(force, tilt), rms(force), GRAVITY * rms(tilt)
     if force_rms < CLEAR_ACCELERATION or weight_rms < CLEAR_ACCELERATION:
         return None

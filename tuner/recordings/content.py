@@ -13,7 +13,7 @@ from tuner.core.numerics import Array
 from tuner.recordings.clocks import align_pose, message_times
 from tuner.recordings.consistency import DOUBTS, contradiction, correct_frames
 from tuner.recordings.defects import clean, is_position_frozen, without_stale_end
-from tuner.recordings.flight import SIGNALS, Series
+from tuner.recordings.flight import SIGNALS, RawSeries, Series
 from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.missions import Mission, find_missions, split_into_manoeuvres
 from tuner.recordings.notes import Damage, Note, NoteCode
@@ -38,7 +38,6 @@ from tuner.recordings.unit_detection import (
     ATTITUDES,
     MIN_SAMPLES,
     UNIT_PHRASES,
-    RawSeries,
     is_too_slow,
     quaternion_of,
     scales_of,

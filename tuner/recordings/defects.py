@@ -428,7 +428,7 @@ def _is_moving(series: Mapping[str, Series], stuck: str, since: float) -> bool:
 
 def _complete_rows(samples: Series, since: float) -> Array:
     """Return the complete samples (n, k) after a time."""
-    return samples.values[(samples.time >= since) & np.isfinite(samples.values).all(axis=1)]
+    return samples.where(samples.time >= since).complete().values
 
 
 def has_stale_attitude(series: Mapping[str, Series], notes: Sequence[Note]) -> bool:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuner.core.numerics import Array
 from tuner.recordings.notes import Damage, Note
@@ -35,20 +36,41 @@ SIGNALS: Mapping[str, tuple[int, str, Literal["linear", "arc", "hold"]]] = {
 
 
 @dataclass(frozen=True)
-class Series:
-    """One recorded signal on its own clock.
+class RawSeries:
+    """One signal as recorded, its samples in any order.
 
     Attributes
     ----------
     time
-        (n,) seconds since the start of the mission, strictly increasing; negative before it.
+        (n,) s.
     values
-        (n, k) in the unit of `SIGNALS`; NaN where a column was not measured (a rotor without
-        tachometer).
+        (n, k) in any unit; NaN where a column was not measured (a rotor without tachometer).
     """
 
     time: Array
     values: Array
+
+    def where(self, kept: NDArray[np.bool_]) -> Self:
+        """Return the samples with true flags (n,)."""
+        return replace(self, time=self.time[kept], values=self.values[kept])
+
+    def complete(self) -> Self:
+        """Return the samples of which all columns were measured."""
+        return self.where(np.asarray(np.isfinite(self.values).all(axis=1)))
+
+    def column(self, number: int) -> tuple[Array, Array]:
+        """Return times and values, (m,) each, of the measured samples of a column."""
+        measured = np.isfinite(self.values[:, number])
+        return self.time[measured], self.values[measured, number]
+
+
+@dataclass(frozen=True)
+class Series(RawSeries):
+    """One recorded signal, cleaned, on its own clock.
+
+    Its time is in s since the start of the mission, negative before it, and strictly increasing;
+    its values are in the unit of `SIGNALS`.
+    """
 
     def __post_init__(self) -> None:
         if self.time.ndim != 1 or self.values.ndim != 2 or len(self.time) != len(self.values):

@@ -242,7 +242,7 @@ def _mission(content: Content, index: int) -> MissionReport:
     if rates is not None:
         turn_rates = np.linalg.norm(resample("body_rate", rates, clock), axis=1)
         turning = float(np.nanmax(turn_rates)) if np.isfinite(turn_rates).any() else None
-    spin = yaw_spin(content.series.get("rate_setpoint"), mission.start, mission.end)
+    yaw_rate, level_held = yaw_spin(content.series.get("rate_setpoint"), mission.start, mission.end)
     known = np.isfinite(position).all(axis=1) & np.isfinite(attitude).all(axis=1)
     return MissionReport(
         start=mission.start,
@@ -253,8 +253,8 @@ def _mission(content: Content, index: int) -> MissionReport:
         top_speed=_reduced(np.nanmax, speed),
         largest_tilt=float(np.degrees(np.arccos(np.clip(_reduced(np.nanmin, up), -1, 1)))),
         top_turn_rate=turning,
-        yaw_rate_setpoint=None if spin is None else spin.yaw_rate,
-        level_held=spin is not None and spin.level_held,
+        yaw_rate_setpoint=yaw_rate,
+        level_held=level_held,
         height=(_reduced(np.nanmin, position[:, 2]), _reduced(np.nanmax, position[:, 2])),
         known=float(known.mean()),
         fitted=mission.fitted,

@@ -28,10 +28,9 @@ def resample(signal: str, series: Series, clock: Array) -> Array:
     if interpolation == "arc":
         return _slerp(series, clock)
     for column in range(columns):
-        measured = np.isfinite(series.values[:, column])
-        if not measured.any():
+        time, values = series.column(column)
+        if not len(time):
             continue
-        time, values = series.time[measured], series.values[measured, column]
         if interpolation == "linear":
             result[:, column] = np.interp(clock, time, values)
             result[np.logical_not(_covered(time, clock)), column] = np.nan
@@ -54,8 +53,8 @@ def with_gaps_filled(series: Series) -> Series:
     put on a monotone cubic through their neighbours (Fritsch and Butland 1984), which keeps steps.
     Gaps longer than `max_gap` stay.
     """
-    known = np.isfinite(series.values).all(axis=1)
-    time, values = series.time[known], series.values[known]
+    known = series.complete()
+    time, values = known.time, known.values
     if len(time) < 2:
         return series
     steps = np.diff(time)
@@ -183,12 +182,18 @@ def body_rate_from(q: Array, q_dot: Array) -> Array:
     )
 
 
+def both_known(a: Array, b: Array) -> tuple[Array, Array]:
+    """Return the rows of two (n, k) signals at which all columns of both are known."""
+    known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    return a[known], b[known]
+
+
 def correlation(a: Array, b: Array) -> float:
     """Return the correlation of two (n, k) signals over all their columns, -1..1."""
-    known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
-    if known.sum() < 20:
+    a, b = both_known(a, b)
+    if len(a) < 20:
         return 0.0
-    a, b = a[known] - a[known].mean(axis=0), b[known] - b[known].mean(axis=0)
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     size = float(np.sqrt((a * a).sum() * (b * b).sum()))
     return float((a * b).sum() / size) if size > 0 else 0.0
 

@@ -73,7 +73,7 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
     clock = np.arange(count) / rate
     kept = (start - PRE_MISSION_S, mission.end + POST_MISSION_S + 1e-6)
     near = {name: data.between(*kept) for name, data in series.items()}
-    nearby = {name: Series(data.time - start, data.values) for name, data in near.items()}
+    nearby = {n: dataclasses.replace(s, time=s.time - start) for n, s in near.items()}
     until = mission.end - start + 1e-6
     mission_series = {name: data.between(-np.inf, until) for name, data in nearby.items()}
     mission_series = {name: data for name, data in mission_series.items() if len(data.time)}
@@ -88,7 +88,7 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
         notes.append(Note(NoteCode.NOT_CHOSEN, "info"))
     signals = {name: _on_clock(name, nearby[name], clock, ticks) for name in mission_series}
     notes.extend(gap_notes(signals, mission_series, rate))
-    spin = yaw_spin(mission_series.get("rate_setpoint"), 0.0, float(clock[-1]))
+    yaw_rate, level_held = yaw_spin(mission_series.get("rate_setpoint"), 0.0, float(clock[-1]))
     return Flight(
         name=path.stem if index == 0 else f"{path.stem}-{index + 1}",
         path=str(path),
@@ -98,8 +98,8 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
         signals=signals,
         series=mission_series,
         initial=initial_state(nearby),
-        yaw_rate_setpoint=None if spin is None else spin.yaw_rate,
-        level_held=spin is not None and spin.level_held,
+        yaw_rate_setpoint=yaw_rate,
+        level_held=level_held,
         trajectory=options.sidecar.trajectory,
         notes=tuple(notes),
         damage=tuple(part.later(-start) for part in content.damage),

@@ -129,10 +129,9 @@ def _first_motion(series: Mapping[str, Series], start: float, end: float) -> flo
     firsts: list[float] = []
     for name in ("reference_position", "reference_velocity"):
         if name in series:
-            samples = series[name].between(start, end)
-            known = np.isfinite(samples.values).all(axis=1)
-            time, values = samples.time[known], samples.values[known]
-            firsts += time[np.abs(values - values[:1]).max(axis=1) > MAX_REST_MOTION][:1].tolist()
+            samples = series[name].between(start, end).complete()
+            away = np.abs(samples.values - samples.values[:1]).max(axis=1)
+            firsts += samples.time[away > MAX_REST_MOTION][:1].tolist()
     return min(firsts, default=start)
 
 
@@ -247,40 +246,30 @@ def stretches(
     return [(float(part[0]), float(part[-1])) for part in parts]
 
 
-@dataclass(frozen=True)
-class YawSpin:
-    """A mission whose yaw rate set-point is constant.
+def yaw_spin(rate_setpoint: Series | None, start: float, end: float) -> tuple[float | None, bool]:
+    """Return the constant yaw rate set-point of a mission, and whether level flight is held.
 
-    Attributes
-    ----------
-    yaw_rate
-        rad/s, body z.
-    level_held
-        Whether attitude control sets the roll and pitch rates, so that position and attitude are
-        held; else both set-points are zero, and only thrust is controlled.
+    Returns
+    -------
+    tuple
+        rad/s, body z, None if it does not spin; and whether attitude control sets the roll and
+        pitch rates, so that position and attitude are held. Else both set-points are zero, and only
+        thrust is controlled.
     """
-
-    yaw_rate: float
-    level_held: bool
-
-
-def yaw_spin(rate_setpoint: Series | None, start: float, end: float) -> YawSpin | None:
-    """Return the yaw spin of a mission by its rate set-points; None if it does not spin."""
-    if rate_setpoint is None:
-        return None
-    during = (rate_setpoint.time >= start - 1e-3) & (rate_setpoint.time <= end)
-    if during.sum() < 10:
-        return None
-    rates = rate_setpoint.values[during]
+    rates = np.empty((0, 3))
+    if rate_setpoint is not None:
+        rates = rate_setpoint.between(start - 1e-3, end).values
+    if len(rates) < 10:
+        return None, False
     yaw = float(np.median(rates[:, 2]))
     constant = np.abs(rates[:, 2] - yaw) < 1e-3 * abs(yaw)
     if abs(yaw) < 0.05 or not _nearly_always(constant):
-        return None
+        return None, False
     if _nearly_always(constant & (np.abs(rates[:, :2]) < 1e-6).all(axis=1)):
-        return YawSpin(yaw, level_held=False)
+        return yaw, False
     # a controller's corrections change from one set-point to the next
     corrected = np.ptp(rates[constant, :2], axis=0) > 1e-6
-    return YawSpin(yaw, level_held=True) if corrected.all() else None
+    return (yaw, True) if corrected.all() else (None, False)
 
 
 def _nearly_always(flags: NDArray[np.bool_]) -> bool:

@@ -181,8 +181,7 @@ def initial_position_error(series: Mapping[str, Series], noise: float) -> float:
         m, standard deviation of a sample.
     """
     hover = in_hover(series)
-    near = _near_start(series["position"], hover)
-    count = int(np.isfinite(near.values).all(axis=1).sum())
+    count = len(_near_start(series["position"], hover).complete().time)
     return float((2.0 if hover else 1.5) * noise / np.sqrt(max(count, 1)))
 
 
@@ -212,9 +211,7 @@ def _near_start(series: Series, hover: bool) -> Series:
 
 def _at_start(series: Series, column: int, hover: bool, line: bool, derivative: int = 0) -> float:
     """Return one column, or its derivative, at time 0."""
-    near = _near_start(series, hover)
-    measured = np.isfinite(near.values[:, column])
-    time, values = near.time[measured], near.values[measured, column]
+    time, values = _near_start(series, hover).column(column)
     if len(time) == 0:
         return float("nan") if derivative else _nearest_sample(series, column)
     if hover:
@@ -233,8 +230,6 @@ def _at_start(series: Series, column: int, hover: bool, line: bool, derivative: 
 
 def _nearest_sample(series: Series, column: int) -> float:
     """Return the sample nearest to the start, within half a second; else NaN."""
-    measured = np.flatnonzero(np.isfinite(series.values[:, column]))
-    if len(measured) == 0:
-        return float("nan")
-    best = measured[np.argmin(np.abs(series.time[measured]))]
-    return float(series.values[best, column]) if abs(series.time[best]) < 0.5 else float("nan")
+    time, values = series.column(column)
+    away = np.abs(time)
+    return float(values[away.argmin()]) if (away < 0.5).any() else float("nan")

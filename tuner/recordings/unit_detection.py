@@ -23,7 +23,8 @@ import numpy as np
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
-from tuner.recordings.interpolation import rotate, upward
+from tuner.recordings.flight import RawSeries
+from tuner.recordings.interpolation import both_known, rotate, upward
 from tuner.recordings.notes import Note, NoteCode
 
 #: Unit name in a topic map -> (factor, offset): SI value = factor * recorded + offset.
@@ -201,14 +202,6 @@ MAX_TURN_RATE = 40.0
 """rad/s. No vehicle turns faster for a tenth of its flight: gyros saturate at 35."""
 MIN_SAMPLES = 20
 """Fewer samples do not show their unit."""
-
-
-@dataclass(frozen=True)
-class RawSeries:
-    """Samples in any order: (n,) s, and (n, k) values that are NaN where not measured."""
-
-    time: Array
-    values: Array
 
 
 @dataclass(frozen=True)
@@ -405,12 +398,11 @@ def _share_a_unit(position: RawSeries, speed: RawSeries) -> bool:
     centres = _bin_centres(position, speed)
     if len(centres) < 2:
         return False
-    moved, speeds = np.gradient(_binned(position, centres), BIN_S, axis=0), _binned(speed, centres)
-    known = np.isfinite(moved).all(axis=1) & np.isfinite(speeds).all(axis=1)
-    if not known.any():
+    moved = np.gradient(_binned(position, centres), BIN_S, axis=0)
+    compared = both_known(moved, _binned(speed, centres))
+    if not len(compared[0]):
         return False
-    lengths = (np.median(np.linalg.norm(values[known], axis=1)) for values in (moved, speeds))
-    slower, faster = sorted(lengths)
+    slower, faster = sorted(np.median(np.linalg.norm(values, axis=1)) for values in compared)
     return bool(faster < MAX_SPEED_RATIO * slower)
 
 
@@ -425,8 +417,7 @@ def _near_middle(*signals: RawSeries) -> list[RawSeries]:
     """Return signals' samples near the median stamp of the last; stamps far off are wrong."""
     last = signals[-1].time
     middle = np.median(last) if len(last) else 0.0
-    near = [np.abs(samples.time - middle) < MAX_DISTANCE_S for samples in signals]
-    return [RawSeries(s.time[n], s.values[n]) for s, n in zip(signals, near, strict=True)]
+    return [s.where(np.abs(s.time - middle) < MAX_DISTANCE_S) for s in signals]
 
 
 def _binned(samples: RawSeries, centres: Array) -> Array:
@@ -435,9 +426,8 @@ def _binned(samples: RawSeries, centres: Array) -> Array:
     NaN where no bin within `HALF_BINS` to either side holds a sample.
     """
     result = np.full((len(centres), samples.values.shape[1]), np.nan)
-    for values, column in zip(samples.values.T, result.T, strict=True):
-        known = np.isfinite(values)
-        time, value = samples.time[known], values[known]
+    for number, column in enumerate(result.T):
+        time, value = samples.column(number)
         bins = ((time - centres[0]) / BIN_S + 0.5).astype(np.int64)
         held, first, count = np.unique(np.sort(bins), return_index=True, return_counts=True)
         if len(held) < 2:
@@ -540,7 +530,7 @@ def unit_of_angles(
     RecordingError
         The unit is uncertain, and `required`.
     """
-    angles = np.abs(attitude.values[np.isfinite(attitude.values).all(axis=1)])
+    angles = np.abs(attitude.complete().values)
     if not len(angles):
         return "si"
     tilt = float(np.quantile(angles[:, :2], 0.99))

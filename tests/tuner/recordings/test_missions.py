@@ -16,7 +16,6 @@ from tuner.recordings.missions import (
     MAX_FITTED_S,
     MAX_MANOEUVRE_S,
     Mission,
-    YawSpin,
     airborne,
     find_missions,
     split_into_manoeuvres,
@@ -105,18 +104,18 @@ def test_what_never_flies_has_no_mission() -> None:
 @pytest.mark.parametrize(
     ("rates", "expected"),
     [
-        (np.tile([0.0, 0.0, -2.5], (len(TIME), 1)), YawSpin(-2.5, level_held=False)),
+        (np.tile([0.0, 0.0, -2.5], (len(TIME), 1)), (-2.5, False)),
         (
             np.column_stack([0.1 * np.sin(TIME), 0.1 * np.cos(TIME), 0 * TIME + 3]),
-            YawSpin(3.0, level_held=True),
+            (3.0, True),
         ),
-        (np.tile([0.0, 0.0, 0.0], (len(TIME), 1)), None),
-        (np.tile([0.01, 0.0, 2.5], (len(TIME), 1)), None),
-        (np.column_stack([0 * TIME, 0 * TIME, np.sin(TIME)]), None),
+        (np.tile([0.0, 0.0, 0.0], (len(TIME), 1)), (None, False)),
+        (np.tile([0.01, 0.0, 2.5], (len(TIME), 1)), (None, False)),
+        (np.column_stack([0 * TIME, 0 * TIME, np.sin(TIME)]), (None, False)),
     ],
     ids=["spin", "held level", "hover", "tilted", "wobble"],
 )
-def test_yaw_spin(rates: np.ndarray, expected: YawSpin | None) -> None:
+def test_yaw_spin(rates: np.ndarray, expected: tuple[float | None, bool]) -> None:
     assert yaw_spin(series(rates), 0.0, 40.0) == expected
 
 

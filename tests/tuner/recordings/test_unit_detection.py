@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 
 from tests.tuner.recordings import making
 from tuner.core.numerics import Array
-from tuner.recordings.flight import Flight
+from tuner.recordings.flight import Flight, RawSeries
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.unit_detection import (
-    RawSeries,
     Scale,
     scale_of,
     scales_of,
