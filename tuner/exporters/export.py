@@ -406,7 +406,7 @@ def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
         return (*gates_not_run()[:-1], Gate(RUN_CONDITIONS[-1], tuple(_on_bounds(run))))
     try:
         flown = refly(run, vehicle)
-        differing = _differing(run, flown)
+        differing = [*_differing(run, flown)]
     except InputError as error:
         flown, differing = {}, [f"the flights cannot be flown again ({error})"]
     objections = (_crashes(flown), differing, _worse_flights(run), _on_bounds(run))
@@ -468,45 +468,41 @@ def check_hover(wanted: VehicleFile, there: VehicleFile) -> Gate:
     return Gate("thrust to weight and hover throttle are the vehicle's", tuple(objections))
 
 
-def _crashes(flown: Mapping[str, AxesRmse]) -> list[str]:
-    return [f"{name} crashes" for name, rmse in flown.items() if rmse.x is None]
+def _crashes(flown: Mapping[str, AxesRmse]) -> Iterator[str]:
+    return (f"{name} crashes" for name, rmse in flown.items() if rmse.x is None)
 
 
-def _differing(run: Run, flown: Mapping[str, AxesRmse]) -> list[str]:
-    objections = []
+def _differing(run: Run, flown: Mapping[str, AxesRmse]) -> Iterator[str]:
     for flight in run.result.flights:
         again = flown.get(flight.name)
         if again is None:
-            objections.append(f"{flight.name} was not flown again")
+            yield f"{flight.name} was not flown again"
             continue
         for axis in RMSE_UNITS:
             then, now = getattr(flight.rmse_best, axis), getattr(again, axis)
             if then is None or now is None:
                 continue
             if not math.isclose(then, now, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE):
-                objections.append(f"{flight.name} {axis} gives {now:.4g}, the run {then:.4g}")
-    return objections
+                yield f"{flight.name} {axis} gives {now:.4g}, the run {then:.4g}"
 
 
-def _worse_flights(run: Run) -> list[str]:
-    objections, flights = [], run.result.flights
+def _worse_flights(run: Run) -> Iterator[str]:
+    flights = run.result.flights
     for flight in [one for one in flights if one.split == "holdout"] or flights:
         for what, unit in (("position", "m"), ("attitude", "degrees")):
             before, after = (flight.rmse_initial.norm(what), flight.rmse_best.norm(what))
             if math.isinf(after):
-                objections.append(f"{flight.name} crashes")
+                yield f"{flight.name} crashes"
                 break
             if after > before * (1 + MAX_RMSE_INCREASE) + ABSOLUTE_TOLERANCE:
-                objections.append(f"{flight.name} {what} {after:.4g} {unit}, before {before:.4g}")
-    return objections
+                yield f"{flight.name} {what} {after:.4g} {unit}, before {before:.4g}"
 
 
-def _on_bounds(run: Run) -> list[str]:
-    """Return the coefficients on bounds that flights tell, and that are not zero there.
+def _on_bounds(run: Run) -> Iterator[str]:
+    """Yield the coefficients on bounds that flights tell, and that are not zero there.
 
     The others move no flight: notes of the export name them.
     """
-    objections = []
     for name, coefficient in run.result.coefficients.items():
         lower, upper = coefficient.lower, coefficient.upper
         if not coefficient.fitted or coefficient.identifiable is False:
@@ -517,5 +513,4 @@ def _on_bounds(run: Run) -> list[str]:
             if bound is None or abs(coefficient.initial - bound) <= near:
                 continue  # the search began there: a set-up without a delay has a latency of zero
             if bound != 0.0 and abs(coefficient.best - bound) <= near:
-                objections.append(f"{name} {coefficient.best:g} is its {side} bound")
-    return objections
+                yield f"{name} {coefficient.best:g} is its {side} bound"

@@ -7,6 +7,7 @@ cross-correlation shows the offset.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -119,28 +120,21 @@ def _repair_stamps(
     )
     if len(jumped) == 0:
         return stamp, []
-    fixed = stamp.copy()
-    notes = []
-    wrong = 0
-    steps = []
-    i = 0
-    while i < len(jumped):
-        here = int(jumped[i])
-        back = int(jumped[i + 1]) if i + 1 < len(jumped) else -1
+    fixed, notes, steps, wrong, left = stamp.copy(), list[Note](), list[int](), 0, deque(jumped)
+    while left:
+        here = int(left.popleft())
+        back = int(left[0]) if left else -1
         if back - here in (1, 2, 3) and abs(int(extra[here] + extra[back])) < MIN_CLOCK_JUMP_NS:
-            rows = np.arange(here + 1, back + 1)
-            fixed[rows] = receive[rows] + (stamp[here] - receive[here])
-            wrong += len(rows)
-            i += 2
-        elif here == 0 or here == len(step) - 1:
-            row = 0 if here == 0 else len(stamp) - 1
-            near = 1 if here == 0 else len(stamp) - 2
-            fixed[row] = receive[row] + (stamp[near] - receive[near])
-            wrong += 1
-            i += 1
+            rows, near = slice(here + 1, int(left.popleft()) + 1), here
+        elif here == 0:
+            rows, near = slice(0, 1), 1
+        elif here == len(step) - 1:
+            rows, near = slice(here + 1, here + 2), here
         else:
             steps.append(here)
-            i += 1
+            continue
+        fixed[rows] = receive[rows] + (stamp[near] - receive[near])
+        wrong += rows.stop - rows.start
     if wrong:
         notes.append(Note(NoteCode.STAMPS_REPLACED, topic=topic, count=wrong))
     if steps:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -220,16 +220,15 @@ def read_signals(options: ReadOptions) -> Signals:
     )
 
 
-def _notes_of_places(places: Mapping[str, Place]) -> list[Note]:
-    """Return notes on the sources of signals."""
-    notes, speed, reference = [], places.get("rotor_speed"), places.get("reference_position")
+def _notes_of_places(places: Mapping[str, Place]) -> Iterator[Note]:
+    """Yield notes on the sources of signals."""
+    speed, reference = places.get("rotor_speed"), places.get("reference_position")
     if speed is not None and speed.source.unit is None:  # what they were taken for
-        notes.append(Note(NoteCode.SPEED_UNIT_OPEN, "info", speed.topic, names=(speed.unit,)))
+        yield Note(NoteCode.SPEED_UNIT_OPEN, "info", speed.topic, names=(speed.unit,))
     if {"position", "attitude"} <= set(places) and not set(DRIVING_SIGNALS) & set(places):
-        notes.append(Note(NoteCode.POSE_ALONE))
+        yield Note(NoteCode.POSE_ALONE)
     if reference and reference.topic.rpartition("/")[2].startswith(PX4_REFERENCES):
-        notes.append(Note(NoteCode.PX4_REFERENCE, "info", reference.topic))
-    return notes
+        yield Note(NoteCode.PX4_REFERENCE, "info", reference.topic)
 
 
 def _stamp_delay(

@@ -12,7 +12,7 @@ import io
 import json
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,9 +108,8 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
 
 def gap_notes(
     signals: Mapping[str, Array], series: Mapping[str, Series], rate: float
-) -> list[Note]:
-    """Return notes on signals with gaps."""
-    notes = []
+) -> Iterator[Note]:
+    """Yield notes on signals with gaps."""
     for name, values in signals.items():
         if SIGNALS[name][2] == "hold":
             continue
@@ -119,8 +118,7 @@ def gap_notes(
         if unknown > max_gap(series[name].time) * rate:
             longest = max(behind - first for first, behind in runs(~known))
             times = {"seconds": unknown / rate, "longest": longest / rate}
-            notes.append(Note(NoteCode.SIGNAL_UNKNOWN, count=unknown, numbers=times, names=(name,)))
-    return notes
+            yield Note(NoteCode.SIGNAL_UNKNOWN, count=unknown, numbers=times, names=(name,))
 
 
 def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> Array:

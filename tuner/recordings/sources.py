@@ -126,8 +126,7 @@ def column_meaning(name: str, written: str | None = None) -> ColumnMeaning | Non
     last = re.split(r"[./]", bare.strip().lower())[-1]
     if whole in _TIME or last in _TIME:
         return ColumnMeaning("time", "", unit if unit in TIME_UNITS else None, "")
-    unit = None if unit in TIME_UNITS - {"s"} else unit
-    unit = None if unit == "s" else unit
+    unit = None if unit in TIME_UNITS else unit
     if words[-1] in ("roll", "pitch", "yaw") and not (_RATE & set(words[:-1])):
         return ColumnMeaning("angles", words[-1], unit, "_".join(words[:-1]))
     axis, rest = _axis(words)
@@ -140,37 +139,28 @@ def column_meaning(name: str, written: str | None = None) -> ColumnMeaning | Non
 
 def _meaning_of_axis(axis: str, rest: list[str], unit: str | None) -> ColumnMeaning | None:
     """Return the meaning of the words before an axis or a rotor's number."""
-    joined = set(rest) | {"_".join(rest[i : i + 2]) for i in range(len(rest) - 1)}
-    signal = _signal_of_numbered(joined, unit) if axis.isdecimal() else _signal_along(axis, joined)
+    words = set(rest) | {"_".join(rest[i : i + 2]) for i in range(len(rest) - 1)}
+    moving, turning = words & (_VELOCITY | {"twist"}), words & {"ang", "angular"}
+    bare = {word for word in words if "_" not in word} <= _ESTIMATE_WORDS | _NEUTRAL_WORDS
+    numbered: tuple[tuple[str, object], ...] = (
+        ("rotor_speed", unit in ("rpm", "hz") or words & _SPEED),
+        ("command", words & _COMMAND),
+        *((signal, words & known) for signal, known in _NUMBERED_WORDS.items()),
+    )
+    along: tuple[tuple[str, object], ...] = (
+        ("attitude", axis == "w" or words & _ATTITUDE),
+        ("body_rate", words & (_RATE - {"angular"}) or (turning and moving)),
+        ("acceleration", words & _FORCE and not turning),
+        ("velocity", moving),
+        ("position", words & _POSITION or bare),
+    )
+    rules = numbered if axis.isdecimal() else along
+    signal = next((signal for signal, holds in rules if holds), None)
     if signal is None:
         return None
-    if signal == "rotor_speed" and unit is None and any("rpm" in word for word in joined):
+    if signal == "rotor_speed" and unit is None and any("rpm" in word for word in words):
         unit = "rpm"
     return ColumnMeaning(signal, axis, None if signal == "attitude" else unit, "_".join(rest))
-
-
-def _signal_of_numbered(words: set[str], unit: str | None) -> str | None:
-    """Return the signal of a numbered column."""
-    if unit in ("rpm", "hz") or words & _SPEED:
-        return "rotor_speed"
-    if words & _COMMAND:
-        return "command"
-    return next((signal for signal, known in _NUMBERED_WORDS.items() if words & known), None)
-
-
-def _signal_along(axis: str, words: set[str]) -> str | None:
-    """Return the signal of a column with an axis."""
-    single = {word for word in words if "_" not in word}
-    turning = bool(words & {"ang", "angular"})
-    moving = bool(words & (_VELOCITY | {"twist"}))
-    rules = (
-        ("attitude", axis == "w" or bool(words & _ATTITUDE)),
-        ("body_rate", bool(words & (_RATE - {"angular"})) or (turning and moving)),
-        ("acceleration", bool(words & _FORCE) and not turning),
-        ("velocity", moving),
-        ("position", bool(words & _POSITION) or single <= _ESTIMATE_WORDS | _NEUTRAL_WORDS),
-    )
-    return next((signal for signal, holds in rules if holds), None)
 
 
 def _words(name: str) -> list[str]:

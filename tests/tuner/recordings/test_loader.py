@@ -170,5 +170,5 @@ def test_a_signal_is_unknown_only_beyond_what_its_rate_leaves_open(
     clock = np.arange(0.0, 20.0, 0.01)
     sampled = Series(np.arange(0.0, 20.0, 1.0 / hertz), np.ones((int(20 * hertz), 1)))
     values = np.where(clock < lost, np.nan, 16.0)[:, None]
-    notes = gap_notes({"battery_voltage": values}, {"battery_voltage": sampled}, 100.0)
+    notes = [*gap_notes({"battery_voltage": values}, {"battery_voltage": sampled}, 100.0)]
     assert bool(notes) is is_said

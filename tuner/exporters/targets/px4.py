@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from sim_jax.constants import GRAVITY
@@ -170,8 +170,7 @@ def px4_draft(vehicle: VehicleFile, provenance: str, simulator: Simulator, *_: o
     """
     flown = simulator.flown(vehicle)
     wanted = parameters(vehicle, simulator)
-    notes = _notes(vehicle, flown, simulator)
-
+    notes = tuple(_notes(vehicle, flown, simulator))
     header = f"{provenance}\nfor {simulator.title} ({simulator.version})"
     return Draft(
         parameters_text(wanted, "\n".join((header, *notes))),
@@ -180,51 +179,45 @@ def px4_draft(vehicle: VehicleFile, provenance: str, simulator: Simulator, *_: o
         lambda path, _: differences(wanted, read_parameters(path)),
         gates=(
             Gate("PX4 accepts every parameter", outside_range(wanted)),
-            Gate("the simulator has such rotors", _rotor_faults(vehicle, simulator)),
+            Gate("the simulator has such rotors", tuple(_rotor_faults(vehicle, simulator))),
         ),
     )
 
 
-def _rotor_faults(vehicle: VehicleFile, simulator: Simulator) -> tuple[str, ...]:
-    """Return how the rotors of the SIH, a symmetric quad X or a hexacopter X, are others."""
-    if simulator is not SIH:
-        return ()
-    if not vehicle.is_quad:
-        return (f"the vehicle has {len(vehicle.rotors)} rotors, what is written is a quad X's",)
-    clauses = []
-    for axis, arm in enumerate(("SIH_L_PITCH", "SIH_L_ROLL")):
-        arms = [abs(rotor.position[axis]) for rotor in vehicle.rotors]
-        if max(arms) - min(arms) > PLACE_TOLERANCE_M:
-            clauses.append(
-                f"rotors sit {min(arms):g} to {max(arms):g} m off along {'xy'[axis]}, and {arm} "
-                "is one number"
-            )
-    return tuple(clauses)
+def _rotor_faults(vehicle: VehicleFile, simulator: Simulator) -> Iterator[str]:
+    """Yield how the rotors of the SIH, a symmetric quad X or a hexacopter X, are others."""
+    if simulator is SIH and not vehicle.is_quad:
+        yield f"the vehicle has {len(vehicle.rotors)} rotors, what is written is a quad X's"
+    elif simulator is SIH:
+        for axis, arm in enumerate(("SIH_L_PITCH", "SIH_L_ROLL")):
+            arms = [abs(rotor.position[axis]) for rotor in vehicle.rotors]
+            if max(arms) - min(arms) > PLACE_TOLERANCE_M:
+                yield (
+                    f"rotors sit {min(arms):g} to {max(arms):g} m off along {'xy'[axis]}, and "
+                    f"{arm} is one number"
+                )
 
 
-def _notes(vehicle: VehicleFile, flown: VehicleFile, simulator: Simulator) -> tuple[str, ...]:
-    """Return remarks for a reader of the parameters."""
-    notes = []
-    hover = hover_command(vehicle)
+def _notes(vehicle: VehicleFile, flown: VehicleFile, simulator: Simulator) -> Iterator[str]:
+    """Yield remarks for a reader of the parameters."""
+    hover, there = hover_command(vehicle), hover_command(flown)
     if simulator is not SIH:
         idle = rotor_speed(vehicle, 0.0)
-        notes.append(
+        yield (
             f"CA_ROTOR*_CT is thrust in N at full command (idle {idle:.0f} rad/s: not CT·u² below)"
         )
         if gz_speed_unit(flown) < 1:
-            notes.append(
+            yield (
                 f"rotors turn at up to {rotor_speed(flown, 1.0):.0f} rad/s and PX4 lets gz-sim be "
                 f"told of {MAX_GZ_SPEED:.0f} at most: speeds are scaled by "
                 f"{gz_speed_unit(flown):.6g}, as the gz-sim export scales its model"
             )
-    there = hover_command(flown)
     if hover is not None and there is not None and abs(hover - there) > 0.005:
-        notes.append(
+        yield (
             f"MPC_THR_HOVER {there:.3f} is the hover of {simulator.title}; with the squared "
             f"thrust of rotors (gz-sim, the vehicle) it is {hover:.3f}"
         )
-    notes.append("MPC_THR_HOVER holds for THR_MDL_FAC 0")
-    return tuple(notes)
+    yield "MPC_THR_HOVER holds for THR_MDL_FAC 0"
 
 
 RANGES = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -83,6 +82,14 @@ def channel_tags() -> dict[str, str]:
     return {entry.tag: name for name, entry in _entries().items() if entry.parent == "channel"}
 
 
+def _tagged(model: Model, vehicle: VehicleFile) -> Iterator[tuple[Element, dict[str, str]]]:
+    """Yield each motor plugin and control channel, with tag -> name of the numbers in it."""
+    for motor in model.motors():
+        yield motor, motor_tags(vehicle, motor_number(motor))
+    for channel in model.channels():
+        yield channel, channel_tags()
+
+
 def center_of_mass(vehicle: VehicleFile) -> dict[str, float]:
     """Return name -> m from the origin of rotor positions to the centre of mass; empty if equal."""
     names = [f"center_of_mass_{axis}" for axis in "xyz"]
@@ -143,35 +150,22 @@ def read_values(model: Model, vehicle: VehicleFile) -> dict[str, float]:
     ExportError
         Its rotors have different values.
     """
-    tagged = [(motor, motor_tags(vehicle, motor_number(motor))) for motor in model.motors()]
-    tagged += [(channel, channel_tags()) for channel in model.channels()]
-    shared: dict[tuple[str, str], list[Element]] = defaultdict(list)
-    for element, tags in tagged:
-        for place in tags.items():
-            shared[place].append(element)
-    read = {name: _shared_value(elements, tag) for (tag, name), elements in shared.items()}
+    read: dict[str, float | None] = {}
+    for element, tags in _tagged(model, vehicle):
+        held = element.numbers
+        for tag, name in tags.items():
+            if read.setdefault(name, held.get(tag)) != held.get(tag):
+                raise ExportError(
+                    element.source.path, f"has rotors of different {tag}", "give them one value"
+                )
     whole = composite(model)
     if center_of_mass(vehicle):
         origin = rotor_origin(model, vehicle)
         offset = whole.pose.position - (np.zeros(3) if origin is None else origin)
         read |= {f"center_of_mass_{axis}": float(offset[i]) for i, axis in enumerate("xyz")}
     body = {f"inertia_{axis}{axis}": float(whole.inertia[i, i]) for i, axis in enumerate("xyz")}
-    held = {name: value for name, value in read.items() if value is not None}
-    return held | body | {"mass": whole.mass}
-
-
-def _shared_value(elements: Sequence[Element], tag: str) -> float | None:
-    """Return the value of a tag that elements share; None if they have none."""
-    path = elements[0].source.path
-    texts = {child.value if (child := of.find(tag)) else "" for of in elements}
-    try:
-        values = {float(text) if text else None for text in texts}
-    except ValueError:
-        found = " and ".join(sorted(texts))
-        raise ExportError(path, f"has the <{tag}> {found}", "write a number") from None
-    if len(values) > 1:
-        raise ExportError(path, f"has rotors of different {tag}", "give them one value")
-    return values.pop()
+    known = {name: value for name, value in read.items() if value is not None}
+    return known | body | {"mass": whole.mass}
 
 
 def rotor_origin(model: Model, vehicle: VehicleFile) -> Array | None:
@@ -372,20 +366,14 @@ def _edits(model: Model, whole: Model, vehicle: VehicleFile, base: Inertial) -> 
         if not none or tensor.find(tag) is not None:
             yield from _value_edits(tensor, {tag: as_text(0.0 if none else value)})
     numbers = {name: as_text(value) for name, value in numbers_of(vehicle).items()}
-    for motor in model.motors():
-        index = motor_number(motor)
-        if index is None and rotor_constants(vehicle):
-            raise ExportError(
-                model.path,
-                "draws its rotors from a template, and this vehicle's differ in motor_constant",
-                "give each rotor a plugin of its own",
-            )
-        values = {tag: numbers[name] for tag, name in motor_tags(vehicle, index).items()}
-        yield from _value_edits(motor, values)
-    for channel in model.channels():
-        yield from _value_edits(
-            channel, {tag: numbers[name] for tag, name in channel_tags().items()}
+    if rotor_constants(vehicle) and None in map(motor_number, model.motors()):
+        raise ExportError(
+            model.path,
+            "draws its rotors from a template, and this vehicle's differ in motor_constant",
+            "give each rotor a plugin of its own",
         )
+    for element, tags in _tagged(model, vehicle):
+        yield from _value_edits(element, {tag: numbers[name] for tag, name in tags.items()})
     if center_of_mass(vehicle):  # with all digits: it is the small difference of large numbers
         link, pose = whole.pose_of(whole.base), inertial.find("pose")
         place = (link.rotation.T @ (base.pose.position - link.position)).tolist()

@@ -7,7 +7,7 @@ import io
 import sys
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
@@ -97,21 +97,13 @@ def unpack(compression: str, packed: bytes, size: int) -> bytes:
     """
     if not 0 < size <= MAX_CHUNK_BYTES:
         raise DamagedError(f"a chunk claims {size} bytes")
+    if compression not in _DECOMPRESSORS:
+        raise DamagedError(f"unknown compression '{compression[:20]}'")
     try:
-        if compression == "bz2":
-            from bz2 import BZ2Decompressor  # noqa: PLC0415 (each on demand)
-
-            return BZ2Decompressor().decompress(packed, max_length=size)
-        if compression == "lz4":
-            lz4 = importlib.import_module("lz4.frame")
-            unpacked: bytes = lz4.LZ4FrameDecompressor().decompress(packed, max_length=size)
-            return unpacked
-        if compression == "zstd":
-            content: bytes = zstd().ZstdDecompressor().decompress(packed, max_length=size)
-            return content
+        unpacked: bytes = _DECOMPRESSORS[compression]()().decompress(packed, max_length=size)
     except Exception as err:  # each library has its own errors
         raise DamagedError(f"a chunk cannot be unpacked ({err})") from None
-    raise DamagedError(f"unknown compression '{compression[:20]}'")
+    return unpacked
 
 
 def zstd() -> Any:
@@ -119,6 +111,14 @@ def zstd() -> Any:
     if sys.version_info >= (3, 14):
         return importlib.import_module("compression.zstd")
     return importlib.import_module("backports.zstd")
+
+
+_DECOMPRESSORS: Mapping[str, Callable[[], Any]] = {
+    "bz2": lambda: importlib.import_module("bz2").BZ2Decompressor,
+    "lz4": lambda: importlib.import_module("lz4.frame").LZ4FrameDecompressor,
+    "zstd": lambda: zstd().ZstdDecompressor,
+}
+"""Compression -> its class, imported on demand."""
 
 
 def unsigned(buffer: Bytes, at: Index, size: int) -> Index:
