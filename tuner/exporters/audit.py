@@ -241,22 +241,18 @@ def _speeds(
     return None if math.isinf(limit) else (0.0, limit)
 
 
-def _motor_constant(rotors: list[Rotor]) -> float:
-    """Return the sum of the rotors' motor constants in N s²/rad²."""
-    return sum(rotor.numbers.get("motorConstant", 0.0) for rotor in rotors)
-
-
-def _hover_throttle(
+def _hover(
     whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float] | None
-) -> float | None:
-    """Return the hover throttle between the speeds at zero and at full command.
+) -> tuple[float, float] | None:
+    """Return full thrust over weight, and the hover throttle between zero and full command.
 
     None if speeds or thrust are unknown, or the speeds are equal.
     """
-    constant, (low, high) = _motor_constant(rotors), speeds or (0.0, 0.0)
+    constant = sum(rotor.numbers.get("motorConstant", 0.0) for rotor in rotors)
+    weight, (low, high) = whole.mass * GRAVITY, speeds or (0.0, 0.0)
     if not (constant > 0 and high > low):
         return None
-    return (math.sqrt(whole.mass * GRAVITY / constant) - low) / (high - low)
+    return constant * high**2 / weight, (math.sqrt(weight / constant) - low) / (high - low)
 
 
 def _hover_faults(
@@ -265,23 +261,18 @@ def _hover_faults(
     """Yield faults of the thrust-to-weight ratio and of the hover."""
     if speeds is None or any("motorConstant" not in rotor.numbers for rotor in rotors):
         return
-    constant, (low, high) = _motor_constant(rotors), speeds
-    hover = _hover_throttle(whole, rotors, speeds)
-    if hover is None:
+    (low, high), found = speeds, _hover(whole, rotors, speeds)
+    if found is None:
         yield f"motorConstant and speeds of {low:g} to {high:g} rad/s give no thrust"
-        return
-    weight = whole.mass * GRAVITY
-    ratio = constant * high**2 / weight
-    if not THRUST_TO_WEIGHT_RANGE[0] <= ratio <= THRUST_TO_WEIGHT_RANGE[1]:
+    elif not THRUST_TO_WEIGHT_RANGE[0] <= found[0] <= THRUST_TO_WEIGHT_RANGE[1]:
         yield (
-            f"full thrust is {ratio:.3g} times the weight of {whole.mass:.4g} kg, vehicles have "
+            f"full thrust is {found[0]:.3g} times the weight of {whole.mass:.4g} kg, vehicles have "
             f"{_range(THRUST_TO_WEIGHT_RANGE)}: mass, motorConstant (N s²/rad², not per rpm²) or "
             "speeds are off"
         )
-        return
-    if not HOVER_RANGE[0] <= hover <= HOVER_RANGE[1]:
+    elif not HOVER_RANGE[0] <= found[1] <= HOVER_RANGE[1]:
         yield (
-            f"it hovers at a throttle of {hover:.2f}, with rotors of {low:g} to {high:g} rad/s; "
+            f"it hovers at a throttle of {found[1]:.2f}, with rotors of {low:g} to {high:g} rad/s; "
             f"PX4 accepts {_range(HOVER_RANGE)}"
         )
 
@@ -309,11 +300,11 @@ def _parameter_faults(
     mass = parameters.get("SIH_MASS")
     if mass is not None and not math.isclose(mass, whole.mass, rel_tol=RELATIVE_TOLERANCE):
         yield f"SIH_MASS is {mass:g} kg, the model weighs {whole.mass:.4g} kg"
-    hover, there = parameters.get("MPC_THR_HOVER"), _hover_throttle(whole, rotors, speeds)
+    hover, there = parameters.get("MPC_THR_HOVER"), _hover(whole, rotors, speeds)
     if hover is None or there is None or "SIH_T_MAX" in parameters:
         return
-    if abs(hover - there) > RELATIVE_TOLERANCE:
-        yield f"MPC_THR_HOVER is {hover:g}, the model hovers at a throttle of {there:.2f}"
+    if abs(hover - there[1]) > RELATIVE_TOLERANCE:
+        yield f"MPC_THR_HOVER is {hover:g}, the model hovers at a throttle of {there[1]:.2f}"
 
 
 def _differences_from(run: Run, whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from ast import Assign, Dict, Name, literal_eval, parse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -274,9 +274,8 @@ def check_every_coefficient(vehicle: VehicleFile, target: Target) -> None:
             )
 
 
-def not_carried(vehicle: VehicleFile, target: Target) -> tuple[str, ...]:
-    """Return a sentence for each coefficient that acts and that a target lacks."""
-    sentences = []
+def not_carried(vehicle: VehicleFile, target: Target) -> Iterator[str]:
+    """Yield a sentence for each coefficient that acts and that a target lacks."""
     for name, value in values_of(vehicle).items():
         row = COEFFICIENTS[name]
         entry = target.simulator.entry(row)
@@ -285,8 +284,7 @@ def not_carried(vehicle: VehicleFile, target: Target) -> tuple[str, ...]:
         same = (at for at in (row.neutral, entry.built_in) if at is not None)
         # a bound may differ in the last digits
         if not any(math.isclose(value, at, abs_tol=1e-9 * row.step) for at in same):
-            sentences.append(f"{name} {quantity(value, row)} is not exported: {entry.reason}")
-    return tuple(sentences)
+            yield f"{name} {quantity(value, row)} is not exported: {entry.reason}"
 
 
 def quantity(value: float, row: Coefficient) -> str:

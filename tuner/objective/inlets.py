@@ -129,7 +129,7 @@ def with_body_rate(flight: Flight) -> Flight:
 
 def zeroed(flight: Flight, names: Collection[str]) -> Flight:
     """Return a flight whose signals are zero throughout, its attitude level."""
-    rows = {name: np.zeros(SIGNALS[name][0]) for name in names}
+    rows = {name: np.zeros(SIGNALS[name].columns) for name in names}
     if "attitude" in rows:
         rows["attitude"][0] = 1.0
     ends = np.array([0.0, flight.duration])

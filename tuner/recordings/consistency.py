@@ -110,10 +110,6 @@ def _turning(flown: Flown) -> tuple[Array, Array]:
     return smooth(body_rate_of(flown["attitude"])), smooth(rate)
 
 
-def _moving(flown: Flown) -> tuple[Array, Array]:
-    return smooth(derivative(flown["position"]), 0.1), smooth(flown["velocity"], 0.1)
-
-
 def _specific_force(flown: Flown) -> Array:
     """Return the motion's specific force in world axes, (n, 3) m/s^2."""
     push = smooth(derivative(smooth(derivative(smooth(flown["position"], 0.2)), 0.2)), 0.2)
@@ -168,8 +164,23 @@ class Pair:
 
 
 PAIRS: Mapping[str, Pair] = {
-    "body_rate": Pair("attitude", [_turning], 0.1, 0.93, 0.9, NoteCode.BODY_RATE_DOUBTED),
-    "velocity": Pair("position", [_moving], 0.2, 0.8, 0.6, NoteCode.VELOCITY_DOUBTED, 1.0),
+    "body_rate": Pair(
+        "attitude",
+        [_turning],
+        min_motion=0.1,
+        min_size=0.93,
+        max_share=0.9,
+        doubt=NoteCode.BODY_RATE_DOUBTED,
+    ),
+    "velocity": Pair(
+        "position",
+        [lambda s: (smooth(derivative(s["position"]), 0.1), smooth(s["velocity"], 0.1))],
+        min_motion=0.2,
+        min_size=0.8,
+        max_share=0.6,
+        doubt=NoteCode.VELOCITY_DOUBTED,
+        max_unmatched=1.0,
+    ),
     # a flipped height shows in world axes, a turned accelerometer in body axes
     "acceleration": Pair("position", [_world_forces, _body_forces], MIN_ACCELERATION, 0.7),
     "rate_setpoint": Pair(

@@ -35,7 +35,6 @@ from tuner.recordings.topics import (
     sidecar_path,
 )
 from tuner.recordings.unit_detection import (
-    ATTITUDES,
     MIN_SAMPLES,
     UNIT_PHRASES,
     is_too_slow,
@@ -398,7 +397,7 @@ def extract(
     read: dict[str, Array] = {}
     inferred: list[Note] = []
     for signal in sorted(
-        places, key=lambda name: name in ATTITUDES
+        places, key=lambda name: SIGNALS[name].axes == "attitude"
     ):  # positions may show their unit
         place = places[signal]
         samples = contents.samples.get(place.topic)
@@ -438,7 +437,7 @@ def _recorded_unit(
     """Return the unit of recorded numbers: the map's, else the plausible one, empty if none is."""
     if place.source.unit is not None:
         return place.unit
-    if signal not in ATTITUDES or place.source.quaternion != "rpy":
+    if SIGNALS[signal].axes != "attitude" or place.source.quaternion != "rpy":
         return unit_by_range(signal, recorded.values, place.unit)
     required = signal == "attitude" and position is not None  # else no flight is made of it
     return unit_of_angles(recording.path, recorded, position, required=required)
@@ -446,8 +445,8 @@ def _recorded_unit(
 
 def _in_flight_axes(samples: Samples, signal: str, place: Place, values: Array) -> Array:
     """Return (n, k) values in the columns and axes of a `Flight`."""
-    columns, _, _ = SIGNALS[signal]
-    if place.source.quaternion == "rpy" and signal in ATTITUDES:
+    columns, axes = SIGNALS[signal].columns, SIGNALS[signal].axes
+    if place.source.quaternion == "rpy" and axes == "attitude":
         values = quaternion_of(values)
     if place.source.rotor is not None:
         rotor = samples.fields[place.source.rotor]

@@ -14,30 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Array
-from tuner.recordings.flight import Series
+from tuner.recordings.flight import SIGNALS, Series
 from tuner.recordings.interpolation import rms, runs, upward
 from tuner.recordings.notes import Kind, Note, NoteCode
-
-RANGES: Mapping[str, tuple[float, float]] = {
-    "position": (-1e5, 1e5),
-    "velocity": (-1e3, 1e3),
-    "attitude": (-1e3, 1e3),
-    "body_rate": (-1e4, 1e4),
-    "acceleration": (-1e4, 1e4),
-    "reference_position": (-1e5, 1e5),
-    "reference_velocity": (-1e3, 1e3),
-    "reference_acceleration": (-1e4, 1e4),
-    "rate_setpoint": (-1e4, 1e4),
-    "attitude_setpoint": (-1e3, 1e3),
-    "lap": (-1e6, 1e6),
-    "command": (-0.025, 1.02),  # an ESC that is off gets less than its first step
-    "thrust_setpoint": (-0.02, 1.02),
-    "commanded_thrust": (-1e4, 1e4),
-    "commanded_torque": (-1e4, 1e4),
-    "rotor_speed": (0.0, 100_000.0),  # in revolutions a minute, if nothing says the unit
-    "battery_voltage": (1.0, 100.0),  # nothing flies on less: a meter that was not read
-}
-"""Signal -> range; a value beyond it is a corrupt sample."""
 
 MAX_BEYOND_SHARE = 0.5
 """With more samples out of range a signal is in another unit rather than corrupt."""
@@ -98,7 +77,7 @@ def clean(
         if count:
             notes.append(Note(code, kind, topic, int(count), numbers, (signal,)))
 
-    low, high = RANGES.get(signal, (-np.inf, np.inf))
+    low, high = SIGNALS[signal].range
     beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
     dropped = int(beyond.any(axis=1).sum())
     if dropped > MAX_BEYOND_SHARE * int((values != 0).any(axis=1).sum()):  # 0 is 0 in each unit
@@ -417,18 +396,13 @@ def is_position_frozen(series: Mapping[str, Series]) -> bool:
 
 def _is_moving(series: Mapping[str, Series], stuck: str, since: float) -> bool:
     """Return whether position or, if it is not the stuck signal, the gyro shows motion."""
-    places = _complete_rows(series["position"], since)
+    places = series["position"].between(since, np.inf).complete().values
     if len(places) and np.ptp(places, axis=0).max() >= MIN_MOTION_M:
         return True
     if stuck == "body_rate" or "body_rate" not in series:
         return False
-    rates = _complete_rows(series["body_rate"], since)
+    rates = series["body_rate"].between(since, np.inf).complete().values
     return len(rates) > 0 and bool(np.sqrt(np.mean(rates**2)) >= MIN_TURN_RATE)
-
-
-def _complete_rows(samples: Series, since: float) -> Array:
-    """Return the complete samples (n, k) after a time."""
-    return samples.where(samples.time >= since).complete().values
 
 
 def has_stale_attitude(series: Mapping[str, Series], notes: Sequence[Note]) -> bool:

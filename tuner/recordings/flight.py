@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, Self
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,26 +12,51 @@ from numpy.typing import NDArray
 from tuner.core.numerics import Array
 from tuner.recordings.notes import Damage, Note
 
-#: The signals a flight can hold: name -> (number of columns, unit, interpolation).
-#: World is ENU, body is FLU, quaternions are (w, x, y, z) body to world.
-SIGNALS: Mapping[str, tuple[int, str, Literal["linear", "arc", "hold"]]] = {
-    "position": (3, "m", "linear"),
-    "velocity": (3, "m/s", "linear"),
-    "attitude": (4, "", "arc"),
-    "body_rate": (3, "rad/s", "linear"),
-    "acceleration": (3, "m/s^2", "linear"),
-    "rotor_speed": (4, "rad/s", "linear"),
-    "command": (4, "", "hold"),
-    "attitude_setpoint": (4, "", "hold"),
-    "rate_setpoint": (3, "rad/s", "hold"),
-    "thrust_setpoint": (1, "", "hold"),
-    "commanded_thrust": (1, "N", "hold"),
-    "commanded_torque": (3, "N m", "hold"),
-    "reference_position": (3, "m", "hold"),
-    "reference_velocity": (3, "m/s", "hold"),
-    "reference_acceleration": (3, "m/s^2", "hold"),
-    "lap": (1, "", "hold"),
-    "battery_voltage": (1, "V", "linear"),
+
+class Signal(NamedTuple):
+    """A signal that a flight can hold.
+
+    Attributes
+    ----------
+    columns
+        Their number.
+    interpolation
+        ``linear``, along an ``arc``, or ``hold`` until the next sample.
+    range
+        A value beyond it is a corrupt sample.
+    axes
+        Of its columns: ``world`` (ENU), ``body`` (FLU), ``attitude`` for a quaternion
+        (w, x, y, z) from body to world, or none.
+    """
+
+    columns: int
+    unit: str
+    interpolation: Literal["linear", "arc", "hold"]
+    range: tuple[float, float]
+    axes: Literal["world", "body", "attitude", ""] = ""
+
+
+SIGNALS: Mapping[str, Signal] = {
+    "position": Signal(3, "m", "linear", (-1e5, 1e5), "world"),
+    "velocity": Signal(3, "m/s", "linear", (-1e3, 1e3), "world"),
+    "attitude": Signal(4, "", "arc", (-1e3, 1e3), "attitude"),
+    "body_rate": Signal(3, "rad/s", "linear", (-1e4, 1e4), "body"),
+    "acceleration": Signal(3, "m/s^2", "linear", (-1e4, 1e4), "body"),
+    # in revolutions a minute, if nothing says the unit
+    "rotor_speed": Signal(4, "rad/s", "linear", (0.0, 100_000.0)),
+    # an ESC that is off gets less than its first step
+    "command": Signal(4, "", "hold", (-0.025, 1.02)),
+    "attitude_setpoint": Signal(4, "", "hold", (-1e3, 1e3), "attitude"),
+    "rate_setpoint": Signal(3, "rad/s", "hold", (-1e4, 1e4), "body"),
+    "thrust_setpoint": Signal(1, "", "hold", (-0.02, 1.02)),
+    "commanded_thrust": Signal(1, "N", "hold", (-1e4, 1e4)),
+    "commanded_torque": Signal(3, "N m", "hold", (-1e4, 1e4), "body"),
+    "reference_position": Signal(3, "m", "hold", (-1e5, 1e5), "world"),
+    "reference_velocity": Signal(3, "m/s", "hold", (-1e3, 1e3), "world"),
+    "reference_acceleration": Signal(3, "m/s^2", "hold", (-1e4, 1e4), "world"),
+    "lap": Signal(1, "", "hold", (-1e6, 1e6)),
+    # nothing flies on less: a meter that was not read
+    "battery_voltage": Signal(1, "V", "linear", (1.0, 100.0)),
 }
 
 

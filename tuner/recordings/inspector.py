@@ -171,7 +171,7 @@ def _with_signals(read: Signals) -> Inspection:
             SignalReport(
                 name,
                 read.places[name].topic,
-                SIGNALS[name][1],
+                SIGNALS[name].unit,
                 len(samples.time),
                 samples.rate,
                 measured[name],
@@ -290,9 +290,8 @@ def inlet_reports(
         measured = {"command": (0, 1, 2, 3), **measured}
     available = []
     for name, needs in _SIGNALS_OF_INLETS.items():
-        missing = [need for need in needs if need not in measured]
-        if trajectory and "reference_position" in missing:
-            missing.remove("reference_position")
+        known = {*measured, "reference_position"} if trajectory else {*measured}
+        missing = [need for need in needs if need not in known]
         for need in ("command", "rotor_speed"):
             columns = measured.get(need)
             if need in needs and columns is not None and len(columns) < 4:
@@ -488,7 +487,7 @@ def _map_text(
         text.append(f"  {signal}: {_inline_yaml(about)}      # {why[signal]}")
     lacking = [signal for signal in SUGGESTED_SIGNALS if signal not in found]
     for signal in lacking:
-        dots = ", ".join(["..."] * SIGNALS[signal][0])
+        dots = ", ".join(["..."] * SIGNALS[signal].columns)
         text.append(f"  # {signal}: {{fields: [{dots}], unit: si}}      # no column seems so")
     if unused:
         text.append(f"# not used: {', '.join(ascii(column)[1:-1] for column in unused)}")

@@ -21,7 +21,7 @@ MAX_STRETCH_S = 60.0
 
 def resample(signal: str, series: Series, clock: Array) -> Array:
     """Return the (N, k) values of a signal on a uniform clock (N,), NaN where none are known."""
-    columns, _, interpolation = SIGNALS[signal]
+    columns, interpolation = SIGNALS[signal].columns, SIGNALS[signal].interpolation
     result = np.full((len(clock), columns), np.nan)
     if len(series.time) == 0:
         return result

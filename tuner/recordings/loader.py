@@ -111,7 +111,7 @@ def gap_notes(
 ) -> Iterator[Note]:
     """Yield notes on signals with gaps."""
     for name, values in signals.items():
-        if SIGNALS[name][2] == "hold":
+        if SIGNALS[name].interpolation == "hold":
             continue
         known = np.isfinite(values).any(axis=1)
         unknown = int((~known).sum())
@@ -122,7 +122,7 @@ def gap_notes(
 
 
 def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> Array:
-    if grid is not None and SIGNALS[signal][2] == "hold" and len(series.time) > 1:
+    if grid is not None and SIGNALS[signal].interpolation == "hold" and len(series.time) > 1:
         series = Series(grid.snap(series.time), series.values)
     if signal.startswith("reference_"):
         series = with_gaps_filled(series)

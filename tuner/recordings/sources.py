@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 from tuner.core.errors import RecordingError
+from tuner.recordings.flight import SIGNALS
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.notes import Note, NoteCode, reason_in_words
 from tuner.recordings.recording import Clock, Recording
 from tuner.recordings.topics import Source, TopicMap
-from tuner.recordings.unit_detection import ATTITUDES
 
 #: Unit as written -> unit of a topic map.
 UNIT_SPELLINGS: Mapping[str, str] = {
@@ -356,7 +356,7 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
         near = difflib.get_close_matches(missing[0], recording.fields(topic), n=1)
         names = (missing[0], signal, *near)
         return None if absent else Note(NoteCode.FIELD_MISSING, topic=topic, names=names)
-    if source.quaternion == "xyzw" and signal in ATTITUDES:
+    if source.quaternion == "xyzw" and SIGNALS[signal].axes == "attitude":
         fields = (fields[3], *fields[:3])
     unit = source.unit or (usual.unit if usual and not source.fields else "si")
     return Place(source, topic, fields, unit, source.frame or (usual.frame if usual else "enu_flu"))

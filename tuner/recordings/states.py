@@ -65,7 +65,7 @@ def states_at(series: Mapping[str, Series], times: Array) -> States:
 
     def read(name: str) -> Array:
         if name not in series:
-            return np.full((len(times), SIGNALS[name][0]), np.nan)
+            return np.full((len(times), SIGNALS[name].columns), np.nan)
         return local_parabolas(series[name], times)
 
     velocity = read("velocity")
@@ -150,7 +150,7 @@ def initial_state(series: Mapping[str, Series]) -> InitialState:
     hover = in_hover(series)
 
     def at_start(name: str, *, line: bool = False) -> Array:
-        columns = SIGNALS[name][0]
+        columns = SIGNALS[name].columns
         if name not in series:
             return np.full(columns, np.nan)
         return np.array([_at_start(series[name], c, hover, line) for c in range(columns)])

@@ -20,7 +20,7 @@ from tuner.recordings import formats as recording_formats
 from tuner.recordings.flight import SIGNALS
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.recording import Clock
-from tuner.recordings.unit_detection import ATTITUDES, UNITS
+from tuner.recordings.unit_detection import UNITS
 from tuner.vehicle.motor_orders import MotorOrder
 
 #: Maps may extend maps to this depth.
@@ -137,10 +137,10 @@ class TopicMap(Section):
         for name, sources in self.signals.items():
             if name not in SIGNALS:
                 raise refuse(f"unknown signal '{name}'", did_you_mean(name, SIGNALS))
-            columns = SIGNALS[name][0]
+            known = SIGNALS[name]
             for source in sources:
-                angles = source.quaternion == "rpy" and name in ATTITUDES
-                wanted = 3 if angles else columns
+                angles = source.quaternion == "rpy" and known.axes == "attitude"
+                wanted = 3 if angles else known.columns
                 count = wanted if source.fields is None else len(source.fields)
                 if source.rotor is None and count != wanted:
                     raise refuse(f"signal '{name}' has {count} fields", f"name all {wanted}")

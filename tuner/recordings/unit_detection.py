@@ -23,7 +23,7 @@ import numpy as np
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
-from tuner.recordings.flight import RawSeries
+from tuner.recordings.flight import SIGNALS, RawSeries
 from tuner.recordings.interpolation import both_known, rotate, upward
 from tuner.recordings.notes import Note, NoteCode
 
@@ -47,18 +47,6 @@ UNITS: Mapping[str, tuple[float, float]] = {
     "signed": (0.5, 0.5),
 }
 
-#: Signals in world, and in body axes.
-WORLD_SIGNALS = {
-    "position",
-    "velocity",
-    "reference_position",
-    "reference_velocity",
-    "reference_acceleration",
-}
-BODY_SIGNALS = {"body_rate", "acceleration", "rate_setpoint", "commanded_torque"}
-#: Signals that are quaternions.
-ATTITUDES = {"attitude", "attitude_setpoint"}
-
 
 def to_si(values: Array, unit: str) -> Array:
     """Convert recorded numbers of any shape to SI."""
@@ -72,13 +60,14 @@ def to_enu_flu(values: Array, signal: str) -> Array:
     A quaternion from FRD to NED becomes one from FLU to ENU: the world turns by
     (0, 1, 1, 0)/sqrt(2), the body by (0, 1, 0, 0).
     """
-    if signal in WORLD_SIGNALS:
+    axes = SIGNALS[signal].axes
+    if axes == "world":
         north, east, down = values.T
         return np.column_stack([east, north, -down])
-    if signal in BODY_SIGNALS:
+    if axes == "body":
         forward, right, down = values.T
         return np.column_stack([forward, -right, -down])
-    if signal in ATTITUDES:
+    if axes == "attitude":
         w, x, y, z = values.T
         return np.column_stack([w + z, x + y, x - y, w - z]) / math.sqrt(2)
     if signal == "thrust_setpoint":  # PX4's thrust points down
@@ -298,11 +287,10 @@ def units_of_references(
     flown, wanted = (math.sqrt(np.nanmean(np.square(recorded[name].values))) for name in names)
     if wanted < flown * math.sqrt(UNITS[unit][0]):
         return {}
-    lengths = WORLD_SIGNALS - set(LENGTH_SIGNALS)
     return {
         name: (unit, replace(note, names=(name, note.names[1])))
         for name in recorded
-        if name in lengths
+        if SIGNALS[name].axes == "world" and name not in LENGTH_SIGNALS
     }
 
 

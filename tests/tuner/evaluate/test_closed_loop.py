@@ -30,7 +30,7 @@ def fly(vehicle, name="circle", controller=None, **options):
 def test_signals_are_those_of_a_flight_on_a_uniform_clock(circle):
     np.testing.assert_allclose(circle.time, np.arange(401) / 100)
     for name, values in circle.signals.items():
-        assert values.shape == (401, SIGNALS[name][0]), name
+        assert values.shape == (401, SIGNALS[name].columns), name
         assert np.isfinite(values).all(), name
     assert circle.crash_time is None
 

@@ -87,10 +87,10 @@ def test_angular_drag_is_written_and_none_is_zero(vehicle):
 
 
 def test_what_px4_does_not_accept_is_a_gate(vehicle):
-    assert outside_range({"SIM_GZ_EC_MAX1": 1066}) == (
+    assert tuple(outside_range({"SIM_GZ_EC_MAX1": 1066})) == (
         "SIM_GZ_EC_MAX1 1066: PX4 accepts 0 to 1000",
     )
-    assert outside_range({"SIH_KDW": -1.0, "SIH_IXY": -1.0}) == (
+    assert tuple(outside_range({"SIH_KDW": -1.0, "SIH_IXY": -1.0})) == (
         "SIH_KDW -1: PX4 accepts at least 0",
     )
     heavy = px4_draft(vehicle.replace(mass=5.8), "", SIH)

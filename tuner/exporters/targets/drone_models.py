@@ -29,6 +29,9 @@ from tuner.exporters.target import PLACE_TOLERANCE_M, Target, numbers_draft, rea
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
+ORDER = [0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]
+"""Swaps velocity and attitude, whose scalar its state has last; rotor speeds in rpm follow."""
+
 
 def params(vehicle: VehicleFile) -> dict[str, Any]:
     """Return the parameters of the first-principles model of a vehicle by its laws."""
@@ -110,23 +113,22 @@ def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
             self.period, self.state = step, np.zeros(17)
 
         def begin(self, state: Array, rotor_speed: Array) -> None:
-            # position, attitude x y z w, velocity, body rate, rotor speeds in rpm
-            order = [0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]
-            self.state = np.concatenate([state[order], rotor_speed / RAD_S_PER_RPM])
+            self.state = np.concatenate([state[ORDER], rotor_speed / RAD_S_PER_RPM])
 
         def step(self, asked: Array) -> tuple[Array, Array]:
             def change(s: Array) -> Array:
-                found = dynamics(
-                    s[:3],
-                    s[3:7],
-                    s[7:10],
-                    s[10:13],
-                    asked / RAD_S_PER_RPM,
-                    s[13:],
-                    J_inv=inverse,
-                    **arrays,
-                )
-                found = list(found)
+                found = [
+                    *dynamics(
+                        s[:3],
+                        s[3:7],
+                        s[7:10],
+                        s[10:13],
+                        asked / RAD_S_PER_RPM,
+                        s[13:],
+                        J_inv=inverse,
+                        **arrays,
+                    )
+                ]
                 rate, vector, scalar = s[10:13], s[3:6], s[6]  # its own change of attitude is wrong
                 turn = scalar * rate + np.cross(vector, rate)
                 found[1] = 0.5 * np.append(turn, -vector @ rate)
@@ -140,8 +142,7 @@ def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
             state = state + period / 6 * (first + 2 * second + 2 * third + fourth)
             state[3:7] /= np.linalg.norm(state[3:7])
             self.state = state
-            order = [0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]
-            return state[order], state[13:] * RAD_S_PER_RPM
+            return state[ORDER], state[13:] * RAD_S_PER_RPM
 
     return flier_of(Flying)
 

@@ -178,7 +178,7 @@ def px4_draft(vehicle: VehicleFile, provenance: str, simulator: Simulator, *_: o
         notes,
         lambda path, _: differences(wanted, read_parameters(path)),
         gates=(
-            Gate("PX4 accepts every parameter", outside_range(wanted)),
+            Gate("PX4 accepts every parameter", tuple(outside_range(wanted))),
             Gate("the simulator has such rotors", tuple(_rotor_faults(vehicle, simulator))),
         ),
     )
@@ -235,15 +235,13 @@ Source: module.yaml of control_allocator, mc_pos_control, simulator_sih and gz_b
 """
 
 
-def outside_range(parameters: Mapping[str, float | int]) -> tuple[str, ...]:
-    """Return a clause for each parameter that PX4 does not accept."""
-    clauses = []
+def outside_range(parameters: Mapping[str, float | int]) -> Iterator[str]:
+    """Yield a clause for each parameter that PX4 does not accept."""
     for name, value in parameters.items():
         for pattern, (low, high) in RANGES.items():
             if re.fullmatch(pattern, name) and not low <= value <= high:
                 limit = f"{low:g} to {high:g}" if math.isfinite(high) else f"at least {low:g}"
-                clauses.append(f"{name} {value:.4g}: PX4 accepts {limit}")
-    return tuple(clauses)
+                yield f"{name} {value:.4g}: PX4 accepts {limit}"
 
 
 def parameters_text(parameters: Mapping[str, float | int], header: str) -> str:
