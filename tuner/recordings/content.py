@@ -257,8 +257,7 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     if signals.no_pose is not None:
         raise signals.no_pose
     topics = signals.topics
-    series, dead = _without_dead_commands(signals.series, topics)
-    series, none = _without_dead_tachometers(series, topics)
+    series, dead = _without_dead_rotors(signals.series, topics)
     series, shifted = align_pose(series, topics)
     series, turned = correct_frames(series, topics)
     cut, stale = without_stale_end(series)
@@ -270,7 +269,7 @@ def content_of(signals: Signals, sidecar: Sidecar) -> Content:
     denied = contradiction(series, missions)
     if denied is not None:  # it explains the doubts about frames
         turned = (*(note for note in turned if note.code not in DOUBTS), denied)
-    notes = (*signals.notes, *shifted, *turned, *stale, *dead, *none)
+    notes = (*signals.notes, *shifted, *turned, *stale, *dead)
     read = vars(signals) | {"series": series, "notes": notes}
     return Content(**read, missions=missions)
 
@@ -310,48 +309,35 @@ MIN_COMMAND_RANGE = 0.05
 """A smaller range of commands may be a hover, in whole microseconds of PWM."""
 
 
-def _without_dead_commands(
+def _without_dead_rotors(
     series: Mapping[str, Series], topics: Mapping[str, str]
 ) -> tuple[dict[str, Series], tuple[Note, ...]]:
-    """Return signals without the commands, if one rotor's never change while others' do."""
-    others = dict(series)
-    if "command" not in others:
-        return others, ()
-    values = others["command"].values
-    change = np.fmax.reduce(values, axis=0) - np.fmin.reduce(values, axis=0)
-    dead = np.flatnonzero(change == 0.0)
-    if len(dead) == 0 or len(values) < MIN_SAMPLES or not (change > MIN_COMMAND_RANGE).any():
-        return others, ()
-    del others["command"]
-    rotors = tuple(str(rotor) for rotor in dead)
-    return others, (
-        Note(NoteCode.COMMAND_DEAD, "warning", topics["command"], len(rotors), names=rotors),
-    )
+    """Return signals without dead commands and rotor speeds, and notes on those.
 
-
-def _without_dead_tachometers(
-    series: Mapping[str, Series], topics: Mapping[str, str]
-) -> tuple[dict[str, Series], tuple[Note, ...]]:
-    """Return signals without dead rotor speeds, and a note on rotors without tachometer.
-
-    A speed is dead if it is always 0, or never changes while others do.
+    All commands are left out if one rotor's never change while others' do. A rotor speed is dead if
+    it is always 0, or never changes while others do.
     """
-    others, speeds = dict(series), series.get("rotor_speed")
-    if speeds is None:
-        return others, ()
-    low, high = np.fmin.reduce(speeds.values, axis=0), np.fmax.reduce(speeds.values, axis=0)
-    still = (low == high) & (np.isfinite(speeds.values).sum(axis=0) >= MIN_SAMPLES)
-    dead = still & ((high == 0.0) | (low < high).any())
-    values = np.where(dead, np.nan, speeds.values)
-    known = np.isfinite(values).any(axis=1)
-    others["rotor_speed"] = Series(speeds.time[known], values[known])
-    if not known.any():
-        del others["rotor_speed"]
-    missing = np.flatnonzero(np.isnan(values).all(axis=0))
-    if len(missing) == 0:
-        return others, ()
-    rotors, topic = tuple(str(rotor) for rotor in missing), topics["rotor_speed"]
-    return others, (Note(NoteCode.NO_TACHOMETER, "info", topic, len(rotors), names=rotors),)
+    others, notes = dict(series), list[Note]()
+    commands, speeds = (series.get(name) for name in PER_MOTOR)
+    if commands is not None and len(commands.values) >= MIN_SAMPLES:
+        change = np.fmax.reduce(commands.values, axis=0) - np.fmin.reduce(commands.values, axis=0)
+        if (change == 0.0).any() and (change > MIN_COMMAND_RANGE).any():
+            del others["command"]
+            rotors, topic = tuple(map(str, np.flatnonzero(change == 0.0))), topics["command"]
+            notes.append(Note(NoteCode.COMMAND_DEAD, "warning", topic, len(rotors), names=rotors))
+    if speeds is not None:
+        low, high = np.fmin.reduce(speeds.values, axis=0), np.fmax.reduce(speeds.values, axis=0)
+        still = (low == high) & (np.isfinite(speeds.values).sum(axis=0) >= MIN_SAMPLES)
+        dead = still & ((high == 0.0) | (low < high).any())
+        turning = replace(speeds, values=np.where(dead, np.nan, speeds.values))
+        others["rotor_speed"] = turning.where(np.asarray(np.isfinite(turning.values).any(axis=1)))
+        if not len(others["rotor_speed"].time):
+            del others["rotor_speed"]
+        missing = np.flatnonzero(np.isnan(turning.values).all(axis=0))
+        rotors, topic = tuple(map(str, missing)), topics["rotor_speed"]
+        if rotors:
+            notes.append(Note(NoteCode.NO_TACHOMETER, "info", topic, len(rotors), names=rotors))
+    return others, tuple(notes)
 
 
 def _choose_missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:
@@ -383,11 +369,10 @@ def extract(
         its defects and times since the first position (without one, since the first sample); the
         messages they come from; and notes.
     """
-    wanted: dict[str, list[str]] = {}
+    wanted: dict[str, dict[str, None]] = {}
     for place in places.values():
-        fields = wanted.setdefault(place.topic, [])
-        extra = [place.source.rotor] if place.source.rotor else []
-        fields.extend(name for name in (*place.fields, *extra) if name not in fields)
+        fields = [*place.fields, *([place.source.rotor] if place.source.rotor else ())]
+        wanted.setdefault(place.topic, {}).update(dict.fromkeys(fields))
     contents = recording.read({topic: tuple(names) for topic, names in wanted.items()}, clocks)
     receive_only = {p.topic for p in places.values() if p.source.stamp == "receive"}
     kinds = {t: {s for s, place in places.items() if place.topic == t} for t in wanted}
