@@ -351,10 +351,9 @@ def recordings_of(run: Run) -> RunInputs:
     wanted = {flight.name: flight for flight in run.result.flights}
     readable, _ = read_recordings(settings, fits=False)
     recordings = tuple(r for r in readable if r.flight.name in wanted)
-    if gone := sorted(set(wanted) - {r.flight.name for r in recordings}):
-        raise InputError(wanted[gone[0]].path, "is not the recording of the run", "fit it again")
-    for flight in (recording.flight for recording in recordings):
-        if flight.sha256 != wanted[flight.name].sha256:
+    read = {r.flight.name: r.flight.sha256 for r in recordings}
+    for name, flight in wanted.items():
+        if read.get(name) != flight.sha256:
             raise InputError(flight.path, "is not the recording of the run", "fit it again")
     late = {name: flight.input_late for name, flight in wanted.items()}
     return settings, with_known(recordings, input_late=late)
