@@ -22,7 +22,7 @@ from tuner.objective.information import Change, FisherInformation
 from tuner.objective.space import Space
 from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import covariance_of
-from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.estimates import READINGS, STUDENT_FACTOR, Uncertainty
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.records import CONFLICT_SE, Sources
 from tuner.vehicle import COEFFICIENTS
@@ -38,18 +38,20 @@ MIN_OWN_INFORMATION = 0.01
 class Split(NamedTuple):
     """Flights that need another value of a coefficient than the others.
 
-    ``number`` is the coefficient's, ``error`` the difference's were residuals independent.
+    ``number`` is the coefficient's, ``error`` the difference's were residuals independent, and
+    ``read`` that by errors of the voltmeter, which last for seconds and differ between flights.
     """
 
     number: int
     flights: NDArray[np.intp]
     difference: float
     error: float
+    read: float = 0.0
 
     @property
     def ratio(self) -> float:
         """The difference in standard errors."""
-        return self.difference / self.error
+        return self.difference / float(np.hypot(self.error, self.read))
 
 
 def flights_disagree(fitted: Fitted, examination: Examination) -> tuple[Finding, ...]:
@@ -72,7 +74,9 @@ def flights_disagree(fitted: Fitted, examination: Examination) -> tuple[Finding,
     if not splits:
         return ()
     split = max(splits, key=lambda one: abs(one.ratio))
-    error = float(covariance_of(_with_two_values(information, split)).error[-1])
+    error = float(
+        np.hypot(covariance_of(_with_two_values(information, split)).error[-1], split.read)
+    )
     sure = abs(split.difference) > float(ndtri(1.0 - 0.5 * FALSE_ALARM_LEVEL / len(splits))) * error
     reference = float(uncertainty.reference[split.number])
     if not sure or abs(split.difference) < MIN_DIFFERENCE * reference:
@@ -90,6 +94,10 @@ def _splits(information: FisherInformation, searched: Sequence[int], flights: in
     np.add.at(score, information.flight, information.score.sum(axis=(0, 2)))
     inverse = information.inverse.matrix
     to_minimum = -inverse @ information.slope
+    drawn = [one for name, one in information.changes.items() if name.startswith(READINGS)]
+    read = np.zeros((max(len(drawn), 1), flights, size))
+    for slopes, change in zip(read, drawn, strict=False):
+        np.add.at(slopes, information.flight, change.across.sum(axis=(0, 2)))
 
     def split(index: int, some: NDArray[np.intp]) -> Split:
         across = blocks[some, :, index].sum(axis=0)
@@ -97,7 +105,9 @@ def _splits(information: FisherInformation, searched: Sequence[int], flights: in
         if own <= MIN_OWN_INFORMATION * across[index]:
             return Split(index, np.sort(some), 0.0, np.inf)
         left = score[some, index].sum() + across @ to_minimum
-        return Split(index, np.sort(some), float(-left / own), float(own**-0.5))
+        moved = (read[:, some, index].sum(axis=1) - read.sum(axis=1) @ inverse @ across) / own
+        by_readings = STUDENT_FACTOR * float(np.sqrt(np.mean(moved**2)))
+        return Split(index, np.sort(some), float(-left / own), float(own**-0.5), by_readings)
 
     splits = []
     for index in searched:

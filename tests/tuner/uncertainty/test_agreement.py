@@ -9,7 +9,7 @@ import pytest
 
 from tuner.equation_error.rate_controller import ControllerEstimate
 from tuner.findings.findings import Code, Finding
-from tuner.objective.information import FisherInformation
+from tuner.objective.information import Change, FisherInformation
 from tuner.uncertainty.agreement import flights_disagree
 from tuner.uncertainty.model_error import ModelErrors
 
@@ -73,6 +73,16 @@ def test_flights_of_another_vehicle_are_named_with_the_coefficient():
 def test_flights_of_one_vehicle_agree(memory, shift):
     fits = (fit_of(seed, 0.0, memory=memory, shift=shift) for seed in range(100))
     assert not any(flights_disagree(*fit) for fit in fits)
+
+
+def test_what_a_voltmeter_may_have_misread_is_no_second_value():
+    """Other readings in two flights would move what these need by as much as they differ."""
+    fitted, examination = fit_of(0, 0.1)
+    blocks = examination.information.blocks
+    across = 0.1 * blocks[..., 1] * np.array([0.0, 1.0, 0.0, 1.0])[:, None, None]
+    own = np.zeros(across.shape[:-1])
+    examination.information.changes["readings 0"] = Change(across, own, own)
+    assert not flights_disagree(fitted, examination)
 
 
 def test_a_coefficient_that_one_flight_determines_has_no_second_value():
