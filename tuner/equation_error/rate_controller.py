@@ -122,12 +122,20 @@ def _apart(
     rest: Sequence[int],
     axis: int,
 ) -> float:
-    """Return the difference of a flight's P from the others' in standard errors; 0 for chance."""
+    """Return the difference of a flight's P from the others' in standard errors; 0 for chance.
+
+    The flight's error is that if its P were the others' (a score test): the instruments of one
+    flight are weak, and where chance makes them seem strong the error about an estimate is small,
+    and the estimate off.
+    """
     others = [other for other in rest if other != number]
-    own, all_others = (
-        _axis_estimates([recorded[i] for i in some], [simulated[i] for i in some], axis).get("P")
-        for some in ([number], others)
-    )
+
+    def of(some: Sequence[int], p: float | None = None) -> _Part | None:
+        flown = [recorded[i] for i in some], [simulated[i] for i in some]
+        return _axis_estimates(*flown, axis, p=p).get("P")
+
+    all_others = of(others)
+    own = None if all_others is None else of([number], all_others.value)
     if own is None or all_others is None or own.sd > MAX_SD_OF_ONE_FLIGHT:
         return 0.0
     sd, off = float(np.hypot(own.sd, all_others.sd)), abs(own.value - all_others.value)
@@ -159,9 +167,12 @@ class _Part(NamedTuple):
 
 
 def _axis_estimates(
-    recorded: Sequence[Signals], simulated: Sequence[Signals], axis: int
+    recorded: Sequence[Signals], simulated: Sequence[Signals], axis: int, *, p: float | None = None
 ) -> dict[str, _Part]:
-    """Return the parts of one axis; none where the regression is singular."""
+    """Return the parts of one axis; none where the regression is singular.
+
+    With ``p``, errors are those if P were so many times the file's.
+    """
     real = [_regression(signals, axis) for signals in recorded]
     made = [
         _as_instrument(_regression(signals, axis), torque)
@@ -173,10 +184,14 @@ def _axis_estimates(
     if not own.any() or min(map(_condition, (own, total))) < MIN_RECIPROCAL_CONDITION:
         return {}
     of_file = np.linalg.solve(own, np.sum([z.T @ torque for z, torque in made], axis=0))
-    gains = np.linalg.solve(total, np.sum([z.T @ torque for (z, _), (_, torque) in both], axis=0))
+    moments = np.sum([z.T @ torque for (z, _), (_, torque) in both], axis=0)
+    gains = supposed = np.linalg.solve(total, moments)
+    if p is not None:
+        left = moments - total[:, 0] * p * of_file[0]
+        supposed = np.append(p * of_file[0], np.linalg.solve(total[1:, 1:], left[1:]))
     scores, square = [], np.zeros((3, 3))
     for (z, _), (x, torque), signals in zip(made, real, recorded, strict=True):
-        left = torque - x @ gains
+        left = torque - x @ supposed
         square += _square_of_sum(z, left, max(1, round(MEMORY_S / signals.step)))
         many = max(round(len(left) * signals.step / STRETCH_S), 1)
         scores += [z[rows].T @ left[rows] for rows in np.array_split(np.arange(len(left)), many)]
