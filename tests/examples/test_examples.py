@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from examples import simulate_bench
+from examples import published_experiments, simulate_bench
 from tuner.exporters.targets.px4 import read_parameters
 from tuner.result import read_run
 from tuner.vehicle import read_vehicle
@@ -53,9 +53,9 @@ def test_the_example_goes_from_recordings_to_a_simulator(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_experiments_show_what_was_published(tmp_path):
-    said = said_by("published_experiments.py", tmp_path)
-    lines = [line.split() for line in said.splitlines()]
+def test_the_experiments_show_what_was_published(capsys):
+    published_experiments.main("hovergames")
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
 
     hover = {words[0]: [float(word) for word in words[1:]] for words in lines if len(words) == 4}
     assert hover["original"] == pytest.approx([0.672, 772, 0.013], abs=0.6)

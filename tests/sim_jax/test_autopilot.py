@@ -47,7 +47,7 @@ SAMPLES = 150
 
 
 def craft_with(effects):
-    return replace(vehicle(), effects={name: jnp.asarray(v) for name, v in effects.items()})
+    return replace(vehicle(), effects={name: jnp.asarray(v, float) for name, v in effects.items()})
 
 
 @cache
