@@ -394,7 +394,7 @@ def with_commands(flight: Flight, vehicle: VehicleFile) -> Flight:
         series={**flight.series, "command": series},
         signals={**flight.signals, "command": on_clock},
         initial=replace(flight.initial, command=nearest),
-        notes=(*flight.notes, Note(NoteCode.COMMAND_DERIVED)),
+        notes=(*flight.notes, NoteCode.COMMAND_DERIVED.note()),
     )
 
 
@@ -500,7 +500,7 @@ def _scaled(flight: Flight, factor: float, name: str) -> Flight:
     series = flight.series["rotor_speed"]
     speeds = {"rotor_speed": Series(series.time, factor * series.values)}
     signals = {"rotor_speed": factor * flight.signals["rotor_speed"]}
-    read = Note(NoteCode.UNIT_READ, count=len(series.time), names=("rotor_speed", name))
+    read = NoteCode.UNIT_READ.note("rotor_speed", name, count=len(series.time))
     return replace(
         flight,
         signals={**flight.signals, **signals},

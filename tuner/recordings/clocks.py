@@ -90,18 +90,19 @@ def message_times(
     for topic, offset in offsets.items():
         if abs(offset - common) > MIN_CLOCK_OFFSET_NS:
             times[topic] = times[topic] - (offset - common)
-            shift = {"seconds": (offset - common) / NS_PER_SECOND}
-            count = len(times[topic])
-            notes.append(Note(NoteCode.OTHER_CLOCK, topic=topic, count=count, numbers=shift))
+            seconds, count = (offset - common) / NS_PER_SECOND, len(times[topic])
+            notes.append(NoteCode.OTHER_CLOCK.note(topic=topic, count=count, seconds=seconds))
     for topic, messages in samples.items():
         if topic not in times:
             # Where stamps count from a start-up, arrivals are shifted to count from there too.
             times[topic] = messages.receive + (common if abs(common) > NS_PER_SECOND else 0)
             if topic in unset_topics:
-                notes.append(Note(NoteCode.STAMPS_UNSET, topic=topic, count=len(messages.receive)))
+                notes.append(NoteCode.STAMPS_UNSET.note(topic=topic, count=len(messages.receive)))
             elif topic not in receive_only:
                 kind: Kind = "info" if topic in slow_topics else "warning"
-                notes.append(Note(NoteCode.NO_HEADER, kind, topic, len(messages.receive)))
+                notes.append(
+                    NoteCode.NO_HEADER.note(kind=kind, topic=topic, count=len(messages.receive))
+                )
     return times, tuple(notes)
 
 
@@ -136,7 +137,7 @@ def _repair_stamps(
         fixed[rows] = receive[rows] + (stamp[near] - receive[near])
         wrong += rows.stop - rows.start
     if wrong:
-        notes.append(Note(NoteCode.STAMPS_REPLACED, topic=topic, count=wrong))
+        notes.append(NoteCode.STAMPS_REPLACED.note(topic=topic, count=wrong))
     if steps:
         bounds = [0, *(at + 1 for at in steps), len(stamp)]
         parts = list(pairwise(bounds))
@@ -145,8 +146,7 @@ def _repair_stamps(
         for (a, b), offset in zip(parts, level, strict=True):
             fixed[a:b] -= offset - level[longest]
         largest = max(abs(offset - level[longest]) for offset in level) / NS_PER_SECOND
-        jump = {"seconds": largest}
-        notes.append(Note(NoteCode.CLOCK_JUMPED, topic=topic, count=len(steps), numbers=jump))
+        notes.append(NoteCode.CLOCK_JUMPED.note(topic=topic, count=len(steps), seconds=largest))
     return fixed, notes
 
 
@@ -300,10 +300,9 @@ def align_pose(
     if abs(offset) < MIN_POSE_OFFSET_S:
         if is_table:
             return aligned, ()
-        return aligned, (Note(NoteCode.POSE_ON_TIME, "info", topic, numbers={"seconds": offset}),)
+        return aligned, (NoteCode.POSE_ON_TIME.note(kind="info", topic=topic, seconds=offset),)
     for signal, samples in series.items():
         if topics.get(signal) == topic and (signal in POSE_SIGNALS or not is_table):
             aligned[signal] = Series(samples.time - offset, samples.values)
     count = len(series["attitude"].time)
-    moved = Note(NoteCode.POSE_MOVED, topic=topic, count=count, numbers={"seconds": offset})
-    return aligned, (moved,)
+    return aligned, (NoteCode.POSE_MOVED.note(topic=topic, count=count, seconds=offset),)

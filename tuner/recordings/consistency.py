@@ -220,8 +220,11 @@ def correct_frames(
             values = reading.read(measured.values, on_clock(fixed, "attitude", measured.time))
             fixed[signal] = replace(measured, values=values).complete()
             flown[signal] = on_clock(fixed, signal, clock)
-            count, names = len(measured.time), (signal, reading.name)
-            notes.append(Note(NoteCode.FRAME_TURNED, topic=topic, count=count, names=names))
+            notes.append(
+                NoteCode.FRAME_TURNED.note(
+                    signal, reading.name, topic=topic, count=len(measured.time)
+                )
+            )
         covering = _COVERED.get(signal)
         if covering is not None and not doubts and not covering & {note.code for note in notes}:
             doubts = _single_axis_doubts(signal, flown)
@@ -242,8 +245,7 @@ def _with_clock_doubted(notes: Sequence[Note]) -> Sequence[Note]:
     if not 0.0 < abs(turned - moved) <= MAX_CLOCK_DIFFERENCE * turned:
         return notes
     others = [note for note in notes if note.code is not NoteCode.AXIS_DOUBTED]
-    numbers = {"times": turned}
-    return [*others, Note(NoteCode.CLOCK_DOUBTED, numbers=numbers, names=tuple(times))]
+    return [*others, NoteCode.CLOCK_DOUBTED.note(*times, times=turned)]
 
 
 def _is_axis_doubt(note: Note, signal: str) -> bool:
@@ -264,7 +266,7 @@ def _saturation(gyro: Series, topic: str) -> list[Note]:
     count = sum(behind - first for first, behind, _ in stays)
     if limit < CLEAR_TURN_RATE or len(signs) < 2 or count < MIN_SATURATED:
         return []
-    return [Note(NoteCode.GYRO_SATURATED, "warning", topic, count, {"limit": limit})]
+    return [NoteCode.GYRO_SATURATED.note(topic=topic, count=count, limit=limit)]
 
 
 def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
@@ -276,7 +278,7 @@ def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
         ups = np.nansum([change[:, 2], recorded[:, 2]], axis=1)
         if signal == "acceleration" and ups[0] * ups[1] < 0.0:  # the weight alone tells the axes
             return READINGS[signal][0], []
-        unmatched = Note(pair.doubt, numbers={"left": 1.0, "agreement": 0.0})
+        unmatched = pair.doubt.note(left=1.0, agreement=0.0)
         return None, [unmatched] if faster > pair.max_unmatched else []
     left, agreement = _residual_share(change, recorded), correlation(change, recorded)
     tried = {
@@ -299,7 +301,7 @@ def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
         of_another_unit = shares[best] < left / 20 and alike[best] > MIN_AGREEMENT
         if shares[best] < min(MAX_BELIEVED_SHARE, left / 2) or of_another_unit:
             return best, []
-    doubt = Note(pair.doubt, numbers={"left": left, "agreement": agreement})
+    doubt = pair.doubt.note(left=left, agreement=agreement)
     return None, [doubt] if left > pair.max_share and agreement < MAX_DOUBTED_AGREEMENT else []
 
 
@@ -355,10 +357,9 @@ def _judge_attitude(_: str, flown: Flown) -> tuple[Reading | None, Sequence[Note
         return READINGS["attitude"][best], []
     by_motion = (upward(q) * pull).sum(axis=1) / np.linalg.norm(pull, axis=1)
     if fit > MIN_AGREEMENT and np.nanmean(by_motion) > UPRIGHT_SHARE:
-        return None, [Note(NoteCode.WEIGHT_NOT_FELT, numbers={"share": upright})]
-    numbers = {"agreement": fit, "upright": upright}
-    doubted = fit < 0.2 or upright < 0.5
-    return None, [Note(NoteCode.ATTITUDE_DOUBTED, numbers=numbers)] if doubted else []
+        return None, [NoteCode.WEIGHT_NOT_FELT.note(share=upright)]
+    doubt = NoteCode.ATTITUDE_DOUBTED.note(agreement=fit, upright=upright)
+    return None, [doubt] if fit < 0.2 or upright < 0.5 else []
 
 
 def _score(fit: float, upright: float) -> float:
@@ -373,13 +374,11 @@ def _single_axis_doubts(signal: str, flown: Flown) -> list[Note]:
         if signal == "velocity" and min(rms(change), rms(recorded)) > pair.min_motion:
             late = lag_between(change, recorded) or 0.0
             if abs(late) > MAX_LAG_S:
-                numbers = {"seconds": late}
-                return [Note(NoteCode.SIGNAL_LATE, numbers=numbers, names=(signal, pair.other))]
+                return [NoteCode.SIGNAL_LATE.note(signal, pair.other, seconds=late)]
         doubts = doubts or list(_axis_doubts(change, recorded, (signal, pair.other)))
     angle = _angle_between(change, recorded) if signal == "body_rate" else 0.0
     if angle > MIN_AXES_ANGLE_RAD and all(note.numbers["times"] > 0 for note in doubts):
-        numbers = {"degrees": float(np.degrees(angle))}
-        return [Note(NoteCode.AXES_TURNED, "warning", numbers=numbers)]
+        return [NoteCode.AXES_TURNED.note(degrees=float(np.degrees(angle)))]
     return doubts
 
 
@@ -408,11 +407,8 @@ def _axis_doubts(motion: Array, recorded: Array, names: tuple[str, str]) -> Iter
             and abs(rms(b) ** 2 - rms(a) ** 2) > mixed_in**2
         )
         if alike < -MIN_SIGN_CORRELATION or of_another_size:
-            numbers = {"times": float(np.copysign(times, alike))}
-            signal, other = names
-            yield Note(
-                NoteCode.AXIS_DOUBTED, "warning", numbers=numbers, names=(signal, name, other)
-            )
+            ratio = float(np.copysign(times, alike))
+            yield NoteCode.AXIS_DOUBTED.note(names[0], name, names[1], times=ratio)
 
 
 def _angle_between(motion: Array, recorded: Array) -> float:
@@ -453,18 +449,17 @@ def contradiction(series: Mapping[str, Series], missions: Sequence[Mission]) -> 
     if not {"position", "attitude"} <= set(parts):
         return None
 
-    def note(agreement: float, *names: str) -> Note:
-        return Note(NoteCode.CONTRADICTED, numbers={"agreement": agreement}, names=names)
-
     flown = {name: on_clock(parts, name, middle_clock(parts)) for name in parts}
     for other, signal, clear in _OPPOSED:
         if signal in flown:
             change, recorded = PAIRS[signal].compared[-1](flown)
             agreement = correlation(change, recorded)
             if agreement < OPPOSED_CORRELATION and min(rms(change), rms(recorded)) > clear:
-                return note(agreement, other, signal)
+                return NoteCode.CONTRADICTED.note(other, signal, agreement=agreement)
     denied = _tilt_contradiction(parts)
-    return None if denied is None else note(denied, "attitude", "position")
+    if denied is None:
+        return None
+    return NoteCode.CONTRADICTED.note("attitude", "position", agreement=denied)
 
 
 def contradiction_in(notes: Sequence[Note]) -> Note | None:

@@ -185,7 +185,7 @@ def read_signals(options: ReadOptions) -> Signals:
     of_log = motor_order_of(recording.parameters)
     order = sidecar.motor_order or of_map or of_log or chosen.motor_order
     notes = [
-        Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),
+        NoteCode.TOPIC_MAP.note(chosen.name, kind="info", count=len(places)),
         *taken,
         *passed_over,
         *unread_columns(recording, chosen, places),
@@ -200,8 +200,8 @@ def read_signals(options: ReadOptions) -> Signals:
         columns = columns_of(order)
         for name in set(PER_MOTOR) & set(raw):
             raw[name] = replace(raw[name], values=raw[name].values[:, columns])
-        names = (order_in_words([column + 1 for column in columns]),)
-        notes.append(Note(NoteCode.MOTOR_ORDER_GIVEN, "info", names=names))
+        words = order_in_words([column + 1 for column in columns])
+        notes.append(NoteCode.MOTOR_ORDER_GIVEN.note(words, kind="info"))
     topics = {signal: places[signal].topic for signal in raw}
     series, dropped = _clean(raw, topics)
     damage = tuple(part.later(_stamp_delay(raw, topics, contents)) for part in contents.damage)
@@ -223,11 +223,11 @@ def _notes_of_places(places: Mapping[str, Place]) -> Iterator[Note]:
     """Yield notes on the sources of signals."""
     speed, reference = places.get("rotor_speed"), places.get("reference_position")
     if speed is not None and speed.source.unit is None:  # what they were taken for
-        yield Note(NoteCode.SPEED_UNIT_OPEN, "info", speed.topic, names=(speed.unit,))
+        yield NoteCode.SPEED_UNIT_OPEN.note(speed.unit, kind="info", topic=speed.topic)
     if {"position", "attitude"} <= set(places) and not set(DRIVING_SIGNALS) & set(places):
-        yield Note(NoteCode.POSE_ALONE)
+        yield NoteCode.POSE_ALONE.note()
     if reference and reference.topic.rpartition("/")[2].startswith(PX4_REFERENCES):
-        yield Note(NoteCode.PX4_REFERENCE, "info", reference.topic)
+        yield NoteCode.PX4_REFERENCE.note(kind="info", topic=reference.topic)
 
 
 def _stamp_delay(
@@ -279,7 +279,7 @@ def _with_times_in_us(raw: dict[str, RawSeries]) -> tuple[dict[str, RawSeries], 
     if not is_too_slow(raw):
         return raw, []
     quick = {name: replace(data, time=1e-3 * data.time) for name, data in raw.items()}
-    return quick, [Note(NoteCode.TIME_READ, count=len(next(iter(raw.values())).time))]
+    return quick, [NoteCode.TIME_READ.note(count=len(next(iter(raw.values())).time))]
 
 
 def _clean(
@@ -324,7 +324,7 @@ def _without_dead_rotors(
         if (change == 0.0).any() and (change > MIN_COMMAND_RANGE).any():
             del others["command"]
             rotors, topic = tuple(map(str, np.flatnonzero(change == 0.0))), topics["command"]
-            notes.append(Note(NoteCode.COMMAND_DEAD, "warning", topic, len(rotors), names=rotors))
+            notes.append(NoteCode.COMMAND_DEAD.note(*rotors, topic=topic, count=len(rotors)))
     if speeds is not None:
         low, high = np.fmin.reduce(speeds.values, axis=0), np.fmax.reduce(speeds.values, axis=0)
         still = (low == high) & (np.isfinite(speeds.values).sum(axis=0) >= MIN_SAMPLES)
@@ -336,7 +336,9 @@ def _without_dead_rotors(
         missing = np.flatnonzero(np.isnan(turning.values).all(axis=0))
         rotors, topic = tuple(map(str, missing)), topics["rotor_speed"]
         if rotors:
-            notes.append(Note(NoteCode.NO_TACHOMETER, "info", topic, len(rotors), names=rotors))
+            notes.append(
+                NoteCode.NO_TACHOMETER.note(*rotors, kind="info", topic=topic, count=len(rotors))
+            )
     return others, tuple(notes)
 
 
@@ -397,8 +399,8 @@ def extract(
         raw = _in_seconds(time, recorded, epoch)
         unit = _recorded_unit(recording, signal, place, raw, position)
         if unit and unit != place.unit:
-            count, names = len(time), (signal, UNIT_PHRASES[unit])
-            inferred.append(Note(NoteCode.UNIT_READ, "warning", place.topic, count, names=names))
+            phrase, count = UNIT_PHRASES[unit], len(time)
+            inferred.append(NoteCode.UNIT_READ.note(signal, phrase, topic=place.topic, count=count))
         values = _in_flight_axes(samples, signal, place, to_si(recorded, unit or "si"))
         if is_tabular(recording.format):  # a row without the signal is no sample of it
             there = np.isfinite(values).any(axis=1)

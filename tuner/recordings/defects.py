@@ -75,7 +75,7 @@ def clean(
 
     def note(count: int, code: NoteCode, kind: Kind = "info", **numbers: float) -> None:
         if count:
-            notes.append(Note(code, kind, topic, int(count), numbers, (signal,)))
+            notes.append(code.note(signal, kind=kind, topic=topic, count=int(count), **numbers))
 
     low, high = SIGNALS[signal].range
     beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
@@ -376,10 +376,8 @@ def without_stale_end(series: Mapping[str, Series]) -> tuple[dict[str, Series], 
             del kept[name]
         else:
             continue
-        numbers = {"seconds": float(time[-1] - time[last])}
-        notes.append(
-            Note(NoteCode.STALE, count=len(time) - last - 1, numbers=numbers, names=(name,))
-        )
+        seconds = float(time[-1] - time[last])
+        notes.append(NoteCode.STALE.note(name, count=len(time) - last - 1, seconds=seconds))
     return kept, notes
 
 

@@ -43,7 +43,7 @@ from tuner.recordings.inspection import (
 from tuner.recordings.interpolation import RATE_HZ, derivative, resample, smooth, upward
 from tuner.recordings.loader import flights_of, flying_stretches, inertial_error, is_inertial
 from tuner.recordings.missions import yaw_spin
-from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.notes import NoteCode
 from tuner.recordings.recording import Samples, Topic
 from tuner.recordings.sources import choose_map, locate, sources_by_name
 from tuner.recordings.topics import Sidecar, Source, TopicMap, shipped_maps
@@ -117,8 +117,8 @@ def _without_pose(signals: Signals) -> Inspection:
     """Return the inspection of a recording of gyro, accelerometer and motor commands alone."""
     flown = flying_stretches(signals)
     error = inertial_error(signals, flown)
-    seconds = {"seconds": float(sum(end - begin for begin, end in flown))}
-    fitted = () if error else (Note(NoteCode.WITHOUT_POSE, "info", numbers=seconds),)
+    seconds = float(sum(end - begin for begin, end in flown))
+    fitted = () if error else (NoteCode.WITHOUT_POSE.note(kind="info", seconds=seconds),)
     return replace(
         _with_signals(signals),
         problem=f"{error.what}; {error.remedy}" if error else None,

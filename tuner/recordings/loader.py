@@ -80,12 +80,12 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
     ticks = dataclasses.replace(grid, origin=grid.origin - start) if grid else None
     notes = list(content.notes)
     if grid is not None and grid.drift:
-        notes.append(Note(NoteCode.CLOCK_DRIFTS, "info", numbers={"drift": grid.drift}))
+        notes.append(NoteCode.CLOCK_DRIFTS.note(kind="info", drift=grid.drift))
     if len(content.missions) > 1:
-        of, number = len(content.missions), {"number": index + 1}
-        notes.append(Note(NoteCode.ONE_OF_SEVERAL, "info", count=of, numbers=number))
+        missions = len(content.missions)
+        notes.append(NoteCode.ONE_OF_SEVERAL.note(kind="info", count=missions, number=index + 1))
     if not mission.fitted:
-        notes.append(Note(NoteCode.NOT_CHOSEN, "info"))
+        notes.append(NoteCode.NOT_CHOSEN.note(kind="info"))
     signals = {name: _on_clock(name, nearby[name], clock, ticks) for name in mission_series}
     notes.extend(gap_notes(signals, mission_series, rate))
     yaw_rate, level_held = yaw_spin(mission_series.get("rate_setpoint"), 0.0, float(clock[-1]))
@@ -117,8 +117,9 @@ def gap_notes(
         unknown = int((~known).sum())
         if unknown > max_gap(series[name].time) * rate:
             longest = max(behind - first for first, behind in runs(~known))
-            times = {"seconds": unknown / rate, "longest": longest / rate}
-            yield Note(NoteCode.SIGNAL_UNKNOWN, count=unknown, numbers=times, names=(name,))
+            yield NoteCode.SIGNAL_UNKNOWN.note(
+                name, count=unknown, seconds=unknown / rate, longest=longest / rate
+            )
 
 
 def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> Array:

@@ -212,6 +212,17 @@ class NoteCode(Worded):
     )
     ONE_OF_SEVERAL = "one_of_several", "mission {number:.0f} of {count} in this recording"
 
+    def note(
+        self,
+        *names: str,
+        kind: Kind = "warning",
+        topic: str = "",
+        count: int = 0,
+        **numbers: float,
+    ) -> Note:
+        """Return a note of this code, with its names and numbers."""
+        return Note(self, kind, topic, count, numbers, names)
+
 
 @dataclass(frozen=True)
 class Note:

@@ -318,9 +318,12 @@ def locate(
             good = [place for place in attempts if isinstance(place, Place)]
             if good:
                 if len(good) > 1:
-                    names = (signal, *(place.topic for place in good[1:4]))
-                    more, topic = len(good) - 1, good[0].topic
-                    notes.append(Note(NoteCode.OTHERS_MATCH, "warning", topic, more, names=names))
+                    taken, *others = (place.topic for place in good)
+                    notes.append(
+                        NoteCode.OTHERS_MATCH.note(
+                            signal, *others[:3], topic=taken, count=len(others)
+                        )
+                    )
                 places[signal] = good[0]
                 break
             refusal = next((found for found in attempts if isinstance(found, Note)), None)
@@ -347,15 +350,15 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
     if fields is None:
         kind = next(known.type for known in recording.topics if known.name == topic)
         wild = "*" in source.topic
-        return None if wild else Note(NoteCode.LAYOUT_UNKNOWN, topic=topic, names=(kind, signal))
+        return None if wild else NoteCode.LAYOUT_UNKNOWN.note(kind, signal, topic=topic)
     missing = recording.missing_fields(topic, fields)
     if missing:
         # a table, or any topic at all, need not hold every signal of a map
         anywhere = is_tabular(recording.format) or source.topic == "*"
         absent = anywhere and len(missing) == len(fields)
         near = difflib.get_close_matches(missing[0], recording.fields(topic), n=1)
-        names = (missing[0], signal, *near)
-        return None if absent else Note(NoteCode.FIELD_MISSING, topic=topic, names=names)
+        note = NoteCode.FIELD_MISSING.note(missing[0], signal, *near, topic=topic)
+        return None if absent else note
     if source.quaternion == "xyzw" and SIGNALS[signal].axes == "attitude":
         fields = (fields[3], *fields[:3])
     unit = source.unit or (usual.unit if usual and not source.fields else "si")
@@ -372,7 +375,7 @@ def unread_columns(
     read |= {clock.field for clock in topics.time}
     columns = [name for topic in recording.topics for name in recording.fields(topic.name)]
     others = tuple(name for name in columns if name not in read)
-    note = Note(NoteCode.COLUMNS_UNREAD, "info", count=len(others), names=others[:MAX_NAMED])
+    note = NoteCode.COLUMNS_UNREAD.note(*others[:MAX_NAMED], kind="info", count=len(others))
     return (note,) if others else ()
 
 
@@ -405,7 +408,7 @@ def with_columns_by_name(
         unwanted = topics.signals.get(signal) == ()
         if signal not in places and not unwanted and not taken & set(fields):
             signals[signal] = (source,)
-            notes.append(Note(NoteCode.COLUMNS_TAKEN, "info", names=(signal, *fields)))
+            notes.append(NoteCode.COLUMNS_TAKEN.note(signal, *fields, kind="info"))
     return whole.replace(signals=signals), tuple(notes)
 
 

@@ -110,7 +110,7 @@ class Table(TabularRecording):
         kept = time != NO_TIME
         if not kept.all():
             lost = int((~kept).sum())
-            notes.append(Note(NoteCode.ROWS_WITHOUT_TIME, topic=TABLE_TOPIC, count=lost))
+            notes.append(NoteCode.ROWS_WITHOUT_TIME.note(topic=TABLE_TOPIC, count=lost))
         fields = {name: values[kept] for name, values in fields.items()}
         samples = Samples(time[kept], time[kept], fields)
         return ReadResult({TABLE_TOPIC: samples}, tuple(notes), tuple(damage))
@@ -272,8 +272,10 @@ def read_times(
     _require_one_start(path, clock.field, times)
     if unit is None or unit == "s":
         return times, ()
-    names = (clock.field, UNIT_NAMES[unit])
-    return times, (Note(NoteCode.UNIT_READ, topic=TABLE_TOPIC, count=len(times), names=names),)
+    read = NoteCode.UNIT_READ.note(
+        clock.field, UNIT_NAMES[unit], topic=TABLE_TOPIC, count=len(times)
+    )
+    return times, (read,)
 
 
 def numbers_of(column: pyarrow.ChunkedArray) -> Array:

@@ -268,9 +268,8 @@ def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
     for unit, name in LENGTH_UNITS.items():
         factor, _ = UNITS[unit]
         if low < scale.per_metre * factor < high:
-            return unit, Note(NoteCode.UNIT_READ, topic=topic, names=(signal, name))
-    numbers = {"times": scale.per_metre}
-    return "si", Note(NoteCode.UNIT_DOUBTED, topic=topic, numbers=numbers, names=(signal,))
+            return unit, NoteCode.UNIT_READ.note(signal, name, topic=topic)
+    return "si", NoteCode.UNIT_DOUBTED.note(signal, topic=topic, times=scale.per_metre)
 
 
 def units_of_references(
