@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import pytest
@@ -180,14 +181,18 @@ def test_only_the_attempt_that_the_table_names_can_commit(idle):
     ]
 
 
-def test_a_lease_that_is_renewed_is_not_taken_away(idle):
+def test_a_lease_that_is_renewed_is_not_taken_away(idle, monkeypatch):
     enter(idle)
+    clock = SimpleNamespace(now=time.time())
+    monkeypatch.setattr("tuner.service.queue.time", SimpleNamespace(time=lambda: clock.now))
     first, second = Queue(idle.database, "a", 0.2), Queue(idle.database, "b", 0.2)
     claim = first.claim()
     for _ in range(4):
-        time.sleep(0.1)
+        clock.now += 0.1
         assert first.report(claim, [], {})
         assert second.recover(own=False) == 0
+    clock.now += 0.3
+    assert second.recover(own=False) == 1
 
 
 def test_a_result_that_takes_longer_to_store_than_a_lease_holds_is_not_fitted_again(
