@@ -190,6 +190,7 @@ def test_a_lease_that_is_renewed_is_not_taken_away(idle, monkeypatch):
     for _ in range(4):
         clock.now += 0.1
         assert first.report(claim, [], {})
+        clock.now += 0.1
         assert second.recover(own=False) == 0
     clock.now += 0.3
     assert second.recover(own=False) == 1
