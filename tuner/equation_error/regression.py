@@ -9,9 +9,10 @@ Four things bias or spoil ordinary least squares:
   and axis, estimated from the residuals (iterated generalised least squares).
 - A fast loop responds within a step, most of all by its rotors' acceleration; noise of rotor speeds
   attenuates their coefficients; and a smoothed log mixes later samples into earlier ones. So
-  columns of moments are replaced by their prediction from columns two steps earlier, beside earlier
-  errors. These hold neither the present innovation nor the present noise (instrumental variables,
-  Ljung 7.6; Söderström and Stoica, Instrumental Variable Methods for System Identification, 1983).
+  columns of moments are replaced by their prediction from columns two or three steps earlier,
+  beside earlier errors. These hold neither the present innovation nor the present noise
+  (instrumental variables, Ljung 7.6; Söderström and Stoica, Instrumental Variable Methods for
+  System Identification, 1983).
 - A loop sees more of a disturbance than a noisy log shows, and a response to it may be a part of
   the innovations. These then correlate with still earlier rotor signals, too, as they do where the
   model omits a lag (residual test; Ljung, 16.6). The size of that correlation estimates the
@@ -39,8 +40,9 @@ instruments predict, and simulated inertia strays."""
 Delays = tuple[int, ...]
 """For each axis, steps by which instruments are earlier than errors; 0 for ordinary regression."""
 NO_DELAYS: Delays = (0,) * 6
-DELAYS: Delays = (0, 0, 0, 2, 2, 2)
-"""Means of neighbouring steps share samples, those of two steps apart do not."""
+DELAYS: Delays = (0, 0, 0, 3, 3, 2)
+"""Means of neighbouring steps share samples, those of two steps apart do not. What a loop sees of
+disturbances, and its log does not, stays in roll's and pitch's innovations for a step more."""
 BIAS_LAGS = 8
 """Number of steps before the instruments in which `feedback_bias` looks for correlation."""
 MAX_ROUNDS = 8

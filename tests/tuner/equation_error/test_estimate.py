@@ -199,7 +199,7 @@ def test_moments_count_only_beside_earlier_errors():
     responses[1:, 3:] += errors[:-1, 3:, None]
     steps, kernels = (
         SimpleNamespace(known=np.ones(size, bool)),
-        [np.array([1.0, 0.0, 0.0, 0.0])] * 6,
+        [np.array([1.0, 0.0, 0.0, 0.0, 0.0])] * 6,
     )
     plain, responding = (
         filtered_sums(LinearisedAccelerations(steps, errors, table), kernels, 3, DELAYS)
