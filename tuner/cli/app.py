@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import logging
+import os
 import shlex
 import sys
 import traceback
 from collections.abc import Sequence
 from io import TextIOWrapper
+from pathlib import Path
 from typing import NoReturn
 
 from cyclopts import App, CycloptsError
@@ -163,6 +165,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
     TYPED_WORDS.set(shlex.join(["tune", *given]))
+    for name in ("stdout", "stderr"):  # closed, as by a daemon: the next file would take its place
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 (as long as the process)
     for stream in (sys.stdout, sys.stderr):  # a terminal of another encoding lacks letters
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")

@@ -16,6 +16,7 @@ import gc
 import logging
 import os
 import platform
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 
 from tuner.core.disk import cache_folder
@@ -133,7 +134,12 @@ def configure(*, keep_compiled: bool = True) -> None:
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", True)
     if keep_compiled and jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
+        compiled = cache_folder() / "compiled"
+        with suppress(OSError):
+            compiled.mkdir(parents=True, exist_ok=True)
+        jax.config.update(
+            "jax_compilation_cache_dir", str(compiled) if os.access(compiled, os.W_OK) else None
+        )
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     logger.debug("%s", describe())

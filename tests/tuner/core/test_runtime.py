@@ -63,6 +63,11 @@ def test_one_thread_double_precision_and_a_kept_cache(
     assert "NPROC=1" in str(report["line"])
 
 
+def test_a_cache_that_cannot_be_kept_is_done_without(tmp_path: Path) -> None:
+    (tmp_path / "multirotor-tune").write_text("a file in its place")
+    assert in_fresh_python(tmp_path)["cache"] is None
+
+
 def test_the_memory_of_arrays_stays_for_the_next_ones(
     plain: tuple[Path, dict[str, object]],
 ) -> None:
