@@ -40,9 +40,11 @@ from tuner.recordings.unit_detection import (
     IN_WORLD_AXES,
     INVERSE,
     READINGS,
+    SCALAR_FIRST,
     Reading,
     force_and_tilt,
     to_enu_flu,
+    turned_about_z,
 )
 
 DOUBTS = (
@@ -88,6 +90,8 @@ MIN_SIGN_CORRELATION, MIN_SIZE_CORRELATION = 0.7, 0.97
 MIN_AXES_ANGLE_RAD, MIN_SINGULAR_VALUE_RATIO = 0.1, 0.05
 """Body axes may be turned by less, as markers were defined; and the second singular value must be
 at least so large beside the first for a rotation to show."""
+MIN_YAW_AGREEMENT = 0.2
+"""Markers that are turned about z show the same yaw."""
 
 MAX_LAG_S = 0.08
 """An estimator's velocity is late by less against the position."""
@@ -107,7 +111,7 @@ def _turning(flown: Flown) -> tuple[Array, Array]:
     """
     rate = np.array(flown["body_rate"])
     rate[1:-1] = (rate[:-2] + 4.0 * rate[1:-1] + rate[2:]) / 6.0
-    return smooth(body_rate_of(flown["attitude"])), smooth(rate)
+    return smooth(body_rate_of(flown["attitude"]), 0.1), smooth(rate, 0.1)
 
 
 def _specific_force(flown: Flown) -> Array:
@@ -287,7 +291,7 @@ def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
         )[1]
         for reading in READINGS[signal]
         # a marker body of another heading looks alike
-        if reading is not IN_WORLD_AXES or _angle_between(change, recorded) == 0.0
+        if reading is not IN_WORLD_AXES or not _angle_of(_rotation_between(change, recorded, 0.0))
     }
     alike = {reading: correlation(change, values) for reading, values in tried.items()}
     shares = {
@@ -302,7 +306,9 @@ def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
         if shares[best] < min(MAX_BELIEVED_SHARE, left / 2) or of_another_unit:
             return best, []
     doubt = pair.doubt.note(left=left, agreement=agreement)
-    return None, [doubt] if left > pair.max_share and agreement < MAX_DOUBTED_AGREEMENT else []
+    alike_in_size = faster < MAX_SIZE_RATIO * slower
+    believed = left <= pair.max_share or (agreement >= MAX_DOUBTED_AGREEMENT and alike_in_size)
+    return None, [] if believed else [doubt]
 
 
 def _residual_share(change: Array, recorded: Array) -> float:
@@ -317,6 +323,10 @@ def _judge_attitude(_: str, flown: Flown) -> tuple[Reading | None, Sequence[Note
     q, pull = flown["attitude"], _specific_force(flown)
     push = pull - np.array([0.0, 0.0, GRAVITY])
     gyro, force = flown.get("body_rate"), flown.get("acceleration")
+    heading = 0.0 if gyro is None else _heading_of_markers(flown)
+    if heading:
+        name = f"of markers turned left by {np.degrees(heading) % 360:.0f} degrees"
+        return Reading(name, lambda q, _: turned_about_z(q, -heading)), []
     turns = [smooth(rate) for rate in (body_rate_of(q), gyro) if rate is not None]
     of_markers = MAX_MARKER_OFFSET_M * min(
         np.nan_to_num(rate**2).sum(axis=1).mean() for rate in turns
@@ -335,8 +345,11 @@ def _judge_attitude(_: str, flown: Flown) -> tuple[Reading | None, Sequence[Note
             scores.append(correlation(smooth(up[:, :2], 0.2), push[:, :2]))
         # The axes of the IMU may be wrong too, though two errors are less likely than one.
         if gyro is not None and rms(gyro) > PAIRS["body_rate"].min_motion:
-            turning, frd = smooth(body_rate_of(turned)), READINGS["body_rate"][0].read(gyro, turned)
-            in_flu, in_frd = (correlation(turning, smooth(rate)) for rate in (gyro, frd))
+            frd = READINGS["body_rate"][0].read(gyro, turned)
+            in_flu, in_frd = (
+                correlation(*_turning({"attitude": turned, "body_rate": rate}))
+                for rate in (gyro, frd)
+            )
             scores.append(max(in_flu, in_frd - READING_PENALTY))
         if force is None:  # thrust points where the motion and gravity ask for it
             upright = carried((up * pull).sum(axis=1) / np.linalg.norm(pull, axis=1))
@@ -349,12 +362,13 @@ def _judge_attitude(_: str, flown: Flown) -> tuple[Reading | None, Sequence[Note
     fit, upright = agreement(q)
     if fit > MIN_AGREEMENT and upright > 0.5:
         return None, []
-    found = [agreement(reading.read(q, q)) for reading in READINGS["attitude"]]
+    readings = [*READINGS["attitude"], *([] if gyro is None else [SCALAR_FIRST])]
+    found = [agreement(reading.read(q, q)) for reading in readings]
     worth = [_score(*each) - READING_PENALTY * i for i, each in enumerate(found)]
     best = int(np.argmax(worth))
     better = _score(*found[best]) > _score(fit, upright) + MIN_SCORE_GAIN
     if better and found[best][0] > MIN_AGREEMENT and found[best][1] > 0.5:
-        return READINGS["attitude"][best], []
+        return readings[best], []
     by_motion = (upward(q) * pull).sum(axis=1) / np.linalg.norm(pull, axis=1)
     if fit > MIN_AGREEMENT and np.nanmean(by_motion) > UPRIGHT_SHARE:
         return None, [NoteCode.WEIGHT_NOT_FELT.note(share=upright)]
@@ -376,7 +390,8 @@ def _single_axis_doubts(signal: str, flown: Flown) -> list[Note]:
             if abs(late) > MAX_LAG_S:
                 return [NoteCode.SIGNAL_LATE.note(signal, pair.other, seconds=late)]
         doubts = doubts or list(_axis_doubts(change, recorded, (signal, pair.other)))
-    angle = _angle_between(change, recorded) if signal == "body_rate" else 0.0
+    turned = _rotation_between(change, recorded) if signal == "body_rate" else np.eye(3)
+    angle = _angle_of(turned)
     if angle > MIN_AXES_ANGLE_RAD and all(note.numbers["times"] > 0 for note in doubts):
         return [NoteCode.AXES_TURNED.note(degrees=float(np.degrees(angle)))]
     return doubts
@@ -411,22 +426,44 @@ def _axis_doubts(motion: Array, recorded: Array, names: tuple[str, str]) -> Iter
             yield NoteCode.AXIS_DOUBTED.note(names[0], name, names[1], times=ratio)
 
 
-def _angle_between(motion: Array, recorded: Array) -> float:
-    """Return the angle, in rad, between the axes of two signals; 0 where it is uncertain.
+def _rotation_between(
+    motion: Array, recorded: Array, min_ratio: float = MIN_SINGULAR_VALUE_RATIO
+) -> Array:
+    """Return the rotation (3, 3) from one signal's axes to another's; identity if uncertain.
 
-    The rotation is that of least squares (Kabsch 1976).
+    It is that of least squares (Kabsch 1976), and halves the residual or, in noise, makes the
+    signals agree.
     """
     a, b = both_known(motion, recorded)
-    if len(a) < 2 or min(rms(a), rms(b)) < CLEAR_TURN_RATE:
-        return 0.0
+    if len(a) < 2 or min(rms(a), rms(b)) < PAIRS["body_rate"].min_motion:
+        return np.eye(3)
     left, sizes, right = np.linalg.svd(b.T @ a)
-    if sizes[1] < MIN_SINGULAR_VALUE_RATIO * sizes[0]:
-        return 0.0
     turned = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    before, behind = _residual_share(a, b), _residual_share(a, b @ turned)
-    if behind > 0.5 * before:
+    certain = sizes[1] >= min_ratio * sizes[0]
+    halved = _residual_share(a, b @ turned) <= 0.5 * _residual_share(a, b)
+    agree = correlation(a, b @ turned) > max(MIN_AGREEMENT, correlation(a, b) + MIN_SCORE_GAIN)
+    return np.asarray(turned) if certain and (halved or agree) else np.eye(3)
+
+
+def _angle_of(rotation: Array) -> float:
+    return float(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0)))
+
+
+def _heading_of_markers(flown: Flown) -> float:
+    """Return by how much, in rad, the attitude's body axes are turned left of the gyro's about z.
+
+    0 where that is little or uncertain, or the axis is another. Near a multiple of 90 degrees it is
+    that: so markers are set up.
+    """
+    turning, rate = _turning(flown)
+    turned = _rotation_between(turning, rate)
+    if _angle_of(turned) < MIN_AXES_ANGLE_RAD or turned[2, 2] < np.cos(2 * MIN_AXES_ANGLE_RAD):
         return 0.0
-    return float(np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0)))
+    heading = float(np.arctan2(turned[1, 0], turned[0, 0]))
+    if abs(heading) > 0.75 * np.pi and correlation(turning[:, 2:], rate[:, 2:]) < MIN_YAW_AGREEMENT:
+        return 0.0  # as in a recording that runs backwards
+    quarter = 0.5 * np.pi * round(heading / (0.5 * np.pi))
+    return quarter if abs(heading - quarter) < MIN_AXES_ANGLE_RAD else heading
 
 
 _OPPOSED = (("attitude", "body_rate", CLEAR_TURN_RATE), ("position", "velocity", CLEAR_SPEED))

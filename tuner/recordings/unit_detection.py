@@ -88,6 +88,12 @@ def quaternion_of(angles: Array) -> Array:
     )
 
 
+def turned_about_z(q: Array, angle: float) -> Array:
+    """Return (n, 4) attitudes whose body axes are turned by an angle in rad about their z."""
+    (w, x, y, z), c, s = q.T, math.cos(0.5 * angle), math.sin(0.5 * angle)
+    return np.column_stack([c * w - s * z, c * x + s * y, c * y - s * x, c * z + s * w])
+
+
 @dataclass(frozen=True)
 class Reading:
     """Another frame, order or unit of recorded numbers: a row of the table of hypotheses.
@@ -115,6 +121,8 @@ _TURN_READINGS = (
     Reading("in milliradians per second", lambda w, _: w * 1e-3),
     Reading("in milliradians, not degrees, per second", lambda w, _: w * 1e-3 / _DEGREE),
 )
+SCALAR_FIRST = Reading("scalar-first", lambda q, _: q[:, [1, 2, 3, 0]])
+"""Without a yaw it leans as the right attitude does along x: a gyro alone tells it."""
 IN_WORLD_AXES = Reading("in world axes", lambda w, q: rotate(q * INVERSE, w))
 READINGS: Mapping[str, tuple[Reading, ...]] = {
     "attitude": (

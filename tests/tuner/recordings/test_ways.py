@@ -567,10 +567,12 @@ def test_a_spin_seen_by_tilted_markers_is_not_another_size(wobble: float, doubte
 
 
 @pytest.mark.parametrize("degrees", [0.0, 10.0, 45.0])
-def test_a_marker_body_of_another_heading_is_named(degrees: float, tmp_path: Path) -> None:
-    notes = [n for n in read(tmp_path, _turned(degrees)).notes if n.code is NoteCode.AXES_TURNED]
-    assert [n.numbers["degrees"] for n in notes] == (
-        [pytest.approx(degrees, abs=1.0)] if degrees else []
+def test_a_marker_body_of_another_heading_is_turned(degrees: float, tmp_path: Path) -> None:
+    flight = read(tmp_path, _turned(degrees))
+    assert_same(flight, share=0.02)
+    notes = [n for n in flight.notes if n.code is NoteCode.FRAME_TURNED]
+    assert [n.names for n in notes] == (
+        [("attitude", f"of markers turned left by {degrees:.0f} degrees")] if degrees else []
     )
 
 
