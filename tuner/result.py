@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer, field_validator
 from pydantic_core import from_json
@@ -265,7 +265,7 @@ class RunResult(ResultFile):
     schema_version: int = 2
     status: Status
     seed: int
-    versions: dict[str, str]
+    versions: dict[str, Annotated[str, Field(max_length=200)]]
     settings: dict[str, JsonValue]
     coefficients: dict[str, CoefficientResult]
     flights: tuple[FlightResult, ...]

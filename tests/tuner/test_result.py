@@ -52,6 +52,7 @@ def test_findings_come_back_as_they_were(make_run):  # noqa: F811
         ({"schema_version": None}, "has no schema version"),
         ({"seed": "x"}, "seed is 'x'"),
         ({"status": "done"}, "status is 'done'"),
+        ({"versions": {"tune": "9" * 10**5}}, "it should have at most 200 characters"),
         (
             {
                 "coefficients": {

@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, ClassVar, Self
-from zipfile import BadZipFile
+from zipfile import BadZipFile, is_zipfile
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
@@ -90,11 +90,15 @@ def read_arrays(path: Path, *, remedy: str) -> dict[str, NDArray[Any]]:
     import numpy as np  # noqa: PLC0415 (`tune --help` answers without it)
 
     try:
-        with _opened(path) as file, np.load(file, allow_pickle=False) as data:
-            size = sum(part.file_size for part in data.zip.infolist())
-            if size > MAX_ARRAYS:
-                raise ValueError(f"it unpacks to {size} bytes")
-            return {name: data[name] for name in data.files}
+        with _opened(path) as file:
+            if not is_zipfile(file):
+                raise ValueError("it is no archive")
+            file.seek(0)
+            with np.load(file, allow_pickle=False) as data:
+                size = sum(part.file_size for part in data.zip.infolist())
+                if size > MAX_ARRAYS:
+                    raise ValueError(f"it unpacks to {size} bytes")
+                return {name: data[name] for name in data.files}
     except (EOFError, MemoryError, AttributeError) as error:
         raise InputError(path, f"is damaged ({type(error).__name__})", remedy) from None
     except (OSError, BadZipFile, ValueError, TypeError, RuntimeError, zlib.error) as error:

@@ -381,6 +381,10 @@ def run_in_simulator(run: Run, target: Target) -> tuple[Run, EffectiveResult | N
     if found is None:
         return run, None
     effective = found.result
+    for flight in run.result.flights:
+        if flight.name not in effective.flights:
+            what = f"its effective coefficients were flown along no flight '{flight.name}'"
+            raise ExportError(run.folder, what, "was it edited? fit again")
     lost = {name for term in effective.lost for name in term.names}
     coefficients = {
         name: row.model_copy(update={"best": effective.coefficients[name]})

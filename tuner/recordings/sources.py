@@ -499,11 +499,11 @@ def _topic_error(recording: Recording, what: str, sources: Sequence[Source]) -> 
         )
     wanted = list(dict.fromkeys(source.topic for source in sources))
     for topic in wanted:
-        for name in names:
-            if name.endswith(topic) and name != topic:
-                prefix = name[: -len(topic)].strip("/")
-                found = f"no topic {topic}; found {name}"
-                return RecordingError(path, found, f"use --namespace {prefix}")
+        elsewhere = [name for name in names if name.endswith(topic) and name != topic]
+        if elsewhere:
+            found = f"no topic {topic}; found {' and '.join(elsewhere)}"
+            prefixes = (name[: -len(topic)].strip("/") for name in elsewhere)
+            return RecordingError(path, found, f"use --namespace {' or '.join(prefixes)}")
     near = [n for topic in wanted for n in difflib.get_close_matches(topic, names, n=2, cutoff=0.6)]
     listed = ", ".join(dict.fromkeys(near)) if near else ", ".join(names[:12]) or "nothing at all"
     return RecordingError(

@@ -104,7 +104,7 @@ def test_cache_folder_follows_the_platform(monkeypatch, tmp_path):
 def test_damaged_arrays_are_one_line(content, tmp_path):
     path = tmp_path / "x.npz"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=r"x\.npz: is damaged .*; run tune again"):
+    with pytest.raises(InputError, match=r"x\.npz: is damaged \(it is no arch.*; run tune again"):
         read_arrays(path, remedy="run tune again")
     with pytest.raises(InputError, match="is damaged"):
         read_arrays(tmp_path / "none.npz", remedy="run tune again")

@@ -375,3 +375,9 @@ def test_gates_ask_of_the_effective_coefficients_what_they_ask_of_others(make_ru
     bound = EFFECTIVE.model_copy(update={"coefficients": {"rotor_drag_coefficient": 4.03e-3}})
     with pytest.raises(ExportError, match=r"rotor_drag_coefficient 0\.00403 is its upper bound"):
         exported(make_run(**DRAGGY, effective=bound), "sdf")
+
+
+def test_effective_coefficients_of_other_flights_are_no_fault_of_ours(make_run):
+    edited = EFFECTIVE.model_copy(update={"flights": {"circle": rmse(0.005)}})
+    with pytest.raises(ExportError, match="no flight 'held'; was it edited"):
+        exported(make_run(**DRAGGY, effective=edited), "sdf")

@@ -330,6 +330,15 @@ def test_namespace_is_suggested_and_works(short: Path, tmp_path: Path, clean: Fl
     near(load_flight(path, namespace="uav1"), clean, position=1e-12)
 
 
+def test_both_vehicles_of_a_bag_are_named(short: Path, tmp_path: Path) -> None:
+    pose = "/mavros/local_position/pose"
+    names = {pose: f"/uav1{pose}", POSE: f"/uav2{pose}"}
+    path = making.rewrite(short, tmp_path / "two.bag", rename=lambda t: names.get(t, t))
+    with pytest.raises(RecordingError, match=r"found /uav[12]/.* and /uav") as caught:
+        load_flight(path, topics="mavros")
+    assert str(caught.value).endswith(("uav1 or uav2", "uav2 or uav1"))
+
+
 def test_side_car_names_the_trajectory_and_the_mission(short: Path, tmp_path: Path) -> None:
     path = making.rewrite(short, tmp_path / "side.bag")
     (tmp_path / "side.yaml").write_text(
