@@ -298,7 +298,9 @@ def _usability(
     words = {one.word for one in checks}
     if words & {"worse", "crashes"} or any(one.word == "crashes" for one in flights):
         return Usability.UNUSABLE
-    if any(found.level == "failure" for found in result.findings):
+    codes = {found.code for found in result.findings}
+    not_found = {Code.WRONG_VEHICLE, Code.HOLDING_BETTER} <= codes  # from another vehicle
+    if not_found or any(found.level == "failure" for found in result.findings):
         return Usability.UNUSABLE
     fitted = [row for row in result.coefficients.values() if row.fitted]
     unsure = (

@@ -86,6 +86,17 @@ def test_a_held_out_flight_that_is_met_worse_forbids_it(result):
     assert found.uses == ("Do not use these numbers: see the warnings for what to do first.",)
 
 
+def test_another_vehicle_that_predicts_worse_than_holding_is_not_usable(result):
+    """As with a mass in grams: nothing of the flown vehicle was found from there."""
+    lift = {"lift": 0.3, "weight": 264.9, "mass": 27.0}
+    other = Finding(Code.WRONG_VEHICLE, "warning", "quad", lift)
+    assert outcome(noticing(result, other)).usability is Usability.WITH_CARE
+    ahead = {"soonest": 0.1, "seconds": 0.5, "position": 0.89, "position_held": 0.49}
+    worse = Finding(Code.HOLDING_BETTER, "warning", "circle", ahead, ("position",))
+    assert outcome(noticing(result, worse)).usability is Usability.WITH_CARE
+    assert outcome(noticing(result, other, worse)).usability is Usability.UNUSABLE
+
+
 def test_what_nothing_checks_or_something_doubts_is_used_with_care(result, tmp_path):
     unchecked = with_held(result, split="fit")
     assert outcome(unchecked).usability is Usability.WITH_CARE
