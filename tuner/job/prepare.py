@@ -334,12 +334,13 @@ def _spread(flight: Flight, axis: str) -> float:
 
 
 def _unused_settings(job: Job) -> Iterator[Finding]:
-    """Warn of settings of coefficients that are neither free nor candidate terms."""
+    """Warn of settings of coefficients that act but are neither estimated nor candidate terms."""
     job_file = job.user_settings.job
+    estimated = {*job.space.free, *(job.accelerations.values if job.accelerations else ())}
     unused = [
         name
         for name in job_file.coefficients
-        if name not in job.space.free
+        if name not in estimated | bypassed_by(job.inlets, job.fitted)
         and (job_file.terms == "none" or not COEFFICIENTS[name].is_optional)
     ]
     if unused:

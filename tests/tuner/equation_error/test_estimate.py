@@ -40,7 +40,8 @@ from tuner.equation_error.regression import (
     whitening,
 )
 from tuner.evaluate.simulation_files import write_csv
-from tuner.job.prepare import of_rigid_body, with_accelerations
+from tuner.findings.findings import Code
+from tuner.job.prepare import check_recordings, of_rigid_body, with_accelerations
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import predicts_turning, read_recordings, regressors
 from tuner.search.problem import job_of
@@ -447,6 +448,14 @@ def test_the_search_begins_there_and_leaves_inertia_alone(flown, begun):
     assert not set(job.space.names) & {*TILTING, "inertia_zz", "rotor_inertia", "moment_constant"}
     assert job.settings.job.search.window == finding.numbers["seconds"]
     assert 0.0 < finding.numbers["explained_x"] < 0.9
+
+
+def test_priors_of_a_new_vehicle_are_all_of_use(begun):
+    """Of motors, which the rotor-speed inlet bypasses, and of what accelerations determine."""
+    _, job, _ = begun
+    assert {"inertia_xx", "time_constant_up"} <= job.settings.job.coefficients.keys()
+    assert not {*job.space.free} & {"inertia_xx", "time_constant_up"}
+    assert Code.SETTINGS_UNUSED not in {finding.code for finding in check_recordings(job)}
 
 
 def test_gains_are_less_than_all_of_the_turning(begun):
