@@ -208,18 +208,19 @@ def _with_lag_terms(
     there: Fitted,
     predictor: Predictor,
     on_message: Callable[[str], None],
+    among: Collection[str] | None = None,
 ) -> tuple[LinearisedInnovations, Fitted, Predictor]:
     """Return the fit with lag terms, if innovations are likelier with them and call for them.
 
-    At its neutral value a lag acts as a latency, and the fit without it has made up for it with
-    other lags and stronger disturbances. So it is judged after a refit, and the other terms are
-    selected once more beside it. A filter that has lost a flight selects nothing.
+    Of all groups of lags, or of some. The fit without a lag has made up for it with other lags and
+    other disturbances. So it is judged after a refit, and the other terms are selected once more
+    beside it. A filter that has lost a flight selects nothing.
 
     A lag shows where commands jump, often in the first tenths of a second of a flight alone. How
     far the gain scatters from stretch to stretch says nothing of it then: the scatter of the scores
     at the fit with the lag does.
     """
-    with_lag_terms = seen.with_lag_terms() if predictor.keeps_track else None
+    with_lag_terms = seen.with_lag_terms(among) if predictor.keeps_track else None
     if with_lag_terms is None:
         return seen, there, predictor
     without, had = predictor.without_gains, seen.selected.kept
@@ -229,10 +230,12 @@ def _with_lag_terms(
     if beside.keeps_track and beside.is_likelier_than(without):
         found = LinearisedInnovations.of(with_lag_terms, fitted, beside)
     lags = set(with_lag_terms.kept) - set(had)
-    if found is None or not all(found.calls_for(lag) for lag in lags):
+    called = [] if found is None else [lag for lag in sorted(lags) if found.calls_for(lag)]
+    if found is None or len(called) < len(lags):
         full = full_problem_of(there.objective, there.point)
         point = Point(full.point.coefficients, without.inputs.offsets)
-        return seen, there, without.at(full.objective, point)
+        before = seen, there, without.at(full.objective, point)
+        return _with_lag_terms(*before, on_message, called) if called else before
     on_message(_changed_terms(seen.selected, with_lag_terms))
     chosen, selected = found.selection(had), with_lag_terms
     if chosen is not None:
@@ -480,8 +483,8 @@ class LinearisedInnovations:
             min_gain=0.0,
         ).is_accepted
 
-    def with_lag_terms(self) -> Selected | None:
-        """Return the terms with lags added, which start away from their neutral values.
+    def with_lag_terms(self, among: Collection[str] | None = None) -> Selected | None:
+        """Return the terms with lags added, of all or of some groups.
 
         No linear approximation tests them; it only shows which are worth a fit. None if none is.
         """
@@ -492,7 +495,8 @@ class LinearisedInnovations:
             for row in self.selected.rows
             if not row.kept
             and row.reason in REJECTED_BY_LEAST_SQUARES
-            and any(name in COEFFICIENTS and COEFFICIENTS[name].begin for name in row.names)
+            and (among is None or row.group in among)
+            and any(name in COEFFICIENTS and COEFFICIENTS[name].is_lag for name in row.names)
             and score(
                 self.linear,
                 model,

@@ -104,6 +104,9 @@ class Coefficient:
         Of an effect: whether it is the sum of other terms' effects.
     expected
         Of an effect: whether every vehicle has it, though flights may not show it.
+    is_lag
+        Of an effect: whether it delays. In gusts a fit without it makes up for it with other lags
+        and disturbances, so that only a fit with it shows what it explains.
     begin
         The start of a search that adds it, if it equals another coefficient at its neutral value.
         It is judged by the secant from there to the neutral value.
@@ -144,6 +147,7 @@ class Coefficient:
     group: str = ""
     is_aggregate: bool = False
     expected: bool = False
+    is_lag: bool = False
     begin: float | None = None
     equivalent_to: str = ""
     reads: str = ""

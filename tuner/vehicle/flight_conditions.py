@@ -40,10 +40,12 @@ def _factor(
     bounds: float,
     prior_sd: float,
     part: LoopPart = "",
+    is_lag: bool = False,
 ) -> Coefficient:
     """Return the row of a factor of the set-up that is one where all is as it is said to be."""
     more = _setup(name, "", meaning, source, place=(EFFECTS, name), bounds=bounds, neutral=1.0)
-    return replace(more, prior_sd=prior_sd, step=0.5 * prior_sd, group=group, part=part)
+    step = 0.5 * prior_sd
+    return replace(more, prior_sd=prior_sd, step=step, group=group, part=part, is_lag=is_lag)
 
 
 SURROUNDING_ROWS = (
@@ -158,6 +160,7 @@ SURROUNDING_ROWS = (
         "PX4 IMU_GYRO_CUTOFF; parameters changed since",
         group="gyro_filter",
         part="rate control",
+        is_lag=True,
         bounds=3.0,
         prior_sd=0.3,
     ),

@@ -202,6 +202,7 @@ _ROWS = (
         bounds=0.03,
         prior_sd=0.003,
         step=0.002,
+        is_lag=True,
         begin=0.004,
         equivalent_to="actuator_latency",
     ),

@@ -255,6 +255,16 @@ def test_nothing_else_is_put_in_unjudged(chosen, lag) -> None:
     assert chosen(seen([lag], {lag.names[0]: 0.1}), lags=True) is None
 
 
+@pytest.mark.parametrize("among", [None, ["gyro_filter"], ["motor_lag"]])
+def test_lags_of_some_groups_are_put_in(chosen, among) -> None:
+    rows = [row(name, SelectionCode.IMMATERIAL) for name in ("motor_lag", "gyro_filter")]
+    innovation = seen(rows, {"time_constant_second": 0.1, "gyro_cutoff_factor": 0.5})
+    chosen(innovation, lags=True)
+    selected = innovation.with_lag_terms(among)
+    assert selected is not None
+    assert {*selected.kept} == {*(among or ("motor_lag", "gyro_filter"))}
+
+
 def test_an_insignificant_term_is_not_refitted(chosen) -> None:
     assert chosen(seen([row("motor_lag", SelectionCode.IMMATERIAL)], {}), lags=True) is None
 

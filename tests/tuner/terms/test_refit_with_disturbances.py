@@ -290,6 +290,40 @@ def test_a_lateness_that_samples_contradict_is_not_believed():
     assert believed(None, contradicted=True) is None
 
 
+def test_of_several_lags_those_stay_that_innovations_call_for(monkeypatch):
+    """Each is judged beside the others, and the fit is repeated with the rest."""
+    full = SimpleNamespace(objective=NOBODY, point=SimpleNamespace(coefficients=np.zeros(0)))
+    beside = SimpleNamespace(
+        keeps_track=True,
+        is_likelier_than=lambda _: True,
+        inputs=SimpleNamespace(offsets=np.zeros((5, 1))),
+        at=lambda *_: beside,
+    )
+    beside.without_gains = beside
+    monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
+    monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, __: (there, beside))
+
+    def seen(selected: Selected, *_: Any) -> Any:
+        def grown(among: Any = None) -> Selected:
+            groups = among or ("gyro_filter", "motor_lag")
+            more = (SimpleNamespace(group=group, kept=True) for group in groups)
+            return replace(selected, rows=(*selected.rows, *more))
+
+        return SimpleNamespace(
+            selected=selected,
+            with_lag_terms=grown,
+            calls_for=lambda group: group == "gyro_filter",
+            selection=lambda _: None,
+        )
+
+    monkeypatch.setattr(disturbances.LinearisedInnovations, "of", seen)
+    begin = Selected(NOBODY, fitted(2.0 * COLOURED_RATIO))
+    found, *_ = disturbances._with_lag_terms(
+        seen(begin), begin.fitted, cast(Any, beside), lambda _: None
+    )
+    assert [row.group for row in found.selected.rows] == ["gyro_filter"]
+
+
 @pytest.mark.parametrize(
     ("lacks", "called_for", "expected"),
     [
@@ -323,7 +357,7 @@ def test_a_term_without_a_derivative_is_judged_by_a_fit_with_it(
 
         return SimpleNamespace(
             selected=selected,
-            with_lag_terms=lambda: grown("motor_lag"),
+            with_lag_terms=lambda _: grown("motor_lag"),
             calls_for=lambda _: lacks != "significance",
             selection=lambda _: grown(called_for),
         )
