@@ -92,16 +92,22 @@ def with_gains_of(controller: Controller, vehicle: Vehicle) -> Controller:
     times ``attitude_gain``: parameters that were changed since, or scaled by an autotune or by the
     battery (PX4 MC_BAT_SCALE_EN).
     """
-    names = ("rate_gain_roll_pitch", "rate_gain_yaw", "integral_gain", "gyro_cutoff_factor")
-    if not vehicle.effects.keys() & {*names, "attitude_gain"}:
+    names = (
+        "rate_gain_roll_pitch",
+        "rate_gain_yaw",
+        "integral_gain",
+        "gyro_cutoff_factor",
+        "attitude_gain",
+    )
+    if not vehicle.effects.keys() & set(names):
         return controller
-    across, about, integral, filtered = (vehicle.effects.get(name, 1.0) for name in names)
+    across, about, integral, filtered, turning = (vehicle.effects.get(name, 1.0) for name in names)
     rate, cutoff = controller.rate, controller.filters.gyro_cutoff
     changed: Controller = eqx.tree_at(
         lambda c: (c.attitude.time_constant, c.rate.k, c.rate.i, c.filters.gyro_cutoff),
         controller,
         (
-            controller.attitude.time_constant / vehicle.effects.get("attitude_gain", 1.0),
+            controller.attitude.time_constant / turning,
             Vec3(rate.k.x * across, rate.k.y * across, rate.k.z * about),
             rate.i * integral,
             None if cutoff is None else cutoff * filtered,

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from tuner.equation_error import rate_controller
 from tuner.equation_error.rate_controller import AXES, Signals, estimate_controller, others_gains
 
 RATE, SECONDS = 100.0, 40.0
@@ -84,6 +85,26 @@ def test_flights_of_the_same_gains_are_not_distinguished():
     assert not any(others_gains(*four_flights(seed, P_GAIN)) for seed in range(40))
     two = [part[1:3] for part in four_flights(0, 0.6 * P_GAIN)]
     assert others_gains(*two) == ()  # nothing says which of them is the other one
+
+
+def test_one_flight_is_judged_by_its_error_if_its_p_were_the_others(monkeypatch):
+    of_axis, asked = rate_controller._axis_estimates, []
+
+    def counted(recorded, simulated, axis, *, p=None):
+        asked.append((len(recorded), p))
+        return of_axis(recorded, simulated, axis, p=p)
+
+    recorded, simulated = four_flights(0, 0.8 * P_GAIN)
+    own = of_axis(recorded[2:3], simulated[2:3], 0)["P"]
+    same, other = (
+        of_axis(recorded[2:3], simulated[2:3], 0, p=own.value + off)["P"] for off in (0.0, 0.2)
+    )
+    assert same.value == other.value == own.value
+    assert same.sd == pytest.approx(own.sd)
+    assert other.sd > 1.1 * own.sd
+    monkeypatch.setattr(rate_controller, "_axis_estimates", counted)
+    assert others_gains(recorded, simulated) == (2,)
+    assert all((p is None) == (flights > 1) for flights, p in asked)
 
 
 def test_a_flight_that_hardly_turns_is_not_distinguished():
