@@ -246,15 +246,17 @@ def _share_latency(known: list[dict[str, _Part]]) -> None:
 
 
 def _regression(signals: Signals, axis: int) -> tuple[Array, Array]:
-    """Return columns (N, 3) and torque (N,), detrended.
+    """Return columns (N - 2, 3) and torque (N - 2,), detrended, of all samples but both ends.
 
-    The recorded gyro's bias is not that of the loop, and its integral is a ramp.
+    The recorded gyro's bias is not that of the loop, and its integral is a ramp. At the ends there
+    are one-sided differences alone, of twice the noise: no stationary residuals, where a spin
+    begins.
     """
-    error, step = signals.error[:, axis], signals.step
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (error[1:] + error[:-1]))]) * step
-    faster = np.gradient(signals.rate[:, axis], step)
-    columns = np.column_stack([error, integral, faster])
-    return _detrended(columns), _detrended(signals.torque[:, axis])
+    error, rate, step = signals.error[:, axis], signals.rate[:, axis], signals.step
+    integral = np.cumsum(0.5 * (error[1:-1] + error[:-2])) * step
+    faster = (rate[2:] - rate[:-2]) / (2.0 * step)
+    columns = np.column_stack([error[1:-1], integral, faster])
+    return _detrended(columns), _detrended(signals.torque[1:-1, axis])
 
 
 def _detrended(series: Array) -> Array:

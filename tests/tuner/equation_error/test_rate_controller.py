@@ -14,14 +14,14 @@ P_GAIN, I_GAIN, D_GAIN = 0.15, 0.2, 0.003
 
 
 def flight(
-    random, *, p=P_GAIN, i=I_GAIN, d=D_GAIN, late=0.0, gusts=0.0, noise=0.0, bias=0.0
+    random, *, p=P_GAIN, i=I_GAIN, d=D_GAIN, late=0.0, gusts=0.0, noise=0.0, bias=0.0, turn=0.0
 ) -> Signals:
     """Return what a loop hears and says whose rate follows its set-point and is pushed."""
     time = np.arange(round(RATE * SECONDS)) / RATE
     wanted = np.random.default_rng(7).normal(size=(len(time), 3))  # what is asked for is the same
     for _ in range(3):
         wanted = lfilter([0.1], [1.0, -0.9], wanted, axis=0)
-    wanted /= wanted.std(axis=0)
+    wanted = wanted / wanted.std(axis=0) + turn
     follow = 1.0 - np.exp(-16.0 / RATE)
     pushed = lfilter([0.1], [1.0, -0.9], gusts * random.normal(size=wanted.shape), axis=0)
     rate = wanted
@@ -146,6 +146,15 @@ def swing(signals: Signals, phase: float) -> Signals:
     time = np.arange(len(signals.rate)) / RATE
     rate = np.sin(10.0 * np.pi * time + phase)[:, None].repeat(3, 1)
     return Signals(signals.step, -rate, rate, -P_GAIN * rate)
+
+
+def test_errors_of_a_turn_that_begins_with_the_recording_are_its_scatter():
+    simulated, off = [flight(np.random.default_rng(0), turn=30.0)], []
+    for seed in range(40):
+        recorded = [flight(np.random.default_rng(seed), turn=30.0, noise=0.1)]
+        found = estimate_controller(recorded, simulated)
+        off += [(one.value - (one.part == "P")) / one.sd for one in found if one.part != "I"]
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(1.0, abs=0.15)
 
 
 def test_one_step_of_a_set_point_tells_nothing():
