@@ -63,9 +63,9 @@ MAX_LANES_COPIED_SINGLY = 64
 """Lanes up to which they are copied one after the other."""
 CACHE_BYTES = 2**18
 """bytes that are laid out at a time."""
-MIN_LANES_OF_TWO_VECTORS = 256
-"""Lanes from which a block without columns is two vectors wide, where LLVM optimises: one computes
-while one waits."""
+MIN_STEPS_OF_TWO_VECTORS = 2**22
+"""Lanes times turns from which a block without columns is two vectors wide, where LLVM optimises:
+one computes while one waits. Fewer take less time than another kernel's compilation."""
 COLUMNS_OF_VALUES = 3
 """Columns that take as long as the values and the factors that columns share."""
 MAX_BLOCKS_ON_ONE_THREAD = 512
@@ -222,9 +222,9 @@ class Program:
         """Name -> the number that stands for each length while it is traced."""
         return dict(zip((*self.names, "turns"), _STAND_INS, strict=False))
 
-    def _kernel(self, lanes: int = 1) -> _Compiled | None:
-        """Return the kernel for so many lanes, or None where something has no rule."""
-        vectors = 2 if lanes >= MIN_LANES_OF_TWO_VECTORS and not self.moving and optimises() else 1
+    def _kernel(self, steps: int = 1) -> _Compiled | None:
+        """Return the kernel for so many lanes times turns; None where something has no rule."""
+        vectors = 2 if steps >= MIN_STEPS_OF_TWO_VECTORS and not self.moving and optimises() else 1
         if vectors not in self._kernels:
             self._kernels[vectors] = None
             try:
@@ -271,7 +271,7 @@ class Program:
         ]
         moved = [np.asarray(t, float) for t in (tangents or [])]
         lengths = self._lengths(leaves, turns)
-        kernel = self._kernel(lanes)
+        kernel = self._kernel(lanes * max(turns, 1))
         if kernel is None:
             return self.by_xla(values, tangents, turns=turns)
         return kernel.run(leaves, moved, lengths, lanes, wanted)

@@ -89,9 +89,10 @@ def test_one_program_serves_every_length_and_every_number_of_lanes(program, coun
 
 
 @pytest.mark.parametrize(("real", "turns"), [(float, 9), (np.float32, 37)])
-def test_many_lanes_in_wider_blocks_give_what_few_do(real, turns):
+def test_many_lanes_in_wider_blocks_give_what_few_do(monkeypatch, real, turns):
+    monkeypatch.setattr(lanes.program, "MIN_STEPS_OF_TWO_VECTORS", 256 * turns)
     still = {name: replace(a, moves=False, dtype=real) for name, a in ARGUMENTS.items()}
-    program, count = Program(filtered, still), lanes.program.MIN_LANES_OF_TWO_VECTORS + 3
+    program, count = Program(filtered, still), 259
     values, _ = given(count, turns)
     few = {name: v if name == "gain" else v[..., -5:] for name, v in values.items()}
     wide, narrow = program(values, lanes=count, turns=turns), program(few, lanes=5, turns=turns)

@@ -219,6 +219,7 @@ class Comparison:
         vehicle: VehicleFile,
         *,
         fitted_starts: bool = False,
+        forces: bool = False,
         flier: Callable[..., Flown] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name to its errors with a vehicle, in the recordings' order.
@@ -228,6 +229,8 @@ class Comparison:
         fitted_starts
             Whether to return flights in windows only, from the most likely starts and trims,
             fitted to each window: the error of a fit, not of a prediction.
+        forces
+            Whether to return what each term does.
         flier
             Function that flies segments, for another simulator.
 
@@ -239,7 +242,9 @@ class Comparison:
         errors: dict[str, FlightErrors] = {}
         for group in self._groups:
             if group.windowed or not fitted_starts:
-                errors |= group.fly(vehicle, fitted_starts=fitted_starts, flier=flier)
+                errors |= group.fly(
+                    vehicle, fitted_starts=fitted_starts, forces=forces, flier=flier
+                )
         return {name: errors[name] for name in self._names if name in errors}
 
 
@@ -308,6 +313,7 @@ class _Group:
         vehicle: VehicleFile,
         *,
         fitted_starts: bool = False,
+        forces: bool = False,
         flier: Callable[..., Flown] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name -> its errors, concatenated over windows."""
@@ -320,7 +326,7 @@ class _Group:
             states = self._likeliest_starts(model, segments)
         elif self.windowed:
             segments = self._with_rotor_speeds(vehicle)
-        simulated, acted, crash_times = self._simulated(model, segments, states, flier)
+        simulated, acted, crash_times = self._simulated(model, segments, states, forces, flier)
         errors, first = {}, 0
         for recording, windows in zip(self._recordings, self._windows, strict=True):
             flight, crash = recording.flight, float(crash_times[first])
@@ -339,15 +345,22 @@ class _Group:
                 attitude,
                 laps_of(flight),
                 crash if crashed else None,
-                self._forces(acted, first, windows, min(crash, flight.duration)),
+                None
+                if acted is None
+                else self._forces(acted, first, windows, min(crash, flight.duration)),
             )
             first += len(windows)
         return errors
 
     def _simulated(
-        self, model: Model, segments: Segments, states: Array | None, flier: Callable[..., Flown]
-    ) -> tuple[dict[str, Array], dict[str, Array], Array]:
-        """Return simulated signals, forces, and crash times (F,) in s.
+        self,
+        model: Model,
+        segments: Segments,
+        states: Array | None,
+        forces: bool,
+        flier: Callable[..., Flown],
+    ) -> tuple[dict[str, Array], dict[str, Array] | None, Array]:
+        """Return simulated signals, forces if asked for, and crash times (F,) in s.
 
         Signal -> (F, n, c) at the recorded stamps, and term -> (F, m, 6) force and moment at every
         ``stride``-th sample. A stamp before the simulation's start, or after its end, is compared
@@ -366,15 +379,17 @@ class _Group:
             channels=(*POSE, TRUE_ROTOR_SPEED, MOTION, BODY_ATTITUDE),
         )
         rate, calm = float(self._schedule.log_rate), np.zeros(segments.count)
-        acted = forces_of_terms(
-            model.vehicle,
-            flown.channels[MOTION],
-            flown.channels[BODY_ATTITUDE],
-            flown.channels[TRUE_ROTOR_SPEED],
-            rate=rate,
-            wind=(conditions.get("wind_x", calm), conditions.get("wind_y", calm)),
-            stride=self._stride,
-        )
+        acted = None
+        if forces:
+            acted = forces_of_terms(
+                model.vehicle,
+                flown.channels[MOTION],
+                flown.channels[BODY_ATTITUDE],
+                flown.channels[TRUE_ROTOR_SPEED],
+                rate=rate,
+                wind=(conditions.get("wind_x", calm), conditions.get("wind_y", calm)),
+                stride=self._stride,
+            )
         no_offsets = np.zeros((len(OFFSETS), segments.count))
         reading = Reading(no_offsets, no_offsets[: len(CLOCKS)], rate, self._samples)
         simulated = {}

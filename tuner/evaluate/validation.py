@@ -153,7 +153,7 @@ def validate(job: Job, fitted: Fitted) -> Validation:
     vehicle = vehicle_fitted(job, fitted)
     validation = Validation(
         initial=comparison.fly(job.user_settings.vehicle),
-        best=comparison.fly(vehicle),
+        best=comparison.fly(vehicle, forces=True),
         fitted_starts=comparison.fly(vehicle, fitted_starts=True),
     )
     fitted_flights = [(r.flight, r.inlet, r.input_late) for r in job.recordings if not r.holdout]

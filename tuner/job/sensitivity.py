@@ -159,7 +159,8 @@ def examine_vehicle(
         on_message("simulating what could be flown next")
         proposals = write_next_flight(out, job, examination, fitted, room)
         _write_requested(options, job, fitted, examination, folder=out, on_message=on_message)
-        write_traces(out, {"simulated": comparison_of(job, fitted).fly(settings.vehicle)})
+        simulated = comparison_of(job, fitted).fly(settings.vehicle, forces=True)
+        write_traces(out, {"simulated": simulated})
         render(out)
     return SensitivityResult(out, knowledge, proposals, fitted.findings)
 

@@ -52,11 +52,10 @@ MOTION, BODY_ATTITUDE, TRUE_ROTOR_SPEED, SETPOINTS = "motion", "turned", "speeds
 """Channels that no recording has: the centre of mass's position, velocity and body rate; the body's
 attitude; the true rotor speeds; and the set-points of rate and thrust."""
 
-LOGGED = (
-    *("position", "attitude", "body_rate", "rotor_speed", "command"),
-    *(MOTION, BODY_ATTITUDE, TRUE_ROTOR_SPEED, SETPOINTS),
-)
-"""Channels of every program without derivatives; those that are not requested are not written."""
+MEASURED = ("position", "attitude", "body_rate", "rotor_speed", "command")
+LOGGED = (*MEASURED, MOTION, BODY_ATTITUDE, TRUE_ROTOR_SPEED, SETPOINTS)
+"""Channels of every program with derivatives, and without; those that are not requested are not
+written."""
 EFFECTS = tuple(name for name, row in COEFFICIENTS.items() if row.is_effect)
 TERMS = tuple(name for name in EFFECTS if COEFFICIENTS[name].group)
 """Coefficients beyond the base model, and those of them that a fit may add."""
@@ -133,7 +132,7 @@ def fly(
     names = tuple(segments.measured) if channels is None else channels
     moves = tangents is not None
     # in one order, for it tells programs apart
-    logged = tuple(sorted(names if moves else {*LOGGED, *names}))
+    logged = tuple(sorted({*(MEASURED if moves else LOGGED), *names}))
     coefficients = {**coefficients_in(model), **coefficients}
     own = not moves or any(np.ndim(value) for value in coefficients.values())
     none = np.zeros((len(segments.free_rows), segments.count))
@@ -166,12 +165,13 @@ def fly(
         made_of=(static, moves, total.TERMS),
         packages=CODE,
     )
+    wanted = ({name: name in names for name in logged}, True)
     run = program(
         given,
         None if tangents is None else _directions(given, tangents),
         lanes=segments.count,
         turns=samples,
-        wanted=None if moves else ({name: name in names for name in logged}, True),
+        wanted=(wanted, wanted) if moves else wanted,
     )
     found, crash_time = run.values
     still: dict[str, Array | None] = dict.fromkeys(names)

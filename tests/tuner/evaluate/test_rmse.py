@@ -56,7 +56,7 @@ def test_a_stretch_is_cut_by_each_clock():
 
 def test_the_vehicle_that_flew_meets_its_recording(flight, updated):
     comparison = Comparison([Recording(flight)], ControllerFile())
-    flown = comparison.fly(updated)["small_circle"]
+    flown = comparison.fly(updated, forces=True)["small_circle"]
     assert flown.crash_time is None
     for axis in ("x", "y", "z"):
         assert getattr(flown.rmse, axis) < 2e-4, axis
@@ -96,7 +96,9 @@ def test_a_late_clock_is_taken_back(flight, updated):
 
 def test_a_vehicle_that_cannot_fly_crashes(flight, updated):
     heavy = with_values(updated, {"mass": 9.0})
-    crash = Comparison([Recording(flight)], ControllerFile()).fly(heavy)["small_circle"]
+    crash = Comparison([Recording(flight)], ControllerFile()).fly(heavy, forces=True)[
+        "small_circle"
+    ]
     assert 0 < crash.crash_time < 12
     assert crash.rmse.x is None
     assert crash.crash_time - 0.03 < crash.forces.time[-1] < crash.crash_time
