@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from tuner import result as results
 from tuner.config.job import TrajectoryName
 from tuner.core.disk import exists
 from tuner.core.errors import ExportError
@@ -25,8 +26,8 @@ from tuner.options import (
     plain,
     taking,
 )
-from tuner.recordings.loader import load_flight
-from tuner.result import Run, read_run
+from tuner.recordings import loader
+from tuner.result import Run
 from tuner.vehicle import VehicleFile
 
 if TYPE_CHECKING:
@@ -53,6 +54,10 @@ __all__ = [
 F = TypeVar("F", bound=Callable[..., Any])
 ONE_THREAD: Callable[[F], F] = threadpool_limits.wrap(limits=1, user_api="blas")
 """While a job runs, as for the command: matrices are small, and sums the same on any machine."""
+
+
+load_flight = taking()(loader.load_flight)
+read_run = taking()(results.read_run)
 
 
 @taking(Options)
@@ -180,6 +185,7 @@ def sensitivity(
         return examine_vehicle(asked, arena, command=command)
 
 
+@taking()
 def connect(url: str | None = None, *, token: str | None = None) -> Client:
     """Return a tuning service, whose ``fit`` is `fit` on its machine.
 

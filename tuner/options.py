@@ -8,8 +8,22 @@ is slow to import, for `tune --help` shows it at once.
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
+from types import NoneType, SimpleNamespace, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    Self,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from annotated_types import Ge, Gt, Interval, Le
 
@@ -239,12 +253,24 @@ class ExportOptions(FromPython):
     draws: int | None = None
 
 
-def taking(options: type) -> Callable[[F], F]:
-    """Show the fields of a class in the signature of a function of ``**options``."""
+def taking(options: type | None = None) -> Callable[[F], F]:
+    """Check the types of a function's own parameters, and show the fields of ``**options``."""
 
     def shown(function: F) -> F:
         signature = inspect.signature(function)
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+
+        @wraps(function)
+        def checked(*given: Any, **named: Any) -> Any:
+            known = signature.bind(*given, **named).arguments
+            # without that of the result, whose import takes its time
+            types = {p.name: p.annotation for p in own if p.annotation is not p.empty}
+            hinted = SimpleNamespace(__annotations__=types)
+            for name, hint in get_type_hints(hinted, inspect.unwrap(function).__globals__).items():
+                if name in known:
+                    check_type(name, plain(known[name]), hint)
+            return function(*given, **named)
+
         more = [
             inspect.Parameter(
                 IN_JOB_FILE.get(field.name, field.name),
@@ -252,22 +278,57 @@ def taking(options: type) -> Callable[[F], F]:
                 default=field.default,
                 annotation=field.type,
             )
-            for field in fields(options)
+            for field in (() if options is None else fields(options))
             if field.name not in signature.parameters
         ]
-        function.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
-        return function
+        checked.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
+        return cast(F, checked)
 
     return shown
 
 
+_TYPES = {str: "text", Path: "a path", float: "a number", int: "a whole number",
+          bool: "True or False", Sequence: "a list", Mapping: "a mapping"}  # fmt: skip
+"""Type of a parameter -> its name in sentences."""
+
+
+def check_type(name: str, value: object, hint: Any) -> None:
+    """Refuse a value that is of no type of a hint, or a list with such an entry.
+
+    Parameters
+    ----------
+    value
+        As `plain` returns it.
+
+    Raises
+    ------
+    ConfigError
+        It is of another type.
+    """
+    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+    known = {get_origin(kind) or kind: get_args(kind) for kind in kinds}
+    if isinstance(value, list) and Sequence in known:
+        for number, entry in enumerate(value):
+            check_type(f"{name}[{number}]", entry, known[Sequence][0])
+    elif not any(_is_of(value, kind) for kind in known):
+        words = [_TYPES.get(kind) or kind.__name__ for kind in known if kind is not NoneType]
+        raise ConfigError(name, f"is of type {type(value).__name__}", f"give {' or '.join(words)}")
+
+
+def _is_of(value: object, kind: Any) -> bool:
+    if isinstance(value, bool) or kind in (bool, Sequence):
+        return kind is bool and isinstance(value, bool)
+    wider = {float: int | float, Path: str, Literal: object}.get(kind, kind)
+    return isinstance(value, wider)
+
+
 def plain(value: Any) -> Any:
-    """Return paths as text, one or a list of them, and NumPy's numbers as Python's."""
+    """Return paths as text, one or a list of them, and NumPy's numbers and lists as Python's."""
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    return value.item() if getattr(value, "shape", None) == () else value
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def check_model(kind: str, value: object) -> None:

@@ -87,28 +87,28 @@ PATTERN_PHRASES: Mapping[str, str] = {
 """Pattern that a key's text has to match -> the same for people."""
 
 
-def first_complaint(details: Sequence[ErrorDetails]) -> tuple[str, str]:
-    """Return the first error, and its remedy.
+def first_complaint(details: Sequence[ErrorDetails], whole: str = "the file") -> tuple[str, str]:
+    """Return the first error, and its remedy; ``whole`` is what holds all keys.
 
     Where a key takes values of several kinds, each kind complains: what goes deepest into the value
     has understood it best, and what goes equally deep is told as one.
     """
     place = _keys(details[0]["loc"])
     if place == details[0]["loc"]:
-        return complaint(details[0])
+        return complaint(details[0], whole)
     rivals = [detail for detail in details if _keys(detail["loc"])[: len(place)] == place]
     depth = max(len(_keys(detail["loc"])) for detail in rivals)
     deepest = [detail for detail in rivals if len(_keys(detail["loc"])) == depth]
-    what, remedy = complaint(deepest[0])
-    others = dict.fromkeys(complaint(detail) for detail in deepest[1:])
+    what, remedy = complaint(deepest[0], whole)
+    others = dict.fromkeys(complaint(detail, whole) for detail in deepest[1:])
     more = [words for other, words in others if other == what and words != remedy]
     return what, ", or ".join([remedy, *(words.removeprefix("it should be ") for words in more)])
 
 
-def complaint(detail: ErrorDetails) -> tuple[str, str]:
+def complaint(detail: ErrorDetails, whole: str = "the file") -> tuple[str, str]:
     """Return a pydantic complaint in plain words, and its remedy."""
     place = _keys(detail["loc"])
-    key = dotted(place) or "the file"
+    key = dotted(place) or whole
     context = detail.get("ctx", {})
     match detail["type"]:
         case "unknown_key":
@@ -116,7 +116,7 @@ def complaint(detail: ErrorDetails) -> tuple[str, str]:
         case "refused":
             return context["what"], context["remedy"]
         case "missing":
-            return f"key '{key}' is missing", "add it"
+            return (f"key '{key}' is missing" if place else f"{whole} is missing"), "add it"
         case _:
             text = repr(detail["input"])
             shown = text if len(text) <= 60 else text[:57] + "..."

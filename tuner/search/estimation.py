@@ -74,6 +74,7 @@ def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
         "key": key,
         "stage": progress.stage,
         "evaluations": progress.evaluations - progress.steps,
+        "converged": progress.converged,
         "loop": progress.loop._asdict(),
         "seconds": seconds,
         "iterations": [iteration.model_dump() for iteration in progress.iterations[:done]],
@@ -117,6 +118,7 @@ def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
             states=data["states"] if data["states"].size else None,
             iterations=tuple(Iteration(**iteration) for iteration in head["iterations"]),
             evaluations=head["evaluations"],
+            converged=head["converged"],
             loop=Loop(**head["loop"]),
         )
         if _form(progress) != _form(fresh) or progress.stage < 0:

@@ -95,7 +95,7 @@ async def _invalid(request: Request, error: Exception) -> Response:
     ]  # from body, query
     if details[0]["type"] == "json_invalid":
         return _problem(request, 422, "the request", "is not JSON", "correct it")
-    what, remedy = first_complaint(details)  # type: ignore[arg-type]
+    what, remedy = first_complaint(details, "its body")  # type: ignore[arg-type]
     return _problem(request, 422, "the request", what, remedy)
 
 

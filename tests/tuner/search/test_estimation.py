@@ -169,6 +169,8 @@ def test_a_checkpoint_that_was_changed_is_not_gone_on_from(fitted, tmp_path, nam
     again, seconds = load(path, "key", start)
     assert (again.points.coefficients == start.points.coefficients).all()
     assert seconds == 2.0
+    save(path, "key", replace(start, converged=True), 2.0)
+    assert load(path, "key", start)[0].converged
     with np.load(path) as arrays:
         np.savez(path, **(dict(arrays) | {name: value}))
     with pytest.raises(InputError, match=r"checkpoint\.npz: is no checkpoint"):

@@ -76,6 +76,7 @@ def test_a_body_that_is_no_request_is_refused(client, body):
     answer = client.post("/api/v1/jobs", content=body, headers={"content-type": "application/json"})
     assert answer.status_code in (400, 422)
     assert set(answer.json()) == {"where", "what", "remedy", "detail"}
+    assert "the file" not in answer.json()["detail"]
 
 
 def test_two_recordings_of_one_name_are_refused(client, table):
