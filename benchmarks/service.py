@@ -24,11 +24,11 @@ from benchmarks.reading import CIRCLE
 from benchmarks.table import Bar, Section
 from tuner.service import jobs
 from tuner.service.app import create_app
-from tuner.service.queue import add_event
+from tuner.service.database import JobRow, RecordingRow, State
+from tuner.service.jobs import add_event
 from tuner.service.request import JobRequest
 from tuner.service.service import Service
 from tuner.service.settings import GIB, MIB, Limits, ServiceSettings
-from tuner.service.tables import JobRow, RecordingRow, State
 
 JOBS = 10_000
 CLIENTS = 100

@@ -31,11 +31,11 @@ from tuner.result import Run
 from tuner.vehicle import VehicleFile
 
 if TYPE_CHECKING:
-    from tuner.client.client import Client
     from tuner.evaluate.closed_loop import Simulation
     from tuner.evaluate.records import Table
     from tuner.exporters.export import Exported
     from tuner.job.sensitivity import SensitivityResult
+    from tuner.service.client import Client
 
 Named = str | Path
 
@@ -201,7 +201,7 @@ def connect(url: str | None = None, *, token: str | None = None) -> Client:
     InputError
         The address is none, or the extra ``service`` is not installed.
     """
-    from tuner.client.client import Client  # noqa: PLC0415 (an extra)
+    from tuner.service.client import Client  # noqa: PLC0415 (an extra)
 
     return Client(url, token)
 

@@ -26,7 +26,7 @@ from tests.docs.pages import ROOT, WITH_COMMANDS, Family, commands, expanded, na
 from tests.test_deploy import instruction, started_by_the_unit
 from tests.tuner.service.conftest import FAKE_WORKER, LIMITS, listening, submit, upload
 from tuner.cli import main
-from tuner.service import attempt
+from tuner.service import dispatcher
 from tuner.service.service import Service
 from tuner.service.settings import ServiceSettings
 
@@ -126,7 +126,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def client(place: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[httpx.Client]:
     """Ask a server whose workers fit nothing, as the commands do."""
-    monkeypatch.setattr(attempt, "WORKER", FAKE_WORKER)
+    monkeypatch.setattr(dispatcher, "WORKER", FAKE_WORKER)
     service = Service.open(ServiceSettings(place / "data", workers=2, limits=LIMITS))
     with listening(service) as opened:
         monkeypatch.setenv("TUNE_SERVER", str(opened.base_url))

@@ -36,7 +36,7 @@ USES = {
     "test": ("tests",),
     "bench": ("benchmarks",),
     "cluster": ("tuner/engine", STORE),
-    "service": ("tuner/service", "tuner/client", STORE),
+    "service": ("tuner/service", STORE),
     "postgresql": (),
     "matlab": ("tuner/recordings/matlab.py",),
     "simulators": tuple(f"{TARGETS}/{name}.py" for name in ("mujoco", "drone_models", "rotorpy")),

@@ -14,8 +14,8 @@ from tuner.options import FitOptions
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
-    from tuner.client.client import Client
     from tuner.search.listener import Listener
+    from tuner.service.client import Client
 
 Server = Annotated[
     str | None,
@@ -41,7 +41,7 @@ def client_of(server: str | None, token: str | None) -> closing[Client]:
     InputError
         The address is none, or an extra is missing.
     """
-    from tuner.client.client import Client
+    from tuner.service.client import Client
 
     return closing(Client(server, token))
 
@@ -86,8 +86,8 @@ def submit(
     """
     from tuner.cli.progress import progress_on_terminal
     from tuner.cli.results import print_run
-    from tuner.client.client import is_success
     from tuner.result import place_for
+    from tuner.service.client import is_success
 
     with client_of(server, token) as client:
         if wait:
@@ -181,7 +181,7 @@ def watch(
         Its id.
     """
     from tuner.cli.progress import progress_on_terminal
-    from tuner.client.client import is_success
+    from tuner.service.client import is_success
 
     with client_of(server, token) as client:
         with progress_on_terminal(quiet=quiet, verbose=True) as listener:
@@ -254,7 +254,7 @@ def watch_folder(
     once
         Submit what is new there, and end.
     """
-    from tuner.client.folder import watch
+    from tuner.service.client import watch
 
     with client_of(server, token) as client:
         watch(client, folder, settle=settle, once=once, say=lambda text: print(text, flush=True))

@@ -9,7 +9,7 @@ from annotated_types import Ge, Interval, Le, Len
 from pydantic import AfterValidator, Field, model_validator
 
 from tuner.core.errors import ConfigError, did_you_mean
-from tuner.core.shipped import EXPORT_TARGETS, Kind, find_config
+from tuner.core.shipped import EXPORT_TARGETS, KINDS, find_config
 from tuner.core.yaml_section import Flag, Number, Positive, Section, Whole, read_model, refuse
 from tuner.options import Method
 from tuner.vehicle import COEFFICIENTS, condition_rows, term_groups
@@ -301,13 +301,8 @@ def read_job(path: str | Path) -> JobFile:
     """
     path = Path(path)
     job = read_model(JobFile, path)
-    kinds: dict[str, Kind] = {
-        "vehicle": "vehicles",
-        "controller": "controllers",
-        "topics": "topics",
-    }
     paths: dict[str, Path] = {}
-    for key, kind in kinds.items():
+    for key, kind in KINDS.items():
         reference = getattr(job, key)
         if reference is not None:
             try:

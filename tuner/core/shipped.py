@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pkgutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -10,6 +11,8 @@ from tuner.core.disk import exists
 from tuner.core.errors import ConfigError, did_you_mean
 
 Kind = Literal["vehicles", "controllers", "topics"]
+KINDS: Mapping[str, Kind] = {"vehicle": "vehicles", "controller": "controllers", "topics": "topics"}
+"""Key of a job file -> folder of ``configs/`` with the files that it may name."""
 
 EXPORT_TARGETS = [
     module.name.replace("_", "-")
@@ -23,6 +26,11 @@ def configs_folder() -> Path:
     package = Path(__file__).resolve().parents[1]
     installed = package / "configs"
     return installed if installed.is_dir() else package.parent / "configs"
+
+
+def shipped(kind: Kind) -> dict[str, Path]:
+    """Return name -> file of all that ship in a folder of ``configs/``, sorted."""
+    return {file.stem: file for file in sorted((configs_folder() / kind).glob("*.yaml"))}
 
 
 def find_config(kind: Kind, reference: str, base: Path) -> Path:
@@ -45,8 +53,7 @@ def find_config(kind: Kind, reference: str, base: Path) -> Path:
     path = base / Path(reference).expanduser()
     if path.suffix in {".yaml", ".yml"} or len(Path(reference).parts) != 1 or exists(path):
         return path
-    folder = configs_folder() / kind
-    known = {file.stem: file for file in sorted(folder.glob("*.yaml"))}
+    known = shipped(kind)
     if reference not in known:
         raise ConfigError(
             reference,

@@ -6,41 +6,280 @@ so that any other machine can go on; its folder lasts for as long as it works.
 
 from __future__ import annotations
 
+import json
 import logging
 import os
-import queue
 import shutil
+import signal
+import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from typing import Any
+from queue import Queue, SimpleQueue
+from typing import IO, Any, TypeVar
+
+from pydantic import ValidationError
 
 from tuner.core.content_store import ContentStore
-from tuner.core.disk import inside
+from tuner.core.disk import digest_of, inside
 from tuner.core.errors import EngineError, InputError
 from tuner.core.runtime import cores
 from tuner.engine.engine import Engine
 from tuner.engine.engine import Report as Channel
-from tuner.result import CHECKPOINTS
-from tuner.service.attempt import (
-    POLL_INTERVAL_S,
-    DiedError,
-    Events,
-    Report,
-    UnwantedError,
-    attempt,
-    put,
-)
-from tuner.service.errors import NoSpaceError, UnavailableError
-from tuner.service.queue import Claim, Outcome, Queue
+from tuner.report.outcome import outcome
+from tuner.result import CHECKPOINTS, ExportRecords, RunResult
+from tuner.service.database import State
+from tuner.service.errors import NoSpaceError, UnavailableError, full_disk
+from tuner.service.jobs import Claim, JobQueue, Outcome
+from tuner.service.request import FLIGHTS, CheckedRequest
 from tuner.service.settings import Limits, ServiceSettings
-from tuner.service.tables import State
-from tuner.service.worker import RESULT_FOLDER
+from tuner.service.worker import RESULT_FOLDER, Assignment
+
+logger = logging.getLogger(__name__)
+T = TypeVar("T")
+
+WORKER = [sys.executable, "-m", "tuner.service.worker"]
+POLL_INTERVAL_S = 0.5
+"""Between two looks into the job table."""
+MAX_LINE_BYTES = 1_000_000
+
+EVENT_KINDS = ("message", "iteration", "estimates", "folds")
+"""What a worker says while it fits;"""
+END_KINDS = ("done", "refused", "fault")
+"""and at its end."""
+
+Events = Sequence[tuple[str, Mapping[str, Any]]]
+Report = Callable[[Events], bool]
+
+
+class DiedError(Exception):
+    """The process of an attempt died; the message says of what."""
+
+
+class UnwantedError(Exception):
+    """The attempt holds its job no more, or its server is ending."""
+
+
+def prepare(folder: Path, claim: Claim, store: ContentStore) -> CheckedRequest:
+    """Lay out the folder of a job, as far as an earlier attempt has not.
+
+    Raises
+    ------
+    InputError
+        The request is of another version of tune, or the disk is full.
+    """
+    try:
+        asked = CheckedRequest.model_validate(claim.request)
+    except ValidationError:
+        what = "was submitted to another version of tune"
+        raise InputError("the job", what, "submit it again") from None
+    with full_disk():
+        shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
+        (folder / FLIGHTS).mkdir(parents=True)
+        for name, digest in claim.flights.items():
+            store.fetch(digest, inside(folder / FLIGHTS, name))
+        asked.lay_out(folder)
+    return asked
+
+
+def attempt(
+    folder: Path,
+    claim: Claim,
+    store: ContentStore,
+    *,
+    limits: Limits,
+    report: Report,
+    cores: Sequence[int] = (),
+    is_unwanted: Callable[[], bool] = lambda: False,
+) -> Outcome:
+    """Run the worker's process to its end, store its files, and return the outcome.
+
+    Parameters
+    ----------
+    folder, claim, store
+        Of the job, and where its recordings are and its result goes.
+    report
+        Called with new events, at least every `POLL_INTERVAL_S`; returns whether the attempt still
+        holds its job.
+
+    Raises
+    ------
+    DiedError
+        The process died, or took too long.
+    UnwantedError
+        See there; the process has been stopped.
+    NoSpaceError
+        The disk is full.
+    """
+    asked = prepare(folder, claim, store)
+    assignment = Assignment(
+        job=claim.id,
+        folder=folder.absolute(),
+        flights=tuple(claim.flights),
+        asked=asked,
+        cores=tuple(cores),
+        limits=limits,
+    )
+    with (folder / "worker.log").open("ab") as log:
+        process = subprocess.Popen(
+            WORKER,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            start_new_session=True,
+        )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    last: Future[dict[str, Any] | None] = Future()
+    heard: Queue[Events] = Queue(maxsize=10_000)
+    stream, deadline = process.stdout, time.monotonic() + limits.job_seconds
+    reader = threading.Thread(target=lambda: last.set_result(_listen(stream, heard)), daemon=True)
+    reader.start()
+
+    def report_in_time(events: Events) -> bool:
+        if time.monotonic() > deadline and not last.done():
+            raise DiedError("it took longer than the service allows")
+        return report(events)
+
+    try:
+        with suppress(BrokenPipeError):
+            process.stdin.write(assignment.model_dump_json().encode() + b"\n")
+            process.stdin.flush()
+        end = _follow(last, heard, report_in_time, is_unwanted)
+        process.wait(timeout=60)
+    except subprocess.TimeoutExpired:
+        raise DiedError("it did not end") from None
+    finally:
+        _kill(process)
+        with suppress(BrokenPipeError):  # of one that died before it read
+            process.stdin.close()
+        reader.join(timeout=5)
+        process.stdout.close()
+    if end is None:
+        raise DiedError(_cause_of_death(process.returncode))
+    return _outcome(end, folder, store)
+
+
+def _listen(stream: IO[bytes], heard: Queue[Events]) -> dict[str, Any] | None:
+    """Pass a worker's events on, and return its last message; None where it has said none."""
+    while line := stream.readline(MAX_LINE_BYTES):
+        message = _message(line)
+        kind = message.get("kind")
+        if kind in END_KINDS:
+            return message
+        if kind in EVENT_KINDS:
+            heard.put([(kind, {key: value for key, value in message.items() if key != "kind"})])
+    return None
+
+
+def _follow(
+    ended: Future[T], heard: Queue[Events], report: Report, is_unwanted: Callable[[], bool]
+) -> T:
+    """Report events as they are heard until an attempt has ended, and return how."""
+    while True:
+        has_ended = wait([ended], timeout=POLL_INTERVAL_S).done
+        events = [event for _ in range(heard.qsize()) for event in heard.get()]
+        if is_unwanted() or not report(events):
+            raise UnwantedError
+        if has_ended:
+            return ended.result()
+
+
+def _message(line: bytes) -> dict[str, Any]:
+    try:
+        content = json.loads(line)
+    except ValueError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """Stop a process and those that it has started."""
+    with suppress(ProcessLookupError, PermissionError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    process.wait()
+
+
+def _cause_of_death(status: int) -> str:
+    """Return why a process died, in words."""
+    if status >= 0:
+        return f"it ended with status {status}"
+    try:
+        name = signal.Signals(-status).name
+    except ValueError:
+        name = str(-status)
+    hint = ", as when memory runs out" if -status == getattr(signal, "SIGKILL", 9) else ""
+    return f"it was ended by {name}{hint}"
+
+
+def _outcome(last: Mapping[str, Any], folder: Path, store: ContentStore) -> Outcome:
+    """Return the outcome of an attempt, after storing the result's files."""
+    if last["kind"] == "refused":
+        return Outcome(State.FAILED, error=str(last["error"]), exit_status=2)
+    if last["kind"] == "fault":
+        error = f"internal error ({last['error']}); please report it"
+        return Outcome(State.FAILED, error=error, exit_status=1)
+    result = RunResult.read(folder / RESULT_FOLDER)
+    exports = ExportRecords.read_if_any(folder / RESULT_FOLDER) or ExportRecords()
+    return Outcome(
+        State.DONE,
+        exit_status=0,
+        usability=outcome(result, exports=tuple(exports.exports.values())).usability,
+        files=_store_files(folder / RESULT_FOLDER, store),
+        points=[
+            {
+                "coefficient": name,
+                "unit": found.unit,
+                "best": found.best,
+                "std_error": found.std_error,
+                "lower": None if found.ci95 is None else found.ci95[0],
+                "upper": None if found.ci95 is None else found.ci95[1],
+                "identifiable": found.identifiable,
+            }
+            for name, found in result.coefficients.items()
+            if found.fitted or name == "mass"  # which others are compared at
+        ],
+    )
+
+
+def _store_files(result: Path, store: ContentStore) -> list[dict[str, Any]]:
+    """Put copies of a result's files into the store, and return their rows."""
+    rows = []
+    for file in sorted(result.rglob("*")):
+        if file.is_symlink() or not file.is_file() or file.match(CHECKPOINTS):
+            continue
+        name, size = file.relative_to(result).as_posix(), file.stat().st_size
+        rows.append({"name": name, "sha256": put(file, store), "size": size})
+    return rows
+
+
+def put(file: Path, store: ContentStore) -> str:
+    """Put a copy of a file into a store, and return its digest.
+
+    Raises
+    ------
+    NoSpaceError
+        The disk is full.
+    """
+    with full_disk():
+        copy = file.with_name(f".{file.name}.copy")
+        try:
+            shutil.copyfile(file, copy)
+            digest = digest_of(copy)
+            store.take(copy, digest)
+        finally:
+            copy.unlink(missing_ok=True)
+    return digest
+
 
 RemoteTask = tuple[Claim, str, Limits]
 """The task of a machine of the cluster: the claim on a job, the store's URL, and its limits."""
@@ -63,10 +302,11 @@ def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
         for file, digest in kept.items():
             store.fetch(digest, inside(folder / RESULT_FOLDER, file))
 
-        def relay(events: Events, progress: Mapping[str, Any]) -> bool:
+        def relay(events: Events) -> bool:
+            before = dict(kept)
             for file in (folder / RESULT_FOLDER).glob(CHECKPOINTS):
                 kept[file.name] = put(file, store)
-            report({"events": list(events), "progress": dict(progress), "checkpoint": dict(kept)})
+            report([*events, *([] if kept == before else [("checkpoint", dict(kept))])])
             return True
 
         return attempt(folder, claim, store, limits=limits, report=relay)
@@ -84,36 +324,14 @@ def run_remotely(
     DiedError
         The process of the job died, or the machine did.
     """
-    heard: SimpleQueue[dict[str, Any]] = SimpleQueue()
+    heard: Queue[Events] = Queue()
     future = engine.submit(fit_remotely, task, heard.put)
     try:
-        while True:
-            has_ended = wait([future], timeout=POLL_INTERVAL_S).done
-            events, progress = _all(heard)
-            if is_unwanted() or not report(events, progress):
-                raise UnwantedError
-            if has_ended:
-                return future.result()
+        return _follow(future, heard, report, is_unwanted)
     except EngineError as error:
         raise DiedError(f"{error.where} {error.what}") from None
     finally:
         future.cancel()
-
-
-def _all(heard: SimpleQueue[dict[str, Any]]) -> tuple[Events, dict[str, Any]]:
-    """Return the messages since the last call."""
-    events: list[tuple[str, Mapping[str, Any]]] = []
-    progress: dict[str, Any] = {}
-    while True:
-        try:
-            message = heard.get_nowait()
-        except Empty:
-            return events, progress
-        events += [(kind, content) for kind, content in message["events"]]
-        progress |= {**message["progress"], "checkpoint": message["checkpoint"]}
-
-
-logger = logging.getLogger(__name__)
 
 
 class Dispatcher:
@@ -128,7 +346,7 @@ class Dispatcher:
     def __init__(
         self,
         settings: ServiceSettings,
-        jobs: Queue,
+        jobs: JobQueue,
         store: ContentStore,
         engine: Engine | None = None,
     ) -> None:
@@ -138,7 +356,7 @@ class Dispatcher:
         self._store = store
         self._stopping = threading.Event()
         self._called = threading.Event()
-        self._slots: queue.SimpleQueue[int] = queue.SimpleQueue()
+        self._slots: SimpleQueue[int] = SimpleQueue()
         for slot in range(settings.workers):
             self._slots.put(slot)
         self._threads = ThreadPoolExecutor(max(1, settings.workers), "attempt")
@@ -194,7 +412,7 @@ class Dispatcher:
     def _keep(self) -> None:
         """Renew the leases of jobs under way: a result may take long to be stored."""
         for claim in tuple(self._held.values()):
-            self._jobs.report(claim, (), {})
+            self._jobs.report(claim, ())
 
     def _work(self, claim: Claim, slot: int) -> None:
         try:
@@ -289,28 +507,26 @@ class Reporter:
     attempts before their search began are not repeated before this one's.
     """
 
-    def __init__(self, jobs: Queue, claim: Claim, lease: float) -> None:
+    def __init__(self, jobs: JobQueue, claim: Claim, lease: float) -> None:
         self._jobs = jobs
         self._claim = claim
         self._pause = min(1.0, lease / 4)
         self._last = 0.0
         self._events: list[tuple[str, Mapping[str, Any]]] = []
-        self._progress: dict[str, Any] = {}
         self._repeated = Counter(claim.preamble)
 
-    def __call__(self, events: Events, progress: Mapping[str, Any]) -> bool:
-        """Enter events and progress, and return whether the attempt still holds its job."""
+    def __call__(self, events: Events) -> bool:
+        """Enter events, and return whether the attempt still holds its job."""
         self._events.extend(event for event in events if self._is_new(*event))
-        self._progress.update(progress)
         now = time.monotonic()
         if not self._events and now - self._last < self._pause:
             return True
         try:
-            held = self._jobs.report(self._claim, self._events, self._progress)
+            held = self._jobs.report(self._claim, self._events)
         except UnavailableError as error:
             logger.warning("job %s: %s", self._claim.id, error)
             return True
-        self._last, self._events, self._progress = now, [], {}
+        self._last, self._events = now, []
         return held
 
     def _is_new(self, kind: str, content: Mapping[str, Any]) -> bool:

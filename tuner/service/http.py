@@ -21,7 +21,8 @@ from tuner.core.disk import file_name
 from tuner.core.errors import InputError
 from tuner.core.runtime import installed
 from tuner.service import jobs, recordings
-from tuner.service.attempt import POLL_INTERVAL_S
+from tuner.service.database import FINISHED, EventRow, FileRow, JobRow, RecordingRow, State
+from tuner.service.dispatcher import POLL_INTERVAL_S
 from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
 from tuner.service.jobs import history
 from tuner.service.recordings import FORM_FIELD, Upload, receive
@@ -41,7 +42,6 @@ from tuner.service.shapes import (
     accepted,
     full_job,
 )
-from tuner.service.tables import FINISHED, EventRow, FileRow, JobRow, RecordingRow, State
 from tuner.service.words import over_http
 
 

@@ -24,11 +24,10 @@ from sqlalchemy.orm import defer
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import inside
 from tuner.core.errors import InputError
-from tuner.service.database import Database
+from tuner.service.database import Database, RecordingRow
 from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, full_disk
 from tuner.service.inspection import inspect
 from tuner.service.settings import ServiceSettings
-from tuner.service.tables import RecordingRow
 from tuner.service.words import recording_name, shown, shown_name, stems
 
 BUFFER_BYTES = 2**20

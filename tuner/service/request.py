@@ -15,7 +15,7 @@ from tuner.config.job import JobFile
 from tuner.config.settings import JOB_FILE, names_recording
 from tuner.core.disk import inside
 from tuner.core.errors import ConfigError, InputError, did_you_mean
-from tuner.core.shipped import Kind, configs_folder
+from tuner.core.shipped import KINDS, shipped
 from tuner.core.yaml_document import dump_yaml
 from tuner.core.yaml_section import Section, build, refuse, section_of
 from tuner.options import FILES, FitOptions, Options
@@ -24,12 +24,7 @@ from tuner.service.words import last_part, recording_name, stems
 from tuner.vehicle import ControllerFile, VehicleFile
 
 FLIGHTS = "flights"
-#: Keys of `tune.yaml` that name a file there, and a shipped file or its content here.
-_KINDS: Mapping[str, Kind] = {
-    "vehicle": "vehicles",
-    "controller": "controllers",
-    "topics": "topics",
-}
+"""Folder of a job's recordings, and of its job file."""
 
 
 def _one_line(text: str) -> str:
@@ -141,7 +136,7 @@ def check_request(
         A key, a name or a value cannot be used; one line says what to do.
     """
     settings = dict(request.settings)
-    named = {key: settings.pop(key, None) for key in _KINDS}
+    named = {key: settings.pop(key, None) for key in KINDS}
     for key in ("vehicle", "controller"):
         given = getattr(request, key)
         named[key] = named[key] if given is None else given
@@ -150,7 +145,7 @@ def check_request(
         what = "export.into names a file, and the service has only what it is sent"
         raise ConfigError("settings", what, "fetch the result and use tune export --into")
     of = named["vehicle"]
-    if isinstance(of, str) and of in earlier and of not in _shipped("vehicles"):
+    if isinstance(of, str) and of in earlier and of not in shipped("vehicles"):
         named["vehicle"] = dict(earlier[of])
     options = {option: getattr(request, option) for option in OptionsOfJob.model_fields}
     asked = CheckedRequest(
@@ -198,10 +193,6 @@ def _holdout(names: Sequence[str] | None, flights: Sequence[str]) -> tuple[str, 
     return tuple(chosen)
 
 
-def _shipped(kind: Kind) -> list[str]:
-    return sorted(file.stem for file in (configs_folder() / kind).glob("*.yaml"))
-
-
 def _parameter_file(
     key: str, given: Any, model: type[M], earlier: Mapping[str, object] | None = None
 ) -> str | M | None:
@@ -210,9 +201,9 @@ def _parameter_file(
         return None
     if isinstance(given, Mapping):
         return build(model, given, key)
-    shipped = _shipped(_KINDS[key])
-    if not isinstance(given, str) or given not in shipped:
-        known = [*shipped, *(earlier or ())]
+    shipped_names = [*shipped(KINDS[key])]
+    if not isinstance(given, str) or given not in shipped_names:
+        known = [*shipped_names, *(earlier or ())]
         remedy = f"{did_you_mean(str(given), known)} or give the content of its file"
         raise ConfigError(key, f"'{given}' is not known here", remedy)
     return given
@@ -224,8 +215,8 @@ def _topics(given: Any) -> str | TopicMap | None:
         if topics.messages:
             what = "messages names files, and the service has only what it is sent"
             raise ConfigError("topics", what, "record in a format that defines its messages")
-        if topics.extends is not None and topics.extends not in _shipped("topics"):
-            remedy = did_you_mean(topics.extends, _shipped("topics"))
+        if topics.extends is not None and topics.extends not in shipped("topics"):
+            remedy = did_you_mean(topics.extends, shipped("topics"))
             raise ConfigError("topics", f"extends '{topics.extends}', which is unknown", remedy)
     return topics
 

@@ -22,7 +22,7 @@ from tuner.service import jobs
 from tuner.service.database import Database
 from tuner.service.dispatcher import Dispatcher
 from tuner.service.errors import UnavailableError
-from tuner.service.queue import Queue
+from tuner.service.jobs import JobQueue
 from tuner.service.settings import ServiceSettings
 
 
@@ -64,7 +64,7 @@ class Service:
         store = ContentStore(settings.store_url)
         database = Database(settings.database_url)
         database.migrate()
-        jobs = Queue(database, _identity(settings.data), settings.lease_seconds)
+        jobs = JobQueue(database, _identity(settings.data), settings.lease_seconds)
         return cls(settings, database, store, Dispatcher(settings, jobs, store, engine), _lock=lock)
 
     def close(self) -> None:

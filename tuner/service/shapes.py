@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
 from tuner.report.outcome import Usability
-from tuner.service.tables import EventRow, FileRow, JobRow, State
+from tuner.service.database import EventRow, FileRow, JobRow, State
 from tuner.service.words import over_http
 
 API = "/api/v1"

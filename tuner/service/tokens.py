@@ -10,8 +10,7 @@ import time
 from sqlalchemy import delete, select
 
 from tuner.core.errors import InputError
-from tuner.service.database import Database
-from tuner.service.tables import SessionRow, TokenRow
+from tuner.service.database import Database, SessionRow, TokenRow
 
 TOKEN_PREFIX = "tune_"
 """The prefix of tokens, by which a leaked one is recognised."""

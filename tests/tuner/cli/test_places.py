@@ -130,7 +130,7 @@ def test_a_place_that_cannot_be_read(command, expected, lab, capsys):
 )
 def test_a_folder_of_somebody_else(command, name, lab, capsys, monkeypatch):
     job = {"id": "00", "state": "done", "files": [name]}
-    monkeypatch.setattr("tuner.client.client.Client.job", lambda *_: job)
+    monkeypatch.setattr("tuner.service.client.Client.job", lambda *_: job)
     command = [word.replace("{server}", "http://127.0.0.1:9") for word in command]
     (lab / "theirs").mkdir()
     (lab / "theirs" / name).write_text("{}")

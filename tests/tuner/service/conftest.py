@@ -19,7 +19,7 @@ import uvicorn
 
 from tests.tuner.service import serving
 from tests.tuner.service.serving import FAKE_WORKER
-from tuner.service import attempt, recordings
+from tuner.service import dispatcher, recordings
 from tuner.service.app import create_app
 from tuner.service.service import Service
 from tuner.service.settings import Limits, ServiceSettings
@@ -31,7 +31,7 @@ LIMITS = Limits(free_bytes=0)
 @pytest.fixture(autouse=True)
 def _quick_worker(monkeypatch, request):
     if "real_worker" not in request.fixturenames:
-        monkeypatch.setattr(attempt, "WORKER", FAKE_WORKER)
+        monkeypatch.setattr(dispatcher, "WORKER", FAKE_WORKER)
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import os
 import sys
 from pathlib import Path
 
-from tuner.service import attempt, recordings
+from tuner.service import dispatcher, recordings
 from tuner.service.app import serve
 from tuner.service.settings import Limits, ServiceSettings
 
@@ -32,7 +32,7 @@ def serve_at(port: int, data: Path, database: str, *, real: bool) -> None:
     """Serve until the process ends; unless it is to be real, nothing is inspected nor fitted."""
     os.chdir(ROOT)
     if not real:
-        attempt.WORKER, recordings.inspect = FAKE_WORKER, found_in_a_table
+        dispatcher.WORKER, recordings.inspect = FAKE_WORKER, found_in_a_table
     settings = ServiceSettings(
         data, database=database, limits=Limits(free_bytes=0), lease_seconds=3.0
     )

@@ -14,11 +14,11 @@ import pytest
 import tuner
 from tests.tuner.service.conftest import submit, upload
 from tuner.cli import main
-from tuner.client import folder as folder_module
-from tuner.client.client import Client, job_request_of
 from tuner.config import Options
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.result import Run
+from tuner.service import client as client_module
+from tuner.service.client import Client, job_request_of
 
 
 @pytest.fixture
@@ -191,17 +191,17 @@ def test_a_folder_s_new_recordings_become_one_job_once(client, table, tmp_path, 
     (tmp_path / "c.csv").write_bytes(table.read_bytes() + b"c")
     assert main(arguments) == 0
     assert capsys.readouterr().out.startswith("c.csv: job ")
-    (tmp_path / folder_module.Submitted.FILE).unlink()  # as after a crash before it was noted
+    (tmp_path / client_module.Submitted.FILE).unlink()  # as after a crash before it was noted
     jobs = len(client.get("/api/v1/jobs").json()["jobs"])
     assert jobs == 2
 
 
 def test_a_recording_that_still_grows_is_waited_for(tmp_path, table):
     (tmp_path / "a.csv").write_bytes(b"time")
-    first = folder_module._new_recordings(tmp_path)
+    first = client_module._new_recordings(tmp_path)
     time.sleep(0.01)
     (tmp_path / "a.csv").write_bytes(table.read_bytes())
-    assert folder_module._new_recordings(tmp_path) != first
+    assert client_module._new_recordings(tmp_path) != first
 
 
 def test_a_recording_that_is_moved_away_is_passed_over(tmp_path, table, monkeypatch):
@@ -216,9 +216,9 @@ def test_a_recording_that_is_moved_away_is_passed_over(tmp_path, table, monkeypa
         return there
 
     monkeypatch.setattr(Path, "is_file", then_moved)
-    assert [path.name for path in folder_module._new_recordings(tmp_path)] == ["b.csv"]
+    assert [path.name for path in client_module._new_recordings(tmp_path)] == ["b.csv"]
     with pytest.raises(InputError, match=r"gone: cannot be read any more \(No such file"):
-        folder_module._new_recordings(tmp_path / "gone")
+        client_module._new_recordings(tmp_path / "gone")
 
 
 STREAM = {"Content-Type": "text/event-stream"}
@@ -251,7 +251,7 @@ def test_what_is_no_tuning_service_is_one_line(command, answer, table, capsys, m
         return made(**given, transport=httpx.MockTransport(answered))
 
     monkeypatch.setattr(httpx, "Client", answering)
-    monkeypatch.setattr("tuner.client.client.MAX_SILENCE_S", -1.0)
+    monkeypatch.setattr("tuner.service.client.MAX_SILENCE_S", -1.0)
     if command == ["submit", "--flights"]:
         command = [*command, str(table)]
     assert main([*command, "--server", "http://other"]) == 2

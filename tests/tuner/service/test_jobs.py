@@ -17,10 +17,9 @@ from tests.tuner.service.conftest import ended, submit, upload
 from tuner.cli import remote
 from tuner.report.outcome import outcome
 from tuner.result import RunResult
-from tuner.service import attempt, http, jobs, queue
-from tuner.service.attempt import put
-from tuner.service.dispatcher import Reporter
-from tuner.service.tables import FileRow, JobRow, State
+from tuner.service import dispatcher, http, jobs
+from tuner.service.database import FileRow, JobRow, State
+from tuner.service.dispatcher import Reporter, put
 
 KEYS = {
     "id",
@@ -128,8 +127,8 @@ def test_a_worker_that_dies_before_it_reads_is_a_death(client, recording, monkey
             super().__init__(*args, **more)
             self.wait()
 
-    monkeypatch.setattr(attempt, "WORKER", [sys.executable, "-c", ""])
-    monkeypatch.setattr(attempt.subprocess, "Popen", Gone)
+    monkeypatch.setattr(dispatcher, "WORKER", [sys.executable, "-c", ""])
+    monkeypatch.setattr(dispatcher.subprocess, "Popen", Gone)
     job = ended(client, submit(client, recording))
     assert job["error"].startswith("its worker died 3 times; the last time it ended with status 0")
 
@@ -254,13 +253,13 @@ def test_what_goes_with_the_mass_is_compared_at_one_mass(client, recording):
 
 
 def test_what_is_found_after_a_long_search_reaches_the_log(idle, monkeypatch):
-    monkeypatch.setattr(queue, "MAX_EVENTS", 10)
+    monkeypatch.setattr(jobs, "MAX_EVENTS", 10)
     with idle.database.writing() as session:
         row = JobRow(id="0" * 16, name="x", vehicle="x", request={}, submitted=0.0)
         session.add(row)
         session.flush()
         for kind in ["iteration"] * 15 + ["message"]:
-            queue.add_event(session, row.number, kind, {"text": "a flight got worse"})
+            jobs.add_event(session, row.number, kind, {"text": "a flight got worse"})
     found = jobs.events(idle.database, row)
     assert [event.kind for event in found] == ["iteration"] * 10 + ["message"]
     (late,) = jobs.events(idle.database, row, most=1, kind="message")
@@ -282,10 +281,10 @@ def test_what_happens_again_after_the_preamble_is_said_again(idle):
         row = JobRow(id="0" * 16, name="x", vehicle="x", request={}, submitted=0.0)
         row.state, row.deaths, row.events = State.QUEUED, 0, 0
         session.add(row)
-    jobs_queue = queue.Queue(idle.database, "here", 60.0)
+    jobs_queue = jobs.JobQueue(idle.database, "here", 60.0)
     for _ in range(3):
         claim = jobs_queue.claim()
-        Reporter(jobs_queue, claim, 60.0)([said, said, iteration, worse, said], {})
+        Reporter(jobs_queue, claim, 60.0)([said, said, iteration, worse, said])
         jobs_queue.give_back(claim, message="gone")
     texts = [e.content["text"] for e in jobs.events(idle.database, row, kind="message")]
     again = ["a flight got worse", "the flights", "gone"]

@@ -13,8 +13,8 @@ from tuner.config import resolve_settings
 from tuner.config.job import ExportSettings
 from tuner.exporters.export import export_formats_of_job
 from tuner.result import BEST_FIT_FILE
-from tuner.service.attempt import prepare
-from tuner.service.queue import Queue
+from tuner.service.dispatcher import prepare
+from tuner.service.jobs import JobQueue
 from tuner.vehicle import ControllerFile, write_vehicle
 
 __all__ = ["make_run"]
@@ -36,7 +36,7 @@ def test_a_job_over_http_stays_in_its_folder(idle, client, make_run, called):
     flying = ControllerFile().model_dump(mode="json", exclude_none=True)
     topics = {"name": called["topics"], "format": "table", "signals": {"position": ["x", "y", "z"]}}
     more = {"controller": flying | {"name": called["controller"]}, "name": called["job"]}
-    queue, claims = Queue(idle.database, "test", 30.0), []
+    queue, claims = JobQueue(idle.database, "test", 30.0), []
     with nothing_outside(idle.settings.data):
         sent = client.post("/api/v1/recordings", files={"file": (called["file"] or "x", b"x\n0\n")})
         job = {"recordings": [sent.json()["id"]], "vehicle": vehicle}

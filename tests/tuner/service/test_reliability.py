@@ -22,13 +22,12 @@ import pytest
 from tests.tuner.service import serving
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
 from tuner.core.errors import InputError
-from tuner.service import attempt, jobs
 from tuner.service import database as database_module
-from tuner.service.database import Database
-from tuner.service.queue import Claim, Outcome, Queue
+from tuner.service import dispatcher, jobs
+from tuner.service.database import Base, Database, RecordingRow, State
+from tuner.service.jobs import Claim, JobQueue, Outcome
 from tuner.service.request import JobRequest
 from tuner.service.service import Service
-from tuner.service.tables import Base, RecordingRow, State
 
 KILLS = 20
 STARTING = multiprocessing.get_context("forkserver")
@@ -153,7 +152,7 @@ def enter(service: Service, count: int = 1, **more: object) -> list[str]:
 
 def test_many_servers_share_one_table_and_no_job_is_claimed_twice(idle):
     entered = enter(idle, 24)
-    queues = [Queue(idle.database, f"server {n}", 30.0) for n in range(8)]
+    queues = [JobQueue(idle.database, f"server {n}", 30.0) for n in range(8)]
     with ThreadPoolExecutor(8) as pool:
         claims = list(pool.map(lambda n: queues[n % 8].claim(), range(32)))
     taken = [claim.id for claim in claims if claim is not None]
@@ -162,14 +161,14 @@ def test_many_servers_share_one_table_and_no_job_is_claimed_twice(idle):
 
 def test_only_the_attempt_that_the_table_names_can_commit(idle):
     (job,) = enter(idle)
-    first = Queue(idle.database, "first", lease=0.01)
-    second = Queue(idle.database, "second", lease=30.0)
+    first = JobQueue(idle.database, "first", lease=0.01)
+    second = JobQueue(idle.database, "second", lease=30.0)
     old = first.claim()
     time.sleep(0.05)
     assert second.recover(own=False) == 1
     new = second.claim()
     points = [{"coefficient": "mass", "unit": "kg", "best": 1.0}]
-    assert not first.report(old, [("message", {"text": "late"})], {"iteration": 9})
+    assert not first.report(old, [("message", {"text": "late"})])
     assert not first.finish(old, Outcome(State.DONE, exit_status=0, points=points))
     assert not first.give_back(old, message="late")
     assert second.finish(new, Outcome(State.DONE, exit_status=0, points=points))
@@ -184,12 +183,12 @@ def test_only_the_attempt_that_the_table_names_can_commit(idle):
 def test_a_lease_that_is_renewed_is_not_taken_away(idle, monkeypatch):
     enter(idle)
     clock = SimpleNamespace(now=time.time())
-    monkeypatch.setattr("tuner.service.queue.time", SimpleNamespace(time=lambda: clock.now))
-    first, second = Queue(idle.database, "a", 0.2), Queue(idle.database, "b", 0.2)
+    monkeypatch.setattr("tuner.service.jobs.time", SimpleNamespace(time=lambda: clock.now))
+    first, second = JobQueue(idle.database, "a", 0.2), JobQueue(idle.database, "b", 0.2)
     claim = first.claim()
     for _ in range(4):
         clock.now += 0.1
-        assert first.report(claim, [], {})
+        assert first.report(claim, [])
         clock.now += 0.1
         assert second.recover(own=False) == 0
     clock.now += 0.3
@@ -199,13 +198,13 @@ def test_a_lease_that_is_renewed_is_not_taken_away(idle, monkeypatch):
 def test_a_result_that_takes_longer_to_store_than_a_lease_holds_is_not_fitted_again(
     settings, table, monkeypatch
 ):
-    store = attempt._store_files
+    store = dispatcher._store_files
 
     def slowly(*arguments):
         time.sleep(2.5)
         return store(*arguments)
 
-    monkeypatch.setattr(attempt, "_store_files", slowly)
+    monkeypatch.setattr(dispatcher, "_store_files", slowly)
     service = Service.open(replace(settings, lease_seconds=1.5))
     with listening(service) as client:
         done = ended(client, submit(client, upload(client, table.read_bytes())))
@@ -250,7 +249,7 @@ def test_a_database_that_cannot_be_migrated_is_told(settings, spoil, said):
 def test_a_job_of_another_version_ends_in_words(idle, tmp_path):
     claim = Claim(1, "a", "b", 0, {"gone": 1}, {}, {})
     with pytest.raises(InputError, match="was submitted to another version of tune; submit it"):
-        attempt.prepare(tmp_path, claim, idle.store)
+        dispatcher.prepare(tmp_path, claim, idle.store)
 
 
 def test_a_locked_database_is_told_and_nothing_is_lost(client, service, table, monkeypatch):
@@ -306,7 +305,7 @@ def test_a_disk_that_fills_while_a_result_is_stored_fails_the_job_and_a_retry_en
         raise OSError(28, os.strerror(28))
 
     with monkeypatch.context() as full:
-        full.setattr("tuner.service.attempt.shutil.copyfile", refuse)
+        full.setattr("tuner.service.dispatcher.shutil.copyfile", refuse)
         job = ended(client, submit(client, recording))
     assert (job["state"], job["exit_status"], job["files"]) == ("failed", 2, [])
     assert "has no space left; free some space and try again" in job["error"]

@@ -2,7 +2,7 @@
 
 from alembic import context
 
-from tuner.service.tables import Base
+from tuner.service.database import Base
 
 context.configure(
     connection=context.config.attributes["connection"],

@@ -15,9 +15,9 @@ from tuner.evaluate.records import RMSE_UNITS
 from tuner.report.chart import FITTED, INITIAL, Chart, Line, Look, Panel
 from tuner.report.section import figures, short
 from tuner.result import CoefficientResult, ExportRecord, ExportRecords, RunResult
+from tuner.service.database import JobRow
 from tuner.service.errors import NotKnownError, NotNowError
 from tuner.service.shapes import CoefficientHistory
-from tuner.service.tables import JobRow
 from tuner.vehicle.registry import mass_factor
 
 

@@ -21,7 +21,7 @@ from starlette.datastructures import FormData
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from tuner.core.errors import ConfigError, InputError
-from tuner.core.shipped import configs_folder
+from tuner.core.shipped import shipped
 from tuner.core.validation import config_error
 from tuner.core.yaml_document import document_of
 from tuner.evaluate.records import RMSE_UNITS
@@ -31,17 +31,16 @@ from tuner.report.outcome import STYLE_OF, flights_table, outcome, warnings_of
 from tuner.report.page import LIBRARIES
 from tuner.report.section import figures
 from tuner.service import jobs, recordings, tokens
+from tuner.service.database import FINISHED, JobRow, RecordingRow, State
 from tuner.service.errors import NoTokenError, ServiceError
 from tuner.service.http import JobOfPath, ServiceOfApp, service_of, upload
-from tuner.service.jobs import history, vehicles
-from tuner.service.queue import MAX_EVENTS
+from tuner.service.jobs import MAX_EVENTS, history, vehicles
 from tuner.service.recordings import flight_name
 from tuner.service.request import JobRequest
 from tuner.service.safety import COOKIE, CURRENT_VISITOR
 from tuner.service.service import Service
 from tuner.service.settings import size_in_words
 from tuner.service.shapes import API, iso
-from tuner.service.tables import FINISHED, JobRow, RecordingRow, State
 from tuner.service.web import comparison
 from tuner.service.web.comparison import history_chart, rmse_chart
 from tuner.service.words import on_the_web
@@ -165,8 +164,7 @@ def _start(
     ids = {row.sha256 for row, _ in chosen}
     given = given or {}
     blank = dict.fromkeys(("name", "vehicle", "mass", "settings", "holdout"), "")
-    shipped = [file.stem for file in (configs_folder() / "vehicles").glob("*.yaml")]
-    names = sorted({*shipped, *vehicles(service.database)})
+    names = sorted({*shipped("vehicles"), *vehicles(service.database)})
     latest = [
         row for row in recordings.latest(service.database, MAX_LATEST) if row.sha256 not in ids
     ]

@@ -1,27 +1,34 @@
-"""A tuning service from Python: ``tuner.connect(url).fit([...])`` is `tuner.fit` elsewhere."""
+"""A tuning service as its users reach it: ``tuner.connect(url).fit([...])`` is `tuner.fit` there.
+
+A folder that fills with recordings can be watched: those that have settled become a job.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import quote
 
+from pydantic import Field
+
 from tuner.config import Settings, resolve_settings
-from tuner.core.disk import inside, result_folder, whole_file
+from tuner.core.disk import exists, inside, result_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
-from tuner.core.shipped import Kind, configs_folder, find_config
+from tuner.core.files import ResultFile
+from tuner.core.shipped import KINDS, configs_folder, find_config
 from tuner.core.yaml_document import read_yaml
 from tuner.core.yaml_section import Section
-from tuner.options import FILES, FitOptions, taking
+from tuner.options import FILES, MODELS, FitOptions, taking
 from tuner.recordings.cache import digest
-from tuner.recordings.topics import load_topic_map
+from tuner.recordings.topics import TopicMap, load_topic_map
 from tuner.result import Run, RunResult, forget, place_for, read_run
 from tuner.vehicle import read_vehicle
 from tuner.vehicle.controller import read_controller
@@ -401,13 +408,12 @@ def job_request_of(options: FitOptions) -> tuple[tuple[Path, ...], dict[str, Any
     settled = resolve_settings(options)
     names = (field.name for field in fields(FitOptions) if field.name not in FILES)
     request = {name: getattr(options, name) for name in names}
+    request |= {key: _content_of(key, getattr(options, key), Path()) for key in MODELS}
     request["settings"] = _settings(settled)
-    request["vehicle"] = _content_of("vehicles", read_vehicle, options.vehicle, Path())
-    request["controller"] = _content_of("controllers", read_controller, options.controller, Path())
     if options.holdout is not None:
         request["holdout"] = list(settled.job.holdout)
     if options.topics is not None:
-        request["settings"]["topics"] = _topics(find_config("topics", options.topics, Path()))
+        request["settings"]["topics"] = _content_of("topics", options.topics, Path())
     return settled.flights, {key: value for key, value in request.items() if value is not None}
 
 
@@ -431,45 +437,127 @@ def _settings(settled: Settings) -> dict[str, Any]:
             "export.into names a file of this machine",
             "leave it out, and use tune export --into on what you fetch",
         )
-    readers: dict[Kind, Callable[[Path], Section]] = {
-        "vehicles": read_vehicle,
-        "controllers": read_controller,
-    }
-    for kind, read in readers.items():
-        if (named := settings.get(key := kind.removesuffix("s"))) is not None:
-            settings[key] = _content_of(kind, read, str(named), base)
-    if (named := settings.get("topics")) is not None:
-        settings["topics"] = _topics(find_config("topics", str(named), base))
-    return settings
+    named = {key: settings[key] for key in KINDS if settings.get(key) is not None}
+    return settings | {key: _content_of(key, str(file), base) for key, file in named.items()}
 
 
-def _content_of(
-    kind: Kind, read: Callable[[Path], Section], named: str | Section | None, base: Path
-) -> str | dict[str, Any] | None:
-    """Return the name of a file that the server ships, or else the file's content."""
-    if not isinstance(named, str):
-        return _content(named)
-    path = find_config(kind, named, base)
-    return _shipped(kind, path) or _content(read(path))
+def _content_of(key: str, named: str | Section | None, base: Path) -> str | dict[str, Any] | None:
+    """Return the name of a file that every server ships, or else the file's content."""
+    if isinstance(named, str):
+        path = find_config(KINDS[key], named, base)
+        if path.resolve().parent == (configs_folder() / KINDS[key]).resolve():
+            return path.stem
+        named = READERS[key](path)
+    return None if named is None else named.model_dump(mode="json", exclude_none=True)
 
 
-def _topics(path: Path) -> Any:
-    shipped = _shipped("topics", path)
-    if shipped is not None:
-        return shipped
+def _read_topics(path: Path) -> TopicMap:
+    """Read a topic map with all that it extends."""
     topics = load_topic_map(path)
     if topics.messages:
         raise InputError(
             path, "names .msg files, which no server takes", "fit with tune on this machine"
         )
-    return _content(topics.replace(extends=None))
+    return topics.replace(extends=None)
 
 
-def _shipped(kind: Kind, path: Path) -> str | None:
-    """Return the name of a file that ships with every server."""
-    inside = path.resolve().parent == (configs_folder() / kind).resolve()
-    return path.stem if inside else None
+READERS: Mapping[str, Callable[[Path], Section]] = {
+    "vehicle": read_vehicle,
+    "controller": read_controller,
+    "topics": _read_topics,
+}
+"""Key of a job file -> reader of a file that it names."""
 
 
-def _content(section: Section | None) -> dict[str, Any] | None:
-    return None if section is None else section.model_dump(mode="json", exclude_none=True)
+SUFFIXES = (".bag", ".mcap", ".db3", ".ulg", ".csv", ".parquet")
+LOOK_INTERVAL_S = 2.0
+"""Between two looks into the folder."""
+Marks = tuple[int, int]
+"""bytes, and ns of the last change"""
+
+
+class Submitted(ResultFile):
+    """Submitted recordings of a folder: name -> its marks and its job."""
+
+    FILE = ".tune-submitted.json"
+
+    recordings: dict[str, tuple[int, int, str]] = Field(default_factory=dict)
+
+
+def watch(
+    client: Client, folder: Path, *, settle: float, once: bool, say: Callable[[str], None]
+) -> None:
+    """Submit a job whenever new recordings have settled, until interrupted.
+
+    Parameters
+    ----------
+    client
+        Of the server.
+    folder
+        To look into.
+    settle
+        s for which no new recording has changed.
+    once
+        End after the first submission, or when nothing is new.
+    say
+        Gets a line for each submission and refusal.
+
+    Raises
+    ------
+    InputError
+        The folder is none or, with ``once``, the job is refused.
+    """
+    if not (exists(folder) and folder.is_dir()):
+        raise InputError(folder, "is no folder", "name the folder that recordings arrive in")
+    seen: Mapping[Path, Marks] = {}
+    still_since = time.monotonic()
+    refused: Mapping[Path, Marks] = {}
+    while True:
+        new = _new_recordings(folder)
+        if new != seen:
+            seen, still_since = new, time.monotonic()
+        settled = time.monotonic() - still_since >= settle
+        if new and settled and new != refused:
+            try:
+                say(_submit(client, folder, new))
+                refused = {}
+            except InputError as error:
+                if once:
+                    raise
+                say(f"tune: {error}")
+                refused = {} if error.where == "--server" else new
+        if once and (not new or settled):
+            return
+        time.sleep(min(LOOK_INTERVAL_S, settle) if new else LOOK_INTERVAL_S)
+
+
+def _new_recordings(folder: Path) -> dict[Path, Marks]:
+    """Return the recordings that were not submitted as they are now."""
+    before = Submitted.read_if_any(folder) or Submitted()
+    found = {}
+    try:
+        paths = sorted(folder.iterdir())
+    except OSError as error:
+        what = f"cannot be read any more ({error.strerror})"
+        raise InputError(folder, what, "check the folder and the disk") from None
+    for path in paths:
+        if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or not path.is_file():
+            continue
+        try:
+            about = path.stat()
+        except FileNotFoundError:  # it was moved away just now
+            continue
+        marks = (about.st_size, about.st_mtime_ns)
+        if before.recordings.get(path.name, (0, 0, ""))[:2] != marks:
+            found[path] = marks
+    return found
+
+
+def _submit(client: Client, folder: Path, new: Mapping[Path, Marks]) -> str:
+    """Submit one job of recordings, note it, and return a line about it."""
+    key = hashlib.sha256(repr([(str(path.absolute()), *new[path]) for path in new]).encode())
+    job = client.submit(FitOptions([str(path) for path in new]), key=key.hexdigest())
+    before = Submitted.read_if_any(folder) or Submitted()
+    done = {path.name: (*marks, job) for path, marks in new.items()}
+    Submitted(recordings=before.recordings | done).write(folder)
+    return f"{', '.join(path.name for path in new)}: job {job}"
