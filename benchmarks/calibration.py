@@ -29,13 +29,14 @@ from benchmarks.oracle import oracle_error, simulate_like
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from sim_jax.inlet import ReferenceInlet
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
 from tuner.objective.criterion import Point, picked
 from tuner.objective.normal_equations import Objective
 from tuner.objective.space import Space
+from tuner.options import Options
 from tuner.search.continuation import run_stages
 from tuner.search.estimation import free_offsets
 from tuner.search.job_flights import read_recordings

@@ -25,11 +25,12 @@ from scipy.spatial.transform import Rotation
 from benchmarks.air import gauss_markov
 from benchmarks.table import Section, figure
 from sim_jax.constants import GRAVITY
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.core.disk import write_text
 from tuner.equation_error.recorded_accelerations import Steps, steps_of
 from tuner.equation_error.regression import convolved, summing
 from tuner.job.run import run
+from tuner.options import Options
 from tuner.recordings.flight import Flight
 from tuner.result import RunResult
 from tuner.search.job_flights import read_recordings, regressors

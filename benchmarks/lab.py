@@ -38,7 +38,7 @@ from benchmarks.lab_flights import (
 from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure, table
 from sim_jax.schedule import Schedule
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
@@ -46,6 +46,7 @@ from tuner.findings.findings import Code, Finding, one_line
 from tuner.job.prepare import prepare
 from tuner.objective.battery import VOLTAGE, log_voltage_of
 from tuner.objective.windows import Window
+from tuner.options import Options
 from tuner.recordings.flight import Flight
 from tuner.search.listener import Reporter
 from tuner.search.problem import Job

@@ -32,8 +32,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
-from tuner.config import Options, resolve_settings
-from tuner.config.job import InletName, JobFile
+from tuner.config import InletName, JobFile, resolve_settings
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array
 from tuner.evaluate.prediction import (
@@ -49,6 +48,7 @@ from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.job.run import run
 from tuner.job.without_pose import fit_without_pose
 from tuner.objective.inlets import INLETS
+from tuner.options import Options
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.loader import InertialFlight
 from tuner.recordings.states import States, initial_state, local_parabolas, states_at

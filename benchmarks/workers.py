@@ -82,7 +82,7 @@ def _processes(engine: Engine, workers: int) -> dict[float, dict[str, float]]:
 
 def _cross_validation() -> tuple[dict[str, _Folds], list[str]]:
     """Return engine -> its cross-validation, and every table."""
-    from tuner.config import Options  # noqa: PLC0415 (jax is configured first)
+    from tuner.options import Options  # noqa: PLC0415 (jax is configured first)
     from tuner.search.estimation import search  # noqa: PLC0415
     from tuner.search.job_flights import read_recordings  # noqa: PLC0415
     from tuner.search.problem import job_of  # noqa: PLC0415

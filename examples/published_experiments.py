@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import tuner
-from tuner.config.job import TrajectoryName
+from tuner.config import TrajectoryName
 from tuner.core.shipped import find_config
 from tuner.vehicle import ControllerFile, VehicleFile, read_controller, read_vehicle
 

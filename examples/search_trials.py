@@ -27,11 +27,12 @@ from tuner.core.runtime import configure
 
 configure()
 
-from tuner.config import Options, Settings, resolve_settings  # noqa: E402 (jax is configured first)
+from tuner.config import Settings, resolve_settings  # noqa: E402 jax is configured first
 from tuner.engine import Report, engine_for  # noqa: E402
 from tuner.evaluate.validation import validate  # noqa: E402
 from tuner.findings.findings import Code  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
+from tuner.options import Options  # noqa: E402
 from tuner.recordings.flight import Flight, Series  # noqa: E402
 from tuner.search.estimation import search  # noqa: E402
 from tuner.search.job_flights import read_recordings  # noqa: E402

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from tuner import result as results
-from tuner.config.job import TrajectoryName
+from tuner.config import TrajectoryName
 from tuner.core.disk import exists
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array

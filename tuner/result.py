@@ -13,9 +13,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer, field_validator
 from pydantic_core import from_json
 
-from tuner.core.disk import check_links, exists, folder_for, inside, remove_file
+from tuner.core.disk import check_links, exists, folder_for, inside, read_bytes, remove_file
 from tuner.core.errors import InputError, OutputError
-from tuner.core.files import MAX_BYTES, FiniteOrNone, Part, ResultFile, read_bytes
+from tuner.core.files import MAX_BYTES, FiniteOrNone, Part, ResultFile
 from tuner.core.yaml_section import refuse
 from tuner.design.proposals import LogProposal
 from tuner.evaluate.records import AxesRmse, PredictedErrors

@@ -15,14 +15,14 @@ from tests.tuner.exporters.conftest import as_the_run_says, make_run
 from tests.tuner.report import making
 from tests.tuner.report.conftest import FREE, ROLLING
 from tuner.cli import main
-from tuner.config.job import ExportSettings
+from tuner.config import ExportSettings
 from tuner.core import disk
 from tuner.core.disk import file_name, inside
 from tuner.core.errors import InputError, OutputError
 from tuner.exporters.export import export_formats_of_job
 from tuner.report import render
-from tuner.report.chart import Chart, Panel
 from tuner.report.paper import write_plots
+from tuner.report.section import Chart, Panel
 from tuner.result import BEST_FIT_FILE
 from tuner.vehicle import write_vehicle
 

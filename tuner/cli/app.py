@@ -125,9 +125,7 @@ COMMANDS = {
         "tune simulate --trajectory circle --sweep motor_constant=1.2e-5:1.6e-5:9 --out g.csv",
     ),
 }
-MODULES = {"new-vehicle": "new_vehicle"} | dict.fromkeys(
-    ("submit", "jobs", "watch", "fetch", "cancel", "watch-folder"), "remote"
-)
+MODULES = dict.fromkeys(("submit", "jobs", "watch", "fetch", "cancel", "watch-folder"), "remote")
 """Command -> its module, where that is not `tuner.cli.commands`."""
 for _name, (_summary, *_examples) in COMMANDS.items():
     if _name == "serve":

@@ -81,7 +81,7 @@ def trace_of(spans: Sequence[Span]) -> dict[str, Any]:
 
 
 def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
-    from tuner.cli.tables import console, rich_table
+    from tuner.cli.results import console, rich_table
 
     screen = console()
     screen.print(rich_table(_table(rows)))

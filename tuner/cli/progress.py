@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from tuner.cli.tables import console
+from tuner.cli.results import console
 from tuner.core.phrases import as_sentence
 from tuner.core.spans import watching
 

@@ -131,7 +131,7 @@ def jobs(
     json
         Print JSON instead of a table.
     """
-    from tuner.cli.tables import console, rich_table
+    from tuner.cli.results import console, rich_table
     from tuner.report.section import Table
 
     with client_of(server, token) as client:

@@ -19,8 +19,9 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
-from tuner.core.errors import InputError, OutputError, RecordingError
+from tuner.core.errors import ConfigError, InputError, OutputError, RecordingError
 
 MAX_NAME_LETTERS = 100
 """Letters of a file's name that is made of another name, its suffix included."""
@@ -380,3 +381,34 @@ def remove_file(path: Path) -> None:
     """
     with _refusals(path):
         path.unlink(missing_ok=True)
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a file, and no pipe or device in a folder: none of its bytes may ever come.
+
+    Those of ``/dev`` are what a shell makes of ``<(command)``.
+    """
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or path.is_relative_to("/dev")):
+        raise OSError(errno.EINVAL, "it is no file")
+    return path.open("rb")
+
+
+def read_bytes(path: Path, *, most: int, remedy: str) -> bytes:
+    """Return the content of a file, if it holds no more than so many bytes.
+
+    Raises
+    ------
+    ConfigError
+        The file does not exist, cannot be read or is larger; ``remedy`` says what to do.
+    """
+    try:
+        with open_file(path) as file:
+            raw = file.read(most + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        raise ConfigError(path, "does not exist", remedy) from None
+    except OSError as error:
+        raise ConfigError(path, f"cannot be read ({error.strerror})", remedy) from None
+    if len(raw) > most:
+        raise ConfigError(path, f"is larger than {most // 1_000_000} MB", remedy)
+    return raw

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import csv
-import errno
 import io
 import json
 import math
-import stat
 import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 from zipfile import BadZipFile, is_zipfile
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
-from tuner.core.disk import write_text
-from tuner.core.errors import ConfigError, InputError
+from tuner.core.disk import open_file, read_bytes, write_text
+from tuner.core.errors import InputError
 from tuner.core.phrases import printable
-from tuner.core.validation import config_error
+from tuner.core.yaml_section import config_error
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,37 +46,6 @@ def _cell(value: object) -> object:
     return repr(value) if isinstance(value, float) else value
 
 
-def _opened(path: Path) -> BinaryIO:
-    """Open a file, and no pipe or device in a folder: none of its bytes may ever come.
-
-    Those of ``/dev`` are what a shell makes of ``<(command)``.
-    """
-    mode = path.stat().st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or path.is_relative_to("/dev")):
-        raise OSError(errno.EINVAL, "it is no file")
-    return path.open("rb")
-
-
-def read_bytes(path: Path, *, most: int, remedy: str) -> bytes:
-    """Return the content of a file, if it holds no more than so many bytes.
-
-    Raises
-    ------
-    ConfigError
-        The file does not exist, cannot be read or is larger; ``remedy`` says what to do.
-    """
-    try:
-        with _opened(path) as file:
-            raw = file.read(most + 1)
-    except (FileNotFoundError, NotADirectoryError):
-        raise ConfigError(path, "does not exist", remedy) from None
-    except OSError as error:
-        raise ConfigError(path, f"cannot be read ({error.strerror})", remedy) from None
-    if len(raw) > most:
-        raise ConfigError(path, f"is larger than {most // 1_000_000} MB", remedy)
-    return raw
-
-
 def read_arrays(path: Path, *, remedy: str) -> dict[str, NDArray[Any]]:
     """Return the arrays of an ``.npz`` file by their names.
 
@@ -90,7 +57,7 @@ def read_arrays(path: Path, *, remedy: str) -> dict[str, NDArray[Any]]:
     import numpy as np  # noqa: PLC0415 (`tune --help` answers without it)
 
     try:
-        with _opened(path) as file:
+        with open_file(path) as file:
             if not is_zipfile(file):
                 raise ValueError("it is no archive")
             file.seek(0)

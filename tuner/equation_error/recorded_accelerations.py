@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sim_jax.constants import GRAVITY
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
-from tuner.config.job import InletName
+from tuner.config import InletName
 from tuner.core.numerics import Array
 from tuner.objective.inlets import (
     MAX_PERIODS,

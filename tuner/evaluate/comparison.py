@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.state import AIRBORNE
-from tuner.config import Settings, resolve_settings
-from tuner.config.job import InletName
+from tuner.config import InletName, Settings, resolve_settings
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array
 from tuner.core.shipped import find_config

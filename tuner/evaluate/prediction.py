@@ -26,7 +26,7 @@ from sim_jax.environment import Disturbance
 from sim_jax.geometry import Vec3
 from sim_jax.schedule import Schedule
 from sim_jax.state import AIRBORNE
-from tuner.config.job import InletName
+from tuner.config import InletName
 from tuner.core.numerics import Array
 from tuner.equation_error.model_accelerations import ModelAccelerations
 from tuner.equation_error.recorded_accelerations import Steps, steps_by_inlet

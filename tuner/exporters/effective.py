@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from tuner.config import JobFile, Settings
-from tuner.config.job import CoefficientSettings
+from tuner.config import CoefficientSettings, JobFile, Settings
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.files import ResultFile
 from tuner.core.phrases import listed

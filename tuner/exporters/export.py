@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from tuner.config.job import ExportSettings
+from tuner.config import ExportSettings
 from tuner.core.disk import check_file, exists, file_name, inside
 from tuner.core.errors import ExportError, InputError
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse

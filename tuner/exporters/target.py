@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from tuner.core import shipped
-from tuner.core.disk import whole_file
+from tuner.core.disk import read_bytes, whole_file
 from tuner.core.errors import ConfigError, ExportError, did_you_mean
-from tuner.core.files import read_bytes
 from tuner.exporters import targets
 from tuner.exporters.simulators import THIS_PROJECT, Simulator
 from tuner.result import Gate

@@ -6,8 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from tuner.ground.bifilar import measure_bifilar
-from tuner.ground.hovers import measure_hover_weights, measure_yaw_spin
+from tuner.ground.hovers import measure_hover_weights, measure_propeller, measure_yaw_spin
 from tuner.ground.measurement import Measurement
 from tuner.ground.plan import (
     Bifilar,
@@ -20,9 +19,8 @@ from tuner.ground.plan import (
     TorqueStand,
     YawSpin,
 )
-from tuner.ground.propeller import measure_propeller
 from tuner.ground.rig_data import read_columns, read_swing, recording_path
-from tuner.ground.stands import measure_rpm_curve, measure_stand
+from tuner.ground.rigs import measure_bifilar, measure_rpm_curve, measure_stand
 from tuner.ground.step_response import measure_step_response
 from tuner.vehicle import VehicleFile
 from tuner.vehicle.vehicle import REFERENCE_ARM, size_of

@@ -1,10 +1,20 @@
-"""Gyro, accelerometer and commands on one clock, in the band of rigid-body motion."""
+"""Gyro, accelerometer and commands on one clock, and body rates that commands predict.
+
+Errors of open-loop predictions from the measured body rate are told by the time ahead::
+
+    I dω/dt = Σ lever·k·Ω² + trim - ω × Iω
+
+with Ω the rotor speeds that follow the commands. Airspeed is unknown without a pose, and left out.
+Errors of the torque accumulate, so that a constant body rate becomes the better prediction after
+some time; later errors do not measure a vehicle.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import starmap
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +22,11 @@ from scipy import signal
 
 from tuner.core.numerics import Array
 from tuner.objective.inlets import linear_interpolation
+from tuner.objective.rotor_response import MotorLags, rotor_speeds
+from tuner.objective.rotor_signals import levers
 from tuner.recordings.flight import Series
+from tuner.vehicle import ControllerFile, VehicleFile, values_of
+from tuner.vehicle.model import model_of
 
 CUTOFF_HZ = 30.0
 """Low-pass of measured and modelled signals, between the band of motors with lags of tens of ms and
@@ -103,3 +117,65 @@ def blocks_of(stretches: tuple[Stretch, ...], order: int) -> NDArray[np.int64]:
         numbers.append(block)
         first = int(block[-1]) + 1
     return np.concatenate(numbers)
+
+
+HORIZONS_S = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
+"""Times ahead of the errors."""
+STRIDE_S = 0.1
+"""Time from one prediction to the next."""
+
+
+@dataclass(frozen=True)
+class RateErrors:
+    """Mean errors, rad/s, of body rates predicted so far ahead.
+
+    Attributes
+    ----------
+    seconds
+        One of `HORIZONS_S`.
+    initial, fitted
+        By the initial and by the fitted vehicle.
+    hold
+        By a constant body rate.
+    """
+
+    seconds: float
+    initial: float
+    fitted: float
+    hold: float
+
+
+def rate_errors(
+    stretches: Sequence[Stretch], initial: VehicleFile, fitted: VehicleFile
+) -> tuple[RateErrors, ...]:
+    """Return the errors of a flight's predictions; none without a stretch."""
+    if not stretches:
+        return ()
+    missed = [
+        np.concatenate([_prediction_errors(stretch, vehicle) for stretch in stretches], axis=1)
+        for vehicle in (initial, fitted, None)
+    ]
+    errors = np.linalg.norm(missed, axis=-1).mean(axis=-1)
+    return tuple(starmap(RateErrors, zip(HORIZONS_S, *errors.tolist(), strict=True)))
+
+
+def _prediction_errors(stretch: Stretch, vehicle: VehicleFile | None) -> Array:
+    """Return the errors (S, n, 3) rad/s of predictions that begin every `STRIDE_S`."""
+    measured, inside = low_pass(stretch.body_rate, stretch.step), np.flatnonzero(stretch.inside)
+    places = [round(seconds / stretch.step) for seconds in HORIZONS_S]
+    begin = inside[: max(0, len(inside) - places[-1]) : round(STRIDE_S / stretch.step)]
+    rates = [measured[begin]]
+    if vehicle is not None:
+        value = values_of(vehicle)
+        inertia = np.array([value[f"inertia_{axis}{axis}"] for axis in "xyz"])
+        trim = np.array([value.get(f"torque_trim_{axis}", 0.0) for axis in "xyz"])
+        motor = model_of(vehicle, ControllerFile()).vehicle.motor
+        lags = MotorLags(
+            value["time_constant_up"], value["time_constant_down"], value["actuator_latency"]
+        )
+        speeds = rotor_speeds(stretch.command, stretch.step, motor, lags)
+        torque = value["motor_constant"] * np.square(speeds) @ levers(vehicle) + trim
+        for step in range(places[-1]):
+            moment = torque[begin + step] - np.cross(rates[-1], inertia * rates[-1])
+            rates.append(rates[-1] + stretch.step * moment / inertia)
+    return np.stack([rates[min(n, len(rates) - 1)] - measured[begin + n] for n in places])

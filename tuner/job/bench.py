@@ -16,9 +16,16 @@ from tuner.core.numerics import Z95
 from tuner.core.runtime import PROGRAM, versions
 from tuner.core.shipped import find_config
 from tuner.findings.findings import Code, Finding
-from tuner.ground.bench_json import Combination, bench_record, combine
 from tuner.ground.experiments import measure, names_of
-from tuner.ground.measurement import Measurement, error_of, scaled_of, value_of
+from tuner.ground.measurement import (
+    Combination,
+    Measurement,
+    bench_record,
+    combine,
+    error_of,
+    scaled_of,
+    value_of,
+)
 from tuner.ground.plan import BenchFile, YawSpin, read_bench
 from tuner.report import render
 from tuner.result import (

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tuner.config import Options, Settings, resolve_settings
+from tuner.config import Settings, resolve_settings
 from tuner.core.errors import InputError
 from tuner.core.phrases import listed
 from tuner.findings.findings import Code, sentence
+from tuner.options import Options
 from tuner.recordings.cache import cache_file, digest, load_or_compute, source_version
 from tuner.recordings.inspection import Inspection
 from tuner.recordings.topics import read_sidecar

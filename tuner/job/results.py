@@ -14,7 +14,7 @@ from tuner.core.disk import write_text
 from tuner.core.files import csv_text
 from tuner.core.numerics import Z95
 from tuner.core.runtime import PROGRAM, versions
-from tuner.core.yaml_document import commented, dump_yaml
+from tuner.core.yaml_section import commented, dump_yaml
 from tuner.design.proposals import LogProposal, Proposals
 from tuner.design.ranking import (
     CLEARANCE_M,

@@ -14,13 +14,13 @@ from math import nan
 from pathlib import Path
 from typing import Any
 
-from tuner.config import Options, Settings, resolve_settings
+from tuner.config import Settings, resolve_settings
 from tuner.core.disk import result_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.core.phrases import clause
 from tuner.core.spans import span
-from tuner.design.next_log import propose_logs
 from tuner.design.proposals import LogProposal
+from tuner.design.ranking import propose_logs
 from tuner.evaluate.comparison import table_of
 from tuner.evaluate.validation import (
     Validation,
@@ -37,6 +37,7 @@ from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.findings.findings import Finding, merge_alike, remedy, sentence
 from tuner.job.prepare import check_information, prepare
 from tuner.job.results import result_of, write_folder, write_next_flight
+from tuner.options import Options
 from tuner.report import render, write_search, write_traces
 from tuner.report.outcome import WRONG_INPUT_CODES
 from tuner.report.result_texts import export_sentence

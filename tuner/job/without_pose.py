@@ -13,11 +13,9 @@ from tuner.config import Settings
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.evaluate.validation import MAX_RMSE_INCREASE
 from tuner.findings.findings import Code, Finding, Level
-from tuner.ground.bench_json import Combination, combine
-from tuner.ground.measurement import Measurement, value_of
+from tuner.ground.measurement import Combination, Measurement, combine, value_of
 from tuner.inertial.measurement import measure_inertial, widen_to_agree
-from tuner.inertial.prediction import RateErrors, rate_errors
-from tuner.inertial.signals import stretches_of
+from tuner.inertial.signals import RateErrors, rate_errors, stretches_of
 from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, write_measurements
 from tuner.recordings.loader import InertialFlight
 from tuner.result import place_for

@@ -28,7 +28,7 @@ from sim_jax.inlet import (
     RotorSpeedInlet,
 )
 from sim_jax.schedule import Schedule
-from tuner.config.job import InletName
+from tuner.config import InletName
 from tuner.core.numerics import Array
 from tuner.recordings.flight import SIGNALS, Flight, Series
 from tuner.recordings.interpolation import body_rate_from, with_gaps_filled

@@ -16,8 +16,7 @@ from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.numeric import Array
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
-from tuner.config import CHANNELS
-from tuner.config.job import InletName
+from tuner.config import CHANNELS, InletName
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array as Numbers
 from tuner.core.numerics import robust_sd

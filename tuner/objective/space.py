@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from sim_jax.sensing import MAX_CUTOFF
-from tuner.config import JobFile
-from tuner.config.job import CoefficientSettings
+from tuner.config import CoefficientSettings, JobFile
 from tuner.core.errors import ConfigError
 from tuner.core.numerics import Array
 from tuner.vehicle import ControllerFile, VehicleFile, check_value, initial_values

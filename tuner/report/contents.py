@@ -16,7 +16,7 @@ from tuner.core.numerics import Array
 from tuner.design.proposals import Proposals
 from tuner.evaluate.records import Table
 from tuner.findings.findings import Finding
-from tuner.ground.bench_json import BenchRecord
+from tuner.ground.measurement import BenchRecord
 from tuner.result import (
     ExportRecord,
     ExportRecords,

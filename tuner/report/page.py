@@ -18,7 +18,6 @@ from markupsafe import Markup
 from tuner.core.disk import write_text
 from tuner.core.errors import InputError
 from tuner.design.proposals import proposals_in_words
-from tuner.report.chart import charts_json
 from tuner.report.contents import Contents, read_contents
 from tuner.report.outcome import (
     examination_in_words,
@@ -28,20 +27,19 @@ from tuner.report.outcome import (
     warnings_of,
 )
 from tuner.report.paper import write_plots
-from tuner.report.section import Section
-from tuner.report.sections.bench import bench
-from tuner.report.sections.coefficients import coefficients
+from tuner.report.section import Section, charts_json
+from tuner.report.sections.coefficients import bench, coefficients, effective, refits, sources
 from tuner.report.sections.flights import flights, forces
-from tuner.report.sections.search import search, selection
+from tuner.report.sections.search import provenance, remarks, search, selection
 from tuner.report.sections.sensitivity import (
     effects,
     global_sensitivity,
     information,
     next_flight,
+    next_log,
     profiles,
     residuals,
 )
-from tuner.report.sections.tables import effective, next_log, provenance, refits, remarks, sources
 
 REPORT_FILE = "report.html"
 LIBRARIES = ("d3.min.js", "plot.umd.min.js")

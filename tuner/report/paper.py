@@ -12,7 +12,7 @@ import numpy as np
 
 from tuner.core.disk import check_file, file_name, inside, make_folder, whole_file
 from tuner.core.errors import InputError
-from tuner.report.chart import (
+from tuner.report.section import (
     FITTED,
     GREY,
     MIN_DRAWN,

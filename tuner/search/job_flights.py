@@ -10,8 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tuner.config import Settings, TrajectorySettings
-from tuner.config.job import FlightSettings, InletName
+from tuner.config import FlightSettings, InletName, Settings, TrajectorySettings
 from tuner.core.disk import exists
 from tuner.core.errors import InputError, RecordingError, did_you_mean
 from tuner.core.numerics import Array

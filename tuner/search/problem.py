@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.state import AIRBORNE, Limits
-from tuner.config import CHANNELS, JobFile, Settings
-from tuner.config.job import ErrorKind, FlightSettings, InletName
+from tuner.config import CHANNELS, ErrorKind, FlightSettings, InletName, JobFile, Settings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.equation_error.estimate import Estimate
 from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage

@@ -21,17 +21,16 @@ from starlette.types import ASGIApp
 
 from tuner.core.errors import InputError
 from tuner.core.runtime import installed
-from tuner.core.validation import first_complaint
+from tuner.core.yaml_section import first_complaint
 from tuner.engine.cluster_file import engine_for
 from tuner.service import tokens
-from tuner.service.errors import ServiceError
+from tuner.service.errors import ServiceError, over_http
 from tuner.service.http import api, watching
 from tuner.service.safety import Guard
 from tuner.service.service import Metrics, Service
 from tuner.service.settings import ServiceSettings
 from tuner.service.shapes import API, Problem
 from tuner.service.web.pages import render, web
-from tuner.service.words import over_http
 
 logger = logging.getLogger(__name__)
 

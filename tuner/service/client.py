@@ -24,8 +24,7 @@ from tuner.core.disk import exists, inside, result_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.core.files import ResultFile
 from tuner.core.shipped import KINDS, configs_folder, find_config
-from tuner.core.yaml_document import read_yaml
-from tuner.core.yaml_section import Section
+from tuner.core.yaml_section import Section, read_yaml
 from tuner.options import FILES, MODELS, FitOptions, taking
 from tuner.recordings.cache import digest
 from tuner.recordings.topics import TopicMap, load_topic_map

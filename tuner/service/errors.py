@@ -1,14 +1,20 @@
-"""Refusals of the service: a sentence for the user and an HTTP status each."""
+"""Refusals of the service: a sentence for the user and an HTTP status each.
+
+What the command line has as options are keys of a request, and fields of a page: messages are
+worded so.
+"""
 
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields
 from typing import ClassVar
 
 from tuner.core.errors import InputError
-from tuner.service.words import shown
+from tuner.options import Options
 
 
 class ServiceError(InputError):
@@ -87,3 +93,56 @@ def full_disk() -> Iterator[None]:
         raise NoSpaceError(
             "the server", "has no space left", "free some space and try again"
         ) from None
+
+
+FIELD_PHRASES: Mapping[str, str] = {
+    "config": "the settings",
+    "controller": "the setting 'controller'",
+    "fit": "the setting 'free'",
+    "fix": "the setting 'fixed'",
+    "holdout": "what checks the fit",
+    "mass": "the weighed mass",
+    "method": "the setting 'search.method'",
+    "namespace": "the setting 'namespace'",
+    "seed": "the setting 'search.seed'",
+    "topics": "the setting 'topics'",
+    "vehicle": "the vehicle",
+}
+"""Option of `tune` that a job has, too -> the same on the page where a job begins."""
+
+
+KEYS: Mapping[str, str] = {"config": "settings"}
+"""Option of `tune` -> key of a request, where that is not its name."""
+
+
+_OPTION = re.compile(rf"--({'|'.join(FIELD_PHRASES)})\b(?!-)( [A-Z]+\b)?")
+
+
+_ANY_OPTION = re.compile(r"--([a-z]+(?:-[a-z]+)*)\b")
+
+
+_REQUEST_FIELDS = {field.name for field in fields(Options)}
+
+
+_COMMAND = re.compile(r",? which tune inspect FILE --suggest begins")
+
+
+def over_http(text: str) -> str:
+    """Return a message with keys of a request in place of options of the command line."""
+
+    def key(found: re.Match[str]) -> str:
+        name = found[1].replace("-", "_")
+        return KEYS.get(name, name) if name in _REQUEST_FIELDS else found[0]
+
+    return _ANY_OPTION.sub(key, _COMMAND.sub("", text))
+
+
+def on_the_web(text: str) -> str:
+    """Return a message with fields of the page in place of options of the command line."""
+    return _OPTION.sub(lambda found: FIELD_PHRASES[found[1]], _COMMAND.sub("", text))
+
+
+def shown(name: str) -> str:
+    """Return a user's word for a message: short, in one line."""
+    plain = "".join(c if c.isprintable() else "?" for c in name)
+    return plain if len(plain) <= 60 else plain[:57] + "..."

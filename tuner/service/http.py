@@ -23,7 +23,13 @@ from tuner.core.runtime import installed
 from tuner.service import jobs, recordings
 from tuner.service.database import FINISHED, EventRow, FileRow, JobRow, RecordingRow, State
 from tuner.service.dispatcher import POLL_INTERVAL_S
-from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
+from tuner.service.errors import (
+    NotKnownError,
+    ServiceError,
+    TooManyError,
+    UnavailableError,
+    over_http,
+)
 from tuner.service.jobs import history
 from tuner.service.recordings import FORM_FIELD, Upload, receive
 from tuner.service.request import JobRequest
@@ -42,7 +48,6 @@ from tuner.service.shapes import (
     accepted,
     full_job,
 )
-from tuner.service.words import over_http
 
 
 def _poll(service: Service, job: str, after: int) -> tuple[JobRow, Sequence[EventRow]]:

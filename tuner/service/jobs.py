@@ -27,11 +27,10 @@ from tuner.service.database import (
     RecordingRow,
     State,
 )
-from tuner.service.errors import NotKnownError, NotNowError, TooManyError, unknown_job
-from tuner.service.request import JobRequest, check_request
+from tuner.service.errors import NotKnownError, NotNowError, TooManyError, shown, unknown_job
+from tuner.service.request import JobRequest, check_request, recording_name, stems
 from tuner.service.settings import Limits
 from tuner.service.shapes import CoefficientHistory, History, Point, iso
-from tuner.service.words import recording_name, shown, stems
 from tuner.vehicle.registry import mass_factor
 
 MAX_EVENTS = 20_000

@@ -25,10 +25,10 @@ from tuner.core.content_store import ContentStore
 from tuner.core.disk import inside
 from tuner.core.errors import InputError
 from tuner.service.database import Database, RecordingRow
-from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, full_disk
+from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, full_disk, shown
 from tuner.service.inspection import inspect
+from tuner.service.request import recording_name, shown_name, stems
 from tuner.service.settings import ServiceSettings
-from tuner.service.words import recording_name, shown, shown_name, stems
 
 BUFFER_BYTES = 2**20
 """bytes that are gathered before they are hashed and written"""

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, TypeVar
 
 from annotated_types import Len
 from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
-from tuner.config import resolve_settings
-from tuner.config.job import JobFile
-from tuner.config.settings import JOB_FILE, names_recording
-from tuner.core.disk import inside
+from tuner.config import JOB_FILE, JobFile, names_recording, resolve_settings
+from tuner.core.disk import file_name, inside
 from tuner.core.errors import ConfigError, InputError, did_you_mean
 from tuner.core.shipped import KINDS, shipped
-from tuner.core.yaml_document import dump_yaml
-from tuner.core.yaml_section import Section, build, refuse, section_of
+from tuner.core.yaml_section import Section, build, dump_yaml, refuse, section_of
 from tuner.options import FILES, FitOptions, Options
 from tuner.recordings.topics import TopicMap
-from tuner.service.words import last_part, recording_name, stems
 from tuner.vehicle import ControllerFile, VehicleFile
 
 FLIGHTS = "flights"
@@ -226,3 +223,34 @@ def _remove_keys(folder: Path, text: str) -> str:
     for place in (folder.resolve() / FLIGHTS, folder / FLIGHTS, folder):
         text = text.replace(f"{place}/", "")
     return text
+
+
+_SIDE_CARS = (".yaml", ".yml")
+
+
+def last_part(name: str) -> str:
+    """Return the part after the last slash of either kind."""
+    return re.split(r"[/\\]", name)[-1]
+
+
+def recording_name(name: str) -> str:
+    """Return a recording's file name; what would be read as a file beside it gets another suffix.
+
+    The stem, by which a flight goes, is kept where it is plain, and so is the suffix.
+    """
+    stem, _, ending = last_part(name).rpartition(".")
+    if not stem or not re.fullmatch(r"\w{1,9}", ending, re.ASCII):
+        stem, ending = last_part(name), ""
+    suffix = f".{ending}" if ending else ""
+    return file_name(stem, f"{suffix}_" if suffix.lower() in _SIDE_CARS else suffix)
+
+
+def stems(names: Iterable[str]) -> list[str]:
+    """Return the flights' names."""
+    return [PurePosixPath(name).stem for name in names]
+
+
+def shown_name(name: str) -> str:
+    """Return a sender's file name for display: one short line without folders."""
+    plain = "".join(c if c.isprintable() else "_" for c in last_part(name)).strip()
+    return plain[:200] or "recording"

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from tuner.report.outcome import Usability
 from tuner.service.database import EventRow, FileRow, JobRow, State
-from tuner.service.words import over_http
+from tuner.service.errors import over_http
 
 API = "/api/v1"
 

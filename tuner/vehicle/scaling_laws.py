@@ -16,7 +16,7 @@ from sim_jax.constants import GRAVITY
 from tuner.core.disk import check_file, write_text
 from tuner.core.runtime import PROGRAM, installed
 from tuner.core.shipped import configs_folder
-from tuner.core.yaml_document import commented, dump_yaml
+from tuner.core.yaml_section import commented, dump_yaml
 from tuner.vehicle import (
     COEFFICIENTS,
     VehicleFile,

@@ -16,7 +16,6 @@ from pydantic import AfterValidator, Field, JsonValue, create_model, model_valid
 
 from tuner.core.disk import write_text
 from tuner.core.errors import ConfigError, did_you_mean
-from tuner.core.yaml_document import commented, dump_yaml
 from tuner.core.yaml_section import (
     NonNegative,
     Number,
@@ -24,6 +23,8 @@ from tuner.core.yaml_section import (
     Section,
     Vector,
     build,
+    commented,
+    dump_yaml,
     read_model,
     refuse,
 )

@@ -9,8 +9,8 @@ from tests.tuner.report.conftest import FREE, ROLLING
 from tuner.cli import main
 from tuner.cli.app import WRONG_INPUT
 from tuner.core.errors import InputError
-from tuner.report.chart import FITTED, Chart, Line, Panel
 from tuner.report.paper import check_figure, write_figure
+from tuner.report.section import FITTED, Chart, Line, Panel
 
 FLY = ["simulate", "--trajectory", "circle", "--duration", "4", "--quiet", "--out"]
 

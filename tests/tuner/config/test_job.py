@@ -2,14 +2,15 @@ import re
 
 import pytest
 
-from tuner.config import JobFile, read_job
-from tuner.config.job import (
+from tuner.config import (
     CHANNELS,
     CoefficientSettings,
     ExportSettings,
     FlightSettings,
+    JobFile,
     Search,
     TrajectorySettings,
+    read_job,
 )
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import configs_folder

@@ -3,10 +3,11 @@ import shutil
 
 import pytest
 
-from tuner.config import Options, find_job_file, resolve_settings
+from tuner.config import find_job_file, resolve_settings
 from tuner.core.disk import find_flights
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder, find_config
+from tuner.options import Options
 from tuner.vehicle import read_vehicle
 
 

@@ -21,12 +21,13 @@ from tuner.core.disk import (
     check_folder,
     exists,
     make_folder,
+    read_bytes,
     result_folder,
     whole_file,
     write_text,
 )
 from tuner.core.errors import ConfigError, InputError, OutputError
-from tuner.core.files import csv_text, read_arrays, read_bytes
+from tuner.core.files import csv_text, read_arrays
 from tuner.core.shipped import configs_folder, find_config
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import configs_folder
-from tuner.core.yaml_document import MAX_BYTES, commented, dump_yaml, read_yaml
+from tuner.core.yaml_section import MAX_BYTES, commented, dump_yaml, read_yaml
 from tuner.vehicle import read_vehicle, write_vehicle
 
 

@@ -113,7 +113,7 @@ def test_garbage_is_looked_for_rarely_unless_the_user_wants_it_rarer_still() -> 
 
 def test_what_is_imported_before_jax_is_set_up_does_without_it() -> None:
     # the environment that `configure` sets is read when jax is imported
-    names = ("cli.results", "cli.progress", "report", "result", "client.client")
+    names = ("cli.results", "cli.progress", "report", "result", "service.client")
     code = "import sys\n" + "".join(
         f"import tuner.{name}\nif 'jax' in sys.modules: sys.exit('{name}')\n" for name in names
     )

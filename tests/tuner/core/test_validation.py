@@ -12,10 +12,9 @@ import pytest
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 import tuner
-from tuner.config.job import JobFile
+from tuner.config import JobFile
 from tuner.core.errors import ConfigError
-from tuner.core.validation import OTHER_FORM, PATTERN_PHRASES, complaint, expected
-from tuner.core.yaml_section import Section, build
+from tuner.core.yaml_section import OTHER_FORM, PATTERN_PHRASES, Section, build, complaint, expected
 from tuner.engine.cluster_file import JobQueue
 from tuner.ground.plan import BenchFile
 from tuner.recordings.topics import TopicMap

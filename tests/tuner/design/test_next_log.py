@@ -11,9 +11,9 @@ from tests.tuner.recorded import recordings_of
 from tests.tuner.uncertainty.making import ended
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import errors_of
-from tuner.design import next_log
-from tuner.design.next_log import propose_logs
+from tuner.design import ranking
 from tuner.design.proposals import LogProposal, log_in_words
+from tuner.design.ranking import propose_logs
 from tuner.objective.criterion import picked
 from tuner.objective.information import information_at
 from tuner.recordings.flight import Series
@@ -61,7 +61,7 @@ def thinned(series, every):
 @pytest.mark.long
 @pytest.mark.slow
 def test_what_is_foreseen_is_what_comes_of_it(full_flight, full_bag, updated, monkeypatch):
-    monkeypatch.setattr(next_log, "MAX_WORTHWHILE_SHARE", 1.0)
+    monkeypatch.setattr(ranking, "MAX_WORTHWHILE_SHARE", 1.0)
     command = full_flight.series["command"]
     logged = with_series(full_flight, command=thinned(command, 2), rotor_speed=None)
     job, fitted, known = seen(logged, full_bag, updated)
@@ -75,7 +75,7 @@ def test_what_is_foreseen_is_what_comes_of_it(full_flight, full_bag, updated, mo
     assert sentence.startswith("Log the rotor speed, at 100 Hz and good to")
 
     # speeds without noise would say what turns commands into speeds, and leave the rest to itself
-    monkeypatch.setattr(next_log, "TACHOMETER_NOISE", 1e-6)
+    monkeypatch.setattr(ranking, "TACHOMETER_NOISE", 1e-6)
     (exact,) = (p for p in propose_logs(job, fitted, known, updated) if p.change == "added")
     rest = [job.space.names.index(name) for name in ("motor_constant", "inertia_xx")]
     alone = errors_of(known[np.ix_(rest, rest)]) / errors_of(known)[rest]
@@ -97,7 +97,7 @@ def test_a_log_too_slow_to_be_thinned_is_no_error(full_flight, full_bag, updated
     elsewhere = replace(job.recordings[0], flight=with_series(full_flight, rotor_speed=None))
     held_out = replace(elsewhere, holdout=True)
     job = replace(job, recordings=(*job.recordings, held_out))
-    monkeypatch.setattr(next_log, "job_of", refused)
+    monkeypatch.setattr(ranking, "job_of", refused)
     fitted = at_truth(job, updated)
     assert propose_logs(job, fitted, np.eye(len(job.space)), updated) == ()
 
@@ -106,15 +106,15 @@ def test_a_log_too_slow_to_be_thinned_is_no_error(full_flight, full_bag, updated
 def test_what_twice_the_rate_wins_follows_from_what_half_of_it_loses(power):
     losses = [3.0 + 0.2 * between**power for between in (1.0, 2.0, 4.0, 0.5)]
     *coarser, finer = losses
-    share = next_log.share_at_twice_the_rate(coarser)
+    share = ranking.share_at_twice_the_rate(coarser)
     assert share == pytest.approx(np.sqrt(finer / losses[0]), rel=1e-9)
 
 
 def test_no_more_is_promised_than_is_seen():
-    assert next_log.share_at_twice_the_rate([3.0, 2.9, 4.0]) == 1.0
-    all_missed = next_log.share_at_twice_the_rate([8.26, 30.17, 30.30])
+    assert ranking.share_at_twice_the_rate([3.0, 2.9, 4.0]) == 1.0
+    all_missed = ranking.share_at_twice_the_rate([8.26, 30.17, 30.30])
     assert np.sqrt(5.32 / 8.26) < all_missed < 1.0  # the losses of a simulated flight; first 400 Hz
-    assert next_log.share_at_twice_the_rate([1.0, 5.0, 13.0]) == 0.5
+    assert ranking.share_at_twice_the_rate([1.0, 5.0, 13.0]) == 0.5
 
 
 @pytest.mark.slow

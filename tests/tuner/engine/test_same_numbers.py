@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from tests.tuner.engine import tasks
-from tuner.config import Options, TrajectorySettings, resolve_settings
+from tuner.config import TrajectorySettings, resolve_settings
 from tuner.engine import using
 from tuner.evaluate import closed_loop as simulation
 from tuner.evaluate.closed_loop import simulate
 from tuner.job.sensitivity import unfitted
 from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import evaluate, sums_at
+from tuner.options import Options
 from tuner.search.job_flights import read_recordings
 from tuner.search.problem import job_of
 from tuner.uncertainty.refits import (

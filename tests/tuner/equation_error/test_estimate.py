@@ -12,8 +12,7 @@ from scipy.signal import lfilter
 
 import tuner
 from benchmarks import fast_flights
-from tuner.config import Options, resolve_settings
-from tuner.config.job import Search
+from tuner.config import Search, resolve_settings
 from tuner.equation_error.estimate import TORQUE_GAINS, Estimate
 from tuner.equation_error.model_accelerations import (
     LinearisedAccelerations,
@@ -42,6 +41,7 @@ from tuner.equation_error.regression import (
 from tuner.evaluate.simulation_files import write_csv
 from tuner.findings.findings import Code
 from tuner.job.prepare import check_recordings, of_rigid_body, with_accelerations
+from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import predicts_turning, read_recordings, regressors
 from tuner.search.problem import job_of

@@ -8,10 +8,10 @@ from lxml import html
 
 from tests.tuner.evaluate.test_rmse import errors
 from tuner.cli import main
-from tuner.config import Options
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.comparison import Comparison, compare, table_of, write_table
+from tuner.options import Options
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile
 

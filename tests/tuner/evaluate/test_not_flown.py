@@ -8,10 +8,11 @@ import pytest
 import yaml
 
 from tests.tuner.evaluate.test_rmse import errors
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.validation import flights_not_followed
 from tuner.findings.findings import Code, remedy, sentence
+from tuner.options import Options
 from tuner.search.job_flights import read_recordings
 from tuner.vehicle import COEFFICIENTS, with_values
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks import fast_flights
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.evaluate.prediction import LAGS, FlightPredictor, TorqueObserver
+from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.recordings.states import MIN_HALF_WIDTH_S
 from tuner.search.job_flights import read_recordings

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import pytest
 
 from tests.tuner.exporters.conftest import MODELS, as_the_run_says, rmse
-from tuner.config.job import ExportSettings
+from tuner.config import ExportSettings
 from tuner.core import shipped
 from tuner.core.errors import ExportError, InputError, OutputError
 from tuner.exporters import export as exporting

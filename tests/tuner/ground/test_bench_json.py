@@ -3,13 +3,13 @@ from pathlib import Path
 
 import tuner.ground
 import tuner.inertial
-from tuner.ground.bench_json import (
+from tuner.ground.measurement import (
     REMARKS,
     ExperimentRecord,
+    Remark,
     numbers_in_words,
     remarks_in_words,
 )
-from tuner.ground.measurement import Remark
 
 
 def test_every_remark_has_a_sentence():

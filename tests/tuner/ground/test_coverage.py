@@ -10,13 +10,10 @@ from pydantic import TypeAdapter
 from tests.tuner.ground import rigs
 from tuner.core.errors import RecordingError
 from tuner.core.shipped import configs_folder
-from tuner.ground.bench_json import combine
-from tuner.ground.bifilar import measure_bifilar
-from tuner.ground.hovers import measure_hover_weights, measure_yaw_spin
-from tuner.ground.measurement import scaled_of
+from tuner.ground.hovers import measure_hover_weights, measure_propeller, measure_yaw_spin
+from tuner.ground.measurement import combine, scaled_of
 from tuner.ground.plan import Experiment
-from tuner.ground.propeller import measure_propeller
-from tuner.ground.stands import measure_rpm_curve, measure_stand
+from tuner.ground.rigs import measure_bifilar, measure_rpm_curve, measure_stand
 from tuner.ground.step_response import measure_step_response
 from tuner.vehicle import read_vehicle, with_values
 

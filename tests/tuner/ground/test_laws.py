@@ -5,9 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from tuner.ground.bifilar import bifilar_inertia
-from tuner.ground.hovers import fast_pair_speed, hover_motor_constant, spin_drag_over_torque
-from tuner.ground.propeller import propeller_moment_constant, propeller_motor_constant
+from tuner.ground.hovers import (
+    fast_pair_speed,
+    hover_motor_constant,
+    propeller_moment_constant,
+    propeller_motor_constant,
+    spin_drag_over_torque,
+)
+from tuner.ground.rigs import bifilar_inertia
 
 MASS, RADIUS, THRUST, TORQUE = 2.243, 0.25, 1.45e-5, 0.033
 

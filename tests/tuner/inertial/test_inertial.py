@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 
 from tests.tuner.recordings.micro_sd import log_of
-from tuner.config import Options, TrajectorySettings, resolve_settings
+from tuner.config import TrajectorySettings, resolve_settings
 from tuner.core.errors import InputError, RecordingError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.closed_loop import fly, simulate
 from tuner.findings.findings import Code, one_line
-from tuner.ground.bench_json import Combination, joint_prior
+from tuner.ground.measurement import Combination, joint_prior
 from tuner.inertial.measurement import measure_inertial
-from tuner.inertial.prediction import rate_errors
-from tuner.inertial.signals import stretches_of
+from tuner.inertial.signals import rate_errors, stretches_of
 from tuner.job.bench import resolution_of, vehicle_of
 from tuner.job.without_pose import fit_without_pose
-from tuner.options import SimulationOptions
+from tuner.options import Options, SimulationOptions
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import read_inertial
 from tuner.recordings.notes import NoteCode

@@ -7,10 +7,10 @@ import pytest
 
 from tests.tuner.job.test_windows import stage_for
 from tests.tuner.recorded import recordings_of
-from tuner.config import JobFile, Options, resolve_settings
-from tuner.config.job import FlightSettings, Search
+from tuner.config import FlightSettings, JobFile, Search, resolve_settings
 from tuner.findings.findings import Code, one_line
 from tuner.objective.rotor_signals import MotorOrder
+from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.search import job_flights as recordings
 from tuner.search.estimation import search

@@ -4,13 +4,14 @@ import re
 
 import pytest
 
-from tuner.config import Options, TrajectorySettings
+from tuner.config import TrajectorySettings
 from tuner.evaluate.closed_loop import simulate
 from tuner.evaluate.simulation_files import write_flights
 from tuner.exporters import effective
 from tuner.exporters.effective import find_effective, recordings_of
 from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.job.run import run
+from tuner.options import Options
 from tuner.result import read_run
 from tuner.vehicle import ControllerFile, values_of, with_values, write_vehicle
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tuner.config import Options
 from tuner.job.run import run
+from tuner.options import Options
 
 ROOT = Path(__file__).parents[3]
 FLIGHTS = (

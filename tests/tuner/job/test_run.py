@@ -15,11 +15,11 @@ from markupsafe import escape
 
 from tuner.cli import main
 from tuner.cli.results import LINES, WIDTH, print_run
-from tuner.config import Options
 from tuner.core.errors import InputError
 from tuner.evaluate.comparison import Comparison
 from tuner.findings.findings import Code, sentence
 from tuner.job.run import run
+from tuner.options import Options
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause
 from tuner.report import render

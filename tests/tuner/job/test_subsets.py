@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tuner.config import Options
 from tuner.core.errors import InputError
 from tuner.findings.findings import Code
 from tuner.job.run import run
+from tuner.options import Options
 from tuner.result import read_run
 
 FREE = (

@@ -9,8 +9,7 @@ import pytest
 from sim_jax.schedule import Schedule
 from tests.tuner.evaluate.test_rmse import errors
 from tests.tuner.recorded import recordings_of
-from tuner.config import JobFile, Options, resolve_settings
-from tuner.config.job import Search
+from tuner.config import JobFile, Search, resolve_settings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.evaluate.validation import flights_worse
 from tuner.findings.findings import Code, Finding
@@ -19,6 +18,7 @@ from tuner.objective.inlets import INLETS, also_free_by, bypassed_by
 from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.space import space_of
 from tuner.objective.windows import windows_of
+from tuner.options import Options
 from tuner.recordings.defects import LIMITS, is_outlier
 from tuner.recordings.flight import Series
 from tuner.recordings.notes import Note, NoteCode

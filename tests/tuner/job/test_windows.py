@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from tests.tuner.recorded import recordings_of
-from tuner.config import JobFile, Options, resolve_settings
-from tuner.config.job import CoefficientSettings, FlightSettings, Search
+from tuner.config import CoefficientSettings, FlightSettings, JobFile, Search, resolve_settings
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.findings.findings import Code
 from tuner.job.prepare import check_information, check_recordings
 from tuner.job.run import run
+from tuner.options import Options
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.unit_detection import UNIT_PHRASES, UNITS, to_si
 from tuner.search.estimation import search

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tuner.config import Options
 from tuner.findings.findings import Code
 from tuner.job.bench import bench
 from tuner.job.run import run
+from tuner.options import Options
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 

@@ -13,9 +13,9 @@ from lanes.program import _program_of
 from sim_jax.terms import total
 from tests.tuner.recorded import recordings_of
 from tests.tuner.uncertainty.making import criterion_of, problem
-from tuner.config import JobFile, Options, resolve_settings
-from tuner.config.job import Search
+from tuner.config import JobFile, Search, resolve_settings
 from tuner.objective import simulation
+from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.search.problem import job_of
 

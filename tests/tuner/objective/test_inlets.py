@@ -6,8 +6,7 @@ from typing import get_args
 import pytest
 
 from sim_jax.inlet import Inlet, MixedInlet
-from tuner.config import CHANNELS
-from tuner.config.job import InletName
+from tuner.config import CHANNELS, InletName
 from tuner.core.errors import RecordingError
 from tuner.objective.initial_conditions import STATES
 from tuner.objective.inlets import INLETS

@@ -16,10 +16,11 @@ from sim_jax.state import AIRBORNE, hover
 from tests.sim_jax.support import controller, vec
 from tests.sim_jax.test_rotor_counts import SCHEDULE, STEPS, round_airframe
 from tests.tuner.recorded import recordings_of
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.objective import simulation
 from tuner.objective.segments import Segments
 from tuner.objective.simulation import beginning_of, recorded_of
+from tuner.options import Options
 from tuner.search.problem import job_of
 from tuner.vehicle.model import Model, coefficients_in, with_coefficients
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tests.tuner.recorded import recordings_of
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.core.errors import RecordingError
+from tuner.options import Options
 from tuner.recordings.defects import (
     clean,
     has_stale_attitude,

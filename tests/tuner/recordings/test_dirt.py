@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.recordings import making
-from tuner.config.job import TrajectorySettings
+from tuner.config import TrajectorySettings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.yaml_section import build
 from tuner.recordings.consistency import correct_frames

@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from tests.tuner.recordings import making
 from tuner.cli import main
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
+from tuner.options import Options
 from tuner.recordings.consistency import contradiction, contradiction_in, correct_frames
 from tuner.recordings.flight import Series
 from tuner.recordings.inspection import inspect_recordings

@@ -26,7 +26,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from tests.tuner.recordings import fuzz, making, ways
 from tuner.core.errors import InputError
-from tuner.ground.propeller import read_static_table
+from tuner.ground.hovers import read_static_table
 from tuner.ground.rig_data import open_table
 from tuner.recordings.flight import Series
 from tuner.recordings.inspection import inspect_recordings

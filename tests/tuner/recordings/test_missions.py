@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from tests.tuner.recordings import making
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.findings.findings import Code
+from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import (

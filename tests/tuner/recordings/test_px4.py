@@ -9,10 +9,11 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from tests.tuner.recordings import making
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
 from tuner.job.recording_verdict import Verdict, in_words, verdict_of
+from tuner.options import Options
 from tuner.recordings.flight import Flight
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight

@@ -14,10 +14,11 @@ from scipy import signal
 from scipy.io import savemat
 
 from tests.tuner.recordings import making, ways
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.findings.findings import one_line
 from tuner.objective.rotor_signals import levers, order_findings
+from tuner.options import Options
 from tuner.recordings.consistency import _axis_doubts
 from tuner.recordings.content import ReadOptions, read_content
 from tuner.recordings.flight import Flight, Series

@@ -16,7 +16,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.report import render
 from tuner.report.contents import SearchRecord, read_contents
 from tuner.report.page import sections_of
-from tuner.report.sections.tables import sources
+from tuner.report.sections.coefficients import sources
 from tuner.result import ExportRecord, ExportRecords, Gate, read_run
 from tuner.uncertainty.records import Sources
 from tuner.uncertainty.verdict import Direction

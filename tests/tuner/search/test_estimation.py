@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import fitted_of, problem, truth
-from tuner.config import JobFile, Options, resolve_settings
-from tuner.config.job import Search
+from tuner.config import JobFile, Search, resolve_settings
 from tuner.core.errors import InputError
 from tuner.findings.findings import Code, Finding, sentence
 from tuner.objective.criterion import Point
 from tuner.objective.space import space_of
+from tuner.options import Options
 from tuner.search import estimation as module
 from tuner.search.estimation import fingerprint, load, polished, save, starting_vectors
 from tuner.search.findings import (

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.docs.recorded import write_lab
-from tuner.config import Options
 from tuner.core.errors import OutputError
 from tuner.findings.findings import MAX_FINITE, Code, Finding, one_line
 from tuner.job.run import run
+from tuner.options import Options
 from tuner.result import read_run
 from tuner.search.listener import Listener, Reporter
 from tuner.terms import refit_with_disturbances as disturbances

@@ -9,10 +9,11 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks import fast_flights
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.findings.findings import Code
 from tuner.job.prepare import _motor_orders
 from tuner.objective.rotor_signals import motor_order, order_findings
+from tuner.options import Options
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
 from tuner.search.job_flights import Recording, read_recordings

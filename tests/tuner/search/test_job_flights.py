@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from tests.tuner.recorded import recordings_of
-from tuner.config import CHANNELS, JobFile, Options, resolve_settings
+from tuner.config import CHANNELS, JobFile, resolve_settings
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import sentence
+from tuner.options import Options
 from tuner.search.job_flights import (
     Recording,
     read_recordings,

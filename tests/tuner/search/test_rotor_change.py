@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tuner.config import Options, resolve_settings
+from tuner.config import resolve_settings
 from tuner.findings.findings import Code
 from tuner.job.prepare import prepare
+from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import read_recordings
 from tuner.search.recorded_rotors import WINDOW_S, cut_at_rotor_changes, rotor_change_of

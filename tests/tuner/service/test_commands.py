@@ -14,8 +14,8 @@ import pytest
 import tuner
 from tests.tuner.service.conftest import submit, upload
 from tuner.cli import main
-from tuner.config import Options
 from tuner.core.errors import InputError, ServerFaultError
+from tuner.options import Options
 from tuner.result import Run
 from tuner.service import client as client_module
 from tuner.service.client import Client, job_request_of

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from tuner.report.chart import charts_json
+from tuner.report.section import charts_json
 from tuner.service.shapes import CoefficientHistory, Point
 from tuner.service.web.comparison import MAX_POINTS, history_chart, rmse_chart
 

@@ -275,7 +275,8 @@ def test_an_attempt_repeats_nothing_that_one_before_it_said(client, recording):
 
 
 def test_what_happens_again_after_the_preamble_is_said_again(idle):
-    said, iteration = ("message", {"text": "the flights"}), ("iteration", {"number": 1})
+    step = {"stage": "whole length", "number": 1, "position_rmse": 0.1, "seconds_left": 2.0}
+    said, iteration = ("message", {"text": "the flights"}), ("iteration", step)
     worse = ("message", {"text": "a flight got worse"})
     with idle.database.writing() as session:
         row = JobRow(id="0" * 16, name="x", vehicle="x", request={}, submitted=0.0)

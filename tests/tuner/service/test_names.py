@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from tests.tuner.exporters.conftest import as_the_run_says, make_run
 from tests.tuner.service.conftest import listening
 from tests.tuner.test_names import EXAMPLES, NAMES, nothing_outside
-from tuner.config import resolve_settings
-from tuner.config.job import ExportSettings
+from tuner.config import ExportSettings, resolve_settings
 from tuner.exporters.export import export_formats_of_job
 from tuner.result import BEST_FIT_FILE
 from tuner.service.dispatcher import prepare

@@ -16,10 +16,10 @@ from tuner.core.errors import InputError
 from tuner.report.page import LIBRARIES
 from tuner.service import app, jobs, tokens
 from tuner.service.app import is_loopback, serve
+from tuner.service.request import recording_name
 from tuner.service.safety import COOKIE, RateLimit
 from tuner.service.service import Service
 from tuner.service.web import pages
-from tuner.service.words import recording_name
 
 HOSTILE = '<img src=x onerror="alert(1)">'
 

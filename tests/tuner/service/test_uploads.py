@@ -19,12 +19,12 @@ import pytest
 from sqlalchemy import inspect
 
 from tests.tuner.service.conftest import FLIGHTS, LIMITS, listening, submit, upload
-from tuner.config import Options
 from tuner.core.errors import RecordingError
+from tuner.options import Options
 from tuner.service import errors, inspection, recordings
+from tuner.service.errors import FIELD_PHRASES, on_the_web, over_http
 from tuner.service.service import Service
 from tuner.service.settings import MIB
-from tuner.service.words import FIELD_PHRASES, on_the_web, over_http
 
 BAG = FLIGHTS / "yaw_spin_3rps.bag"
 

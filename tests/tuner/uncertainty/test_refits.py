@@ -8,7 +8,7 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.report.result_texts import refits_in_words
-from tuner.report.sections.tables import refits
+from tuner.report.sections.coefficients import refits
 from tuner.uncertainty.records import Refit
 from tuner.uncertainty.refits import _counted, jackknife_errors
 

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from docs.generate.pages import markdown_table
-from tuner.config import JobFile
-from tuner.config.job import CoefficientSettings
+from tuner.config import CoefficientSettings, JobFile
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import find_config
 from tuner.objective.space import space_of

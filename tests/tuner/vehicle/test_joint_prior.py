@@ -5,14 +5,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tuner.config import JobFile, Options, resolve_settings
+from tuner.config import JobFile, resolve_settings
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder, find_config
 from tuner.findings.findings import Code
-from tuner.ground.bench_json import BenchRecord, joint_prior
+from tuner.ground.measurement import BenchRecord, joint_prior
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.normal_equations import normal_equations
 from tuner.objective.space import space_of
+from tuner.options import Options
 from tuner.uncertainty.agreement import ground_conflicts, sources_of
 from tuner.vehicle import ControllerFile, read_vehicle
 from tuner.vehicle.joint_prior import JointPrior

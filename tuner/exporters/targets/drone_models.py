@@ -13,7 +13,7 @@ import numpy as np
 from sim_jax.constants import GRAVITY, RAD_S_PER_RPM
 from tuner.core.disk import file_name
 from tuner.core.numerics import Array
-from tuner.core.yaml_document import commented
+from tuner.core.yaml_section import commented
 from tuner.exporters.external_simulator import flier_of
 from tuner.exporters.simulators import (
     LINEAR_DRAG,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from tuner.core.yaml_document import commented
+from tuner.core.yaml_section import commented
 from tuner.exporters.simulators import (
     ANGULAR_DRAG,
     CENTRE,

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import ExportError
-from tuner.core.yaml_document import commented
+from tuner.core.yaml_section import commented
 from tuner.exporters.simulators import (
     GZ_SIM,
     LINEAR_DRAG,

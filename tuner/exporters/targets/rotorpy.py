@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tuner.core.numerics import Array
-from tuner.core.yaml_document import commented
+from tuner.core.yaml_section import commented
 from tuner.exporters.external_simulator import flier_of
 from tuner.exporters.simulators import (
     CENTRE,

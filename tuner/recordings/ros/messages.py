@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
+from tuner.core.disk import read_bytes
 from tuner.core.errors import ConfigError, InputError, RecordingError
-from tuner.core.files import read_bytes
 from tuner.recordings.recording import FieldLayout, short_reason
 
 #: Fields of a message type in their order: name and rosbags' description of its type.

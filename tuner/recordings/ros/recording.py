@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tuner.core.disk import file_name
 from tuner.core.errors import ConfigError, RecordingError
-from tuner.core.yaml_document import read_yaml
+from tuner.core.yaml_section import read_yaml
 from tuner.recordings import ulog
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import (

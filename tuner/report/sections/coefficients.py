@@ -1,16 +1,46 @@
-"""Each coefficient: its value, how well it is known, and why."""
+"""Each coefficient: its value, and why; by the ground, by refits and in Gazebo beside the fit."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from tuner.core.numerics import Z95
-from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
+from tuner.core.phrases import percent
+from tuner.ground.measurement import (
+    BenchRecord,
+    Curve,
+    ExperimentRecord,
+    agreement_in_words,
+    is_of_flights,
+    numbers_in_words,
+    remarks_in_words,
+)
 from tuner.report.contents import Contents
-from tuner.report.result_texts import calibration_in_words
-from tuner.report.section import Cell, Section, Table, figures, short
-from tuner.result import CoefficientResult
-from tuner.uncertainty.records import CoefficientKnowledge, calibration
+from tuner.report.result_texts import (
+    calibration_in_words,
+    effective_in_words,
+    refits_in_words,
+    rmse_in_words,
+)
+from tuner.report.section import (
+    FITTED,
+    GREY,
+    PALETTE,
+    Bars,
+    Cell,
+    Chart,
+    Line,
+    Look,
+    Panel,
+    Section,
+    Table,
+    figures,
+    short,
+)
+from tuner.result import CoefficientResult, RunResult
+from tuner.uncertainty.records import CONFLICT_SE, CoefficientKnowledge, Sources, calibration
 from tuner.uncertainty.verdict import (
     Verdict,
     half_width_in_words,
@@ -186,3 +216,171 @@ def _intervals(known: Mapping[str, CoefficientKnowledge]) -> list[Chart]:
             fold="How closely each coefficient is known",
         )
     ]
+
+
+def refits(result: RunResult) -> Section | None:
+    """Return a table of the errors by jackknife and bootstrap, where they were asked for."""
+    rows: list[tuple[Cell | str, ...]] = [
+        (
+            name,
+            figures(found.best),
+            *map(short, (found.std_error, found.jackknife_error, found.bootstrap_error)),
+            found.unit,
+        )
+        for name, found in result.coefficients.items()
+        if found.jackknife_error is not None or found.bootstrap_error is not None
+    ]
+    if not rows:
+        return None
+    columns = ("coefficient", "best", "±, this fit", "±, jackknife", "±, bootstrap", "unit")
+    return Section(
+        "refits",
+        "Refits to other flights",
+        refits_in_words(result),
+        tables=(Table(columns, rows, words=("coefficient", "unit")),),
+        note="± is one standard error. The jackknife leaves each flight out in turn; the bootstrap "
+        "draws as many flights with replacement.",
+    )
+
+
+def sources(found: Mapping[str, Sources]) -> Section:
+    """Return a table of what the ground, the flights and both give."""
+    rows: list[tuple[Cell | str, ...]] = []
+    for name, source in found.items():
+        both = (source.ground, source.flights, source.both)
+        errors = (source.ground_error, source.flights_error, source.both_error)
+        pairs = [t for v, e in zip(both, errors, strict=True) for t in (figures(v), short(e))]
+        if source.deviation is None:
+            agree = Cell("flights do not identify it", look="kept")
+        elif abs(source.deviation) > CONFLICT_SE:
+            agree = Cell("● conflict", look="not")
+        else:
+            agree = Cell("○ yes", look="well")
+        apart = "–" if source.deviation is None else f"{source.deviation:+.1f}"
+        rows.append((name, *pairs, COEFFICIENTS[name].unit, apart, agree))
+    columns = (
+        *("coefficient", "ground", "±", "flights alone", "±", "both", "±", "unit", "apart [±]"),
+        "do they agree?",
+    )
+    words = ("coefficient", "unit", "do they agree?")
+    return Section(
+        "sources",
+        "Ground and flights",
+        tables=(Table(columns, rows, words=words),),
+        note="± is one standard error, that of flights widened for model error. Flights alone are "
+        "what one step without the ground measurements gives from the end of the fit. More than "
+        "three standard errors apart is a conflict: do not believe the value of both before one of "
+        "them is explained.",
+    )
+
+
+def effective(result: RunResult) -> Section | None:
+    """Return both answers beside each other, and what each term that is lost is worth."""
+    found = result.effective
+    if found is None:
+        return None
+    physical = {name: row.best for name, row in result.coefficients.items()}
+    rows = [
+        (
+            name,
+            figures(physical[name]),
+            figures(value),
+            COEFFICIENTS[name].unit,
+            _change(physical[name], value),
+        )
+        for name, value in found.coefficients.items()
+        if name in physical and value != physical[name]
+    ]
+    lost = [
+        (Cell(term.group, small=", ".join(term.names)), rmse_in_words(term.rmse_without))
+        for term in found.lost
+    ]
+    columns = ("coefficient", "physical", "in Gazebo", "unit", "change")
+    tables = (
+        Table(columns, rows, words=("coefficient", "unit")),
+        Table(
+            ("term that Gazebo lacks", "RMSE without it alone"),
+            lost,
+            words=("term that Gazebo lacks",),
+        ),
+    )
+    note = (
+        "Physical coefficients say what is true of the vehicle; those in Gazebo stand in for what "
+        "it lacks, and mean less than their names say. Exports for simulators hold the latter, "
+        "unless the job file has target: physical. RMSE is over all flights, in position and in "
+        "attitude."
+    )
+    return Section("effective", "In Gazebo", (effective_in_words(found),), tables=tables, note=note)
+
+
+def _change(before: float, after: float) -> str:
+    if before == 0.0:
+        return "–"
+    share = after / before - 1.0
+    return f"{'+' if share > 0 else '−'}{percent(abs(share))}"
+
+
+USED = Look(PALETTE[2], marks=True)
+
+
+NOT_USED = Look(GREY, marks=True)
+
+
+RESIDUAL = Look(PALETTE[1], marks=True)
+
+
+def bench(record: BenchRecord) -> Section:
+    """Return a table of the experiments and a picture of each: data, law, residuals."""
+    experiments = record.experiments
+    rows = [
+        (e.name, "; ".join(numbers_in_words(e)), " ".join(remarks_in_words(e))) for e in experiments
+    ]
+    flown = is_of_flights(record)
+    columns = ("flight" if flown else "experiment", "gives", "what its checks noticed")
+    table = Table(columns, rows, words=columns)
+    charts = [
+        chart for number, experiment in enumerate(experiments)
+        for chart in _experiment_charts(number, experiment)
+    ]  # fmt: skip
+    return Section(
+        "bench",
+        "Flights without a pose" if flown else "Ground measurements",
+        sentences=(agreement_in_words(record),),
+        tables=(table,),
+        charts=charts,
+        note="± is one standard error.",
+    )
+
+
+def _experiment_charts(number: int, experiment: ExperimentRecord) -> list[Chart]:
+    return [
+        Chart(
+            key=f"bench_{number + 1}_{place + 1}",
+            title=f"{experiment.name}: {curve.title}",
+            caption="The estimate rests on the green points; grey ones were left out."
+            if not all(curve.used)
+            else "",
+            panels=_curve_panels(curve),
+            x_title=curve.x_label,
+            height=440 if curve.law else 320,
+        )
+        for place, curve in enumerate(experiment.curves)
+    ]
+
+
+def _curve_panels(curve: Curve) -> list[Panel]:
+    used = np.array(curve.used, bool)
+    x, measured = np.array(curve.x), np.array(curve.measured)
+    marks = [
+        Line(name, x[chosen].tolist(), measured[chosen].tolist(), look, joined=False)
+        for name, chosen, look in (("left out", ~used, NOT_USED), ("used", used, USED))
+        if chosen.any()
+    ]
+    name = "law" if curve.law else "level"
+    marks.append(Line(name, curve.fit_x, curve.fit, FITTED, joined=curve.law))
+    panels = [Panel(marks, y_title=curve.y_label)]
+    if curve.law and len(curve.fit_x) > 1:
+        rest = measured[used] - np.interp(x[used], curve.fit_x, curve.fit)
+        line = Line("residual", x[used].tolist(), rest.tolist(), RESIDUAL, joined=False)
+        panels.append(Panel([line], y_title="residual"))
+    return panels

@@ -11,23 +11,26 @@ from tuner.core.numerics import Array
 from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse
 from tuner.evaluate.records import Table as RmseTable
 from tuner.findings.sentences import PREDICTED_UNITS
-from tuner.report.chart import (
+from tuner.report.contents import Contents
+from tuner.report.outcome import flights_table, outcome
+from tuner.report.result_texts import starts_in_words
+from tuner.report.section import (
     FITTED,
     INITIAL,
     MIN_DRAWN,
     PALETTE,
     RECORDED,
+    Cell,
     Chart,
     Dash,
     Line,
     Look,
     Panel,
+    Section,
+    Table,
     rounded,
+    short,
 )
-from tuner.report.contents import Contents
-from tuner.report.outcome import flights_table, outcome
-from tuner.report.result_texts import starts_in_words
-from tuner.report.section import Cell, Section, Table, short
 from tuner.result import FlightResult, RunResult
 
 #: What is flown -> suffix of its arrays and its look; drawn in this order.

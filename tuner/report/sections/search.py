@@ -1,11 +1,13 @@
-"""The sections on the search, and on the selection of terms."""
+"""How the numbers came about: search, selection of terms, remarks, and all that decides them."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Sequence
 
 from tuner.core.phrases import listed
-from tuner.report.chart import FITTED, GREY, INITIAL, PALETTE, Bars, Chart, Line, Look, Panel
+from tuner.findings.findings import remedy, sentence
 from tuner.report.contents import Contents, SearchRecord
 from tuner.report.result_texts import (
     ending_sentence,
@@ -14,7 +16,20 @@ from tuner.report.result_texts import (
     reason_in_words,
     selection_in_words,
 )
-from tuner.report.section import Cell, Section, Table
+from tuner.report.section import (
+    FITTED,
+    GREY,
+    INITIAL,
+    PALETTE,
+    Bars,
+    Cell,
+    Chart,
+    Line,
+    Look,
+    Panel,
+    Section,
+    Table,
+)
 from tuner.vehicle.selection_table import SelectionRow
 
 
@@ -167,3 +182,55 @@ def _figure(rows: Sequence[SelectionRow]) -> list[Chart]:
             height=140 + 26 * len(scored),
         )
     ]
+
+
+#: Settings that other sections show.
+PROVENANCE_KEYS = ("command", "origin", "starts")
+
+
+def remarks(contents: Contents) -> Section | None:
+    """Return the findings that are no warnings; warnings are beside the outcome."""
+    points = [
+        Cell(f"{found.subject}: {sentence(found)} {remedy(found)}".strip())
+        for found in contents.about.findings
+        if found.level == "info"
+    ]
+    title = f"{len(points)} remark{'' if len(points) == 1 else 's'}"
+    return Section("remarks", title, points=points, folded=True) if points else None
+
+
+def provenance(contents: Contents) -> Section:
+    """Return everything that decides the numbers."""
+    about, origins = contents.about, contents.about.settings.get("origin")
+    rows: list[tuple[Cell | str, ...]] = [
+        (name, str(origin))
+        for name, origin in (origins if isinstance(origins, dict) else {}).items()
+    ]
+    if contents.result:
+        rows.append(("seed", str(contents.result.seed)))
+    rows += [
+        (flight.name, Cell(f"{flight.duration:.1f} s, {flight.path}", f"sha256 {flight.sha256}"))
+        for flight in about.flights
+    ]
+    rows += [
+        (f"{name} as used", f"sha256 {_digest(about.settings[name])}")
+        for name in ("vehicle", "controller", "job")
+        if name in about.settings
+    ]
+    rows += list(about.versions.items())
+    columns = ("what", "which")
+    tables = [Table(columns, rows, words=columns)]
+    settings = {
+        name: value for name, value in about.settings.items() if name not in PROVENANCE_KEYS
+    }
+    tables += [
+        Table(("",), [(json.dumps(value, indent=2),)], words=("",), fold=name)
+        for name, value in settings.items()
+    ]
+    said = (f"Command: {about.command}",) if about.command else ()
+    return Section("provenance", "Provenance", said, tables=tables, folded=True)
+
+
+def _digest(value: object) -> str:
+    """Return the SHA-256 of a setting's content, however its file was laid out."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()

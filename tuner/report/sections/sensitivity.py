@@ -1,4 +1,4 @@
-"""The sections on effects, information, residuals, profiles and indices of coefficients."""
+"""Effects, information, residuals, profiles and indices of coefficients; what to fly and log."""
 
 from __future__ import annotations
 
@@ -6,9 +6,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuner.design.proposals import Proposals, proposals_in_words
-from tuner.report.chart import FITTED, GREY, PALETTE, Bars, Chart, Heat, Line, Look, Panel
-from tuner.report.section import Cell, Section, Table, figures
+from tuner.design.proposals import LogProposal, Proposals, log_in_words, proposals_in_words
+from tuner.report.section import (
+    FITTED,
+    GREY,
+    PALETTE,
+    Bars,
+    Cell,
+    Chart,
+    Heat,
+    Line,
+    Look,
+    Panel,
+    Section,
+    Table,
+    figures,
+)
 from tuner.uncertainty.records import (
     CHI_SQUARE_95,
     INDEX_MEANINGS,
@@ -452,3 +465,14 @@ def next_flight(proposals: Proposals) -> Section:
             )
         )
     return Section("next_flight", "What to fly next", points=points, charts=charts, note=note)
+
+
+def next_log(proposals: Sequence[LogProposal]) -> Section:
+    """Return the effects of further signals, or of more samples, on intervals."""
+    points = [Cell(log_in_words(proposal)) for proposal in proposals]
+    note = (
+        "Computed at the fitted coefficients, with the quoted intervals: an added signal is "
+        "simulated and weighed with the noise named; what twice the samples of an input would "
+        "bring follows from leaving out some of them."
+    )
+    return Section("next_log", "What to log next time", points=points, note=note)

@@ -12,8 +12,7 @@ from tuner.core.content_store import ContentStore
 from tuner.core.files import MAX_BYTES
 from tuner.core.phrases import listed
 from tuner.evaluate.records import RMSE_UNITS
-from tuner.report.chart import FITTED, INITIAL, Chart, Line, Look, Panel
-from tuner.report.section import figures, short
+from tuner.report.section import FITTED, INITIAL, Chart, Line, Look, Panel, figures, short
 from tuner.result import CoefficientResult, ExportRecord, ExportRecords, RunResult
 from tuner.service.database import JobRow
 from tuner.service.errors import NotKnownError, NotNowError

@@ -22,17 +22,15 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import shipped
-from tuner.core.validation import config_error
-from tuner.core.yaml_document import document_of
+from tuner.core.yaml_section import config_error, document_of
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
-from tuner.report.chart import charts_json
 from tuner.report.outcome import STYLE_OF, flights_table, outcome, warnings_of
 from tuner.report.page import LIBRARIES
-from tuner.report.section import figures
+from tuner.report.section import charts_json, figures
 from tuner.service import jobs, recordings, tokens
 from tuner.service.database import FINISHED, JobRow, RecordingRow, State
-from tuner.service.errors import NoTokenError, ServiceError
+from tuner.service.errors import NoTokenError, ServiceError, on_the_web
 from tuner.service.http import JobOfPath, ServiceOfApp, service_of, upload
 from tuner.service.jobs import MAX_EVENTS, history, vehicles
 from tuner.service.recordings import flight_name
@@ -43,7 +41,6 @@ from tuner.service.settings import size_in_words
 from tuner.service.shapes import API, iso
 from tuner.service.web import comparison
 from tuner.service.web.comparison import history_chart, rmse_chart
-from tuner.service.words import on_the_web
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
 STATES: Mapping[str, tuple[str, str]] = {
