@@ -5,7 +5,7 @@ by this project's own simulator, at a finer physics step than a fit takes, its b
 the load; then recorded with noise, through markers that are off.
 
 Two laboratories of three have an effect that a fit may not know. The first of these have terms in
-the registry; the others none, and are flown here by a changed loop or recorded otherwise than they
+the registry; the others none, and are flown here by changed rotors or recorded otherwise than they
 were.
 """
 
@@ -65,7 +65,7 @@ EFFECTS = (
     "derivative_filter",
 )
 """As they are drawn: a seed's effect goes with their order."""
-UNKNOWN = ("rotor_damage", "translational_lift", "derivative_filter")
+UNKNOWN = ("rotor_damage", "translational_lift")
 KNOWN = tuple(name for name in EFFECTS if name not in UNKNOWN)
 """Groups of terms."""
 CHOICE = os.environ.get("TUNE_LAB_EFFECT", "drawn")
@@ -86,8 +86,7 @@ class Effect:
     size
         Of what this project's simulator does not fly: share of its thrust that a rotor loses; s of
         the filter through which rotor speeds went before they were logged; gain of thrust per
-        squared air velocity across the rotors, s²/m²; factor on the cutoff of the filter of the
-        differentiated rate.
+        squared air velocity across the rotors, s²/m².
     rotor, flight, begin
         Which rotor loses thrust, in which flight, from which s on.
     several
@@ -148,6 +147,7 @@ def effect_of(seed: int, *, seconds: float, flights: int, log_rate: float) -> Ef
     values["attitude_gain"] = {"attitude_gain": 1.0 / sizes.pop("attitude_gain")}
     values["integral_gain"] = {"integral_gain": sizes.pop("integral_gain")}
     values["gyro_filter"] = {"gyro_cutoff_factor": sizes.pop("gyro_filter")}
+    values["derivative_filter"] = {"derivative_cutoff_factor": sizes.pop("derivative_filter")}
     late = kept / (1.0 - kept) / log_rate
     memory = sizes["tachometer_lag"] / late
     values["tachometer_lag"] = {"tachometer_lag": late, "tachometer_memory": memory}
@@ -171,15 +171,6 @@ def _kept(seconds: float, rate: float) -> float:
     It is late by that share over the rest of it, in samples.
     """
     return float(np.exp(-1.0 / rate / seconds))
-
-
-def controller_with(effect: Effect, file: ControllerFile) -> ControllerFile:
-    """Return the controller that flies, which is not the file's."""
-    for part in effect.each:
-        if part.name == "derivative_filter":
-            cutoff = part.size * (file.filters.dgyro_cutoff or 0.0)
-            file = file.replace(filters=file.filters.replace(dgyro_cutoff=cutoff))
-    return file
 
 
 class Beyond(ReferenceInlet):
@@ -354,7 +345,7 @@ def drawn(seed: int, effect: Effect = NOTHING) -> Lab:
 def write(lab: Lab, folder: Path, *, seed: int) -> list[Path]:
     """Fly all trajectories, and write a recording of each beside the laboratory's job file."""
     random = np.random.default_rng([seed, 1])
-    controller = controller_with(lab.effect, ControllerFile())
+    controller = ControllerFile()
     fine = controller.replace(
         physics=controller.physics.replace(rate=float(PHYSICS)),
         sensing=controller.sensing.replace(sees_markers=lab.sees_markers),

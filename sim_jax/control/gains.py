@@ -88,30 +88,37 @@ def with_gains_of(controller: Controller, vehicle: Vehicle) -> Controller:
     """Return the controller that flies a vehicle whose effects say how it differs from its file.
 
     K of the rates is times ``rate_gain_roll_pitch`` and ``rate_gain_yaw``, I times
-    ``integral_gain``, the gyro filter's cut-off times ``gyro_cutoff_factor``, the attitude's gain
-    times ``attitude_gain``: parameters that were changed since, or scaled by an autotune or by the
-    battery (PX4 MC_BAT_SCALE_EN).
+    ``integral_gain``, the attitude's gain times ``attitude_gain``, the cut-offs of the gyro's
+    filter and of its derivative's times ``gyro_cutoff_factor`` and ``derivative_cutoff_factor``:
+    parameters that were changed since, or scaled by an autotune or by the battery (PX4
+    MC_BAT_SCALE_EN).
     """
     names = (
         "rate_gain_roll_pitch",
         "rate_gain_yaw",
         "integral_gain",
-        "gyro_cutoff_factor",
         "attitude_gain",
+        "gyro_cutoff_factor",
+        "derivative_cutoff_factor",
     )
     if not vehicle.effects.keys() & set(names):
         return controller
-    across, about, integral, filtered, turning = (vehicle.effects.get(name, 1.0) for name in names)
-    rate, cutoff = controller.rate, controller.filters.gyro_cutoff
+    across, about, integral, turning, *filtered = (vehicle.effects.get(n, 1.0) for n in names)
+    rate, filters = controller.rate, controller.filters
+    cutoffs = (
+        None if cutoff is None else cutoff * factor
+        for cutoff, factor in zip(
+            (filters.gyro_cutoff, filters.dgyro_cutoff), filtered, strict=True
+        )
+    )
     changed: Controller = eqx.tree_at(
-        lambda c: (c.attitude.time_constant, c.rate.k, c.rate.i, c.filters.gyro_cutoff),
+        lambda c: (c.attitude.time_constant, c.rate.k, c.rate.i, c.filters),
         controller,
         (
             controller.attitude.time_constant / turning,
             Vec3(rate.k.x * across, rate.k.y * across, rate.k.z * about),
             rate.i * integral,
-            None if cutoff is None else cutoff * filtered,
+            Filters(*cutoffs),
         ),
-        is_leaf=lambda leaf: leaf is None,
     )
     return changed

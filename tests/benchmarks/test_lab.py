@@ -154,12 +154,12 @@ def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
     by_effect = "| rotor damage |  | 1 |  | 0 of 1 | 1 (motor_constant) | motor_constant +8.0 |  |"
     assert by_effect in effects.text.splitlines()
     both = Effect(
-        "rotor_damage, derivative_filter", several=(loss, Effect("derivative_filter", size=1.3))
+        "rotor_damage, translational_lift", several=(loss, Effect("translational_lift", size=0.004))
     )
     with_both = replace(trials[1], lab=replace(lab, effect=both))
     several = section([with_effect, with_both])
     assert several.title == "Simulated lab flights with several effects"
-    for name, count in (("rotor damage", 2), ("derivative filter", 1)):
+    for name, count in (("rotor damage", 2), ("translational lift", 1)):
         assert any(
             line.startswith(f"| {name} |  | {count} |") for line in several.text.splitlines()
         )

@@ -39,6 +39,7 @@ GAINS = {
     "rate_gain_yaw": 0.95,
     "integral_gain": 1.3,
     "gyro_cutoff_factor": 0.8,
+    "derivative_cutoff_factor": 1.4,
     "attitude_gain": 1.1,
 }
 ALL = {**TILT, **SCALE, **GAINS, "thrust_exponent": 1.93}
@@ -146,5 +147,6 @@ def test_gains_are_those_of_the_file_times_a_factor():
     np.testing.assert_allclose(flies.rate.k.stacked(), factors * file.rate.k.stacked())
     np.testing.assert_allclose(flies.rate.i.stacked(), 1.3 * file.rate.i.stacked())
     assert flies.filters.gyro_cutoff == 0.8 * file.filters.gyro_cutoff
+    assert flies.filters.dgyro_cutoff == 1.4 * file.filters.dgyro_cutoff
     assert flies.attitude.time_constant == file.attitude.time_constant / 1.1
     assert with_gains_of(file, vehicle()) is file

@@ -300,6 +300,14 @@ def _gyro_filter(numbers: Numbers) -> str:
     return f"The gyro's low-pass filter cuts off {excess} than in the controller file."
 
 
+def _derivative_filter(numbers: Numbers) -> str:
+    excess = _excess(numbers, "derivative_cutoff_factor")
+    return (
+        f"The filter of the rate controller's derivative cuts off {excess} than in the controller "
+        "file."
+    )
+
+
 def _attitude_gain(numbers: Numbers) -> str:
     excess = _excess(numbers, "attitude_gain")
     return f"The attitude controller's gain is {excess} than in the controller file."
@@ -367,6 +375,10 @@ TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
         "Compare it with the autopilot's parameters (MC_ROLLRATE_I, MC_PITCHRATE_I, MC_YAWRATE_I).",
     ),
     "gyro_filter": (_gyro_filter, "Compare it with the autopilot's IMU_GYRO_CUTOFF."),
+    "derivative_filter": (
+        _derivative_filter,
+        "Compare it with the autopilot's IMU_DGYRO_CUTOFF.",
+    ),
     "attitude_gain": (
         _attitude_gain,
         "Compare attitude.time_constant with the controller that flew (MC_ROLL_P, MC_PITCH_P).",

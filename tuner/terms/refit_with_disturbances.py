@@ -230,7 +230,7 @@ def _with_lag_terms(
     if beside.keeps_track and beside.is_likelier_than(without):
         found = LinearisedInnovations.of(with_lag_terms, fitted, beside)
     lags = set(with_lag_terms.kept) - set(had)
-    called = [] if found is None else [lag for lag in sorted(lags) if found.calls_for(lag)]
+    called = () if found is None else found.called_for(lags)
     if found is None or len(called) < len(lags):
         full = full_problem_of(there.objective, there.point)
         point = Point(full.point.coefficients, without.inputs.offsets)
@@ -470,18 +470,22 @@ class LinearisedInnovations:
         moved = vector_after(self.space, self.vector, self._change(model, tried, large))
         return self._with(base, tried, large, moved)
 
-    def calls_for(self, group: str) -> bool:
-        """Return whether innovations contradict the absence of a group that is in the fit."""
-        names = next(row.names for row in self.selected.rows if row.group == group)
-        others = [name for name in self.fitted.objective.space.names if name not in names]
-        return score(
+    def called_for(self, groups: Collection[str]) -> tuple[str, ...]:
+        """Return those of some groups in the fit without which innovations would be unlikely.
+
+        Of groups that act alike, none is needed beside the others: the least needed goes first.
+        """
+        lags = {row.group: row.names for row in self.selected.rows if row.group in groups}
+        names = self.fitted.objective.space.names
+        kept, _ = backward_elimination(
             self.linear,
-            self._model(others),
-            self._columns(names),
+            self._model([name for name in names if name not in names_of(lags)]),
+            {group: self._columns(own) for group, own in lags.items()},
             candidates=len(self.selected.rows),
-            inside=True,
             min_gain=0.0,
-        ).is_accepted
+            without_refits=True,
+        )
+        return tuple(kept)
 
     def with_lag_terms(self, among: Collection[str] | None = None) -> Selected | None:
         """Return the terms with lags added, of all or of some groups.

@@ -325,6 +325,7 @@ REPORTED_TERMS = (
     "rate_gain",
     "integral_gain",
     "gyro_filter",
+    "derivative_filter",
     "attitude_gain",
     "autopilot_tilt",
     "gyro_scale",

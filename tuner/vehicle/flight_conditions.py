@@ -165,6 +165,16 @@ SURROUNDING_ROWS = (
         prior_sd=0.3,
     ),
     _factor(
+        "derivative_cutoff_factor",
+        "cut-off of the low-pass filter of the rate's derivative over that of the controller file",
+        "PX4 IMU_DGYRO_CUTOFF; parameters changed since",
+        group="derivative_filter",
+        part="rate control",
+        is_lag=True,
+        bounds=3.0,
+        prior_sd=0.3,
+    ),
+    _factor(
         "attitude_gain",
         "gain of the attitude controller over that of its file",
         "PX4 MC_ROLL_P, MC_PITCH_P; parameters changed since",

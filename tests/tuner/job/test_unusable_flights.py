@@ -128,6 +128,7 @@ def test_coefficients_that_an_inlet_bypasses_are_not_fitted(updated, flight):
         "rate_gain_yaw",
         "integral_gain",
         "gyro_cutoff_factor",
+        "derivative_cutoff_factor",
         "attitude_gain",
     }
     with pytest.raises(ConfigError, match="leaves no coefficient that acts"):

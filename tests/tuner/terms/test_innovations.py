@@ -104,6 +104,21 @@ def seen(
     return LinearisedInnovations(selected, fitted, space, vector, linear)
 
 
+def fitted_at(
+    scaled: Mapping[str, float],
+    kept: Sequence[SelectionRow],
+    left_out: Sequence[SelectionRow],
+    alike: Mapping[str, str] | None = None,
+) -> LinearisedInnovations:
+    """Return innovations of a fit that ends with some coefficients off their neutral values."""
+    rows = [*(r.model_copy(update={"kept": True}) for r in kept), *left_out]
+    innovation = seen(rows, {}, alike)
+    moved = innovation.linear.scaled.copy()
+    for name, size in scaled.items():
+        moved[list(innovation.space.names).index(name)] = size
+    return replace(innovation, linear=replace(innovation.linear, scaled=moved))
+
+
 @pytest.fixture
 def chosen(monkeypatch: pytest.MonkeyPatch):
     """Return what says which groups are chosen, and their numbers; None where nothing changes."""
@@ -271,11 +286,20 @@ def test_an_insignificant_term_is_not_refitted(chosen) -> None:
 
 @pytest.mark.parametrize(("size", "needed"), [(0.5, True), (1e-3, False)])
 def test_a_term_in_the_fit_is_needed_where_samples_contradict_its_absence(size, needed) -> None:
-    innovation = seen([DRAG.model_copy(update={"kept": True}), INFLOW], {})
-    moved = innovation.linear.scaled.copy()
-    moved[list(innovation.space.names).index("fuselage_drag")] = size * USUAL["fuselage_drag"]
-    there = replace(innovation, linear=replace(innovation.linear, scaled=moved))
-    assert there.calls_for("fuselage_drag") is needed
+    there = fitted_at({"fuselage_drag": size * USUAL["fuselage_drag"]}, [DRAG], [INFLOW])
+    assert there.called_for(["fuselage_drag"]) == (("fuselage_drag",) if needed else ())
+
+
+@pytest.mark.parametrize(
+    ("sizes", "needed"), [((0.0, 0.022), "derivative_filter"), ((0.01, 0.0), "gyro_filter")]
+)
+def test_of_two_terms_that_act_alike_the_likelier_one_is_needed(sizes, needed) -> None:
+    """Neither is beside the other, and something is missing without both."""
+    names = ("gyro_cutoff_factor", "derivative_cutoff_factor")
+    rows = [row(name, SelectionCode.IMMATERIAL) for name in ("gyro_filter", "derivative_filter")]
+    there = fitted_at(dict(zip(names, sizes, strict=True)), rows, [], dict([names]))
+    assert there.called_for(["gyro_filter"]) == there.called_for(["derivative_filter"]) == ()
+    assert there.called_for(["gyro_filter", "derivative_filter"]) == (needed,)
 
 
 @pytest.mark.parametrize("alike", [True, False])

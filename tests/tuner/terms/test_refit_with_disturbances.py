@@ -312,7 +312,7 @@ def test_of_several_lags_those_stay_that_innovations_call_for(monkeypatch):
         return SimpleNamespace(
             selected=selected,
             with_lag_terms=grown,
-            calls_for=lambda group: group == "gyro_filter",
+            called_for=lambda _: ("gyro_filter",),
             selection=lambda _: None,
         )
 
@@ -358,7 +358,7 @@ def test_a_term_without_a_derivative_is_judged_by_a_fit_with_it(
         return SimpleNamespace(
             selected=selected,
             with_lag_terms=lambda _: grown("motor_lag"),
-            calls_for=lambda _: lacks != "significance",
+            called_for=lambda lags: () if lacks == "significance" else tuple(lags),
             selection=lambda _: grown(called_for),
         )
 

@@ -22,6 +22,7 @@ TRUTH = {
     "rate_gain_yaw": 0.93,
     "integral_gain": 1.3,
     "gyro_cutoff_factor": 0.8,
+    "derivative_cutoff_factor": 1.4,
     "attitude_gain": 1.08,
 }
 GROUPS = {
