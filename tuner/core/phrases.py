@@ -48,10 +48,10 @@ def percent(share: float) -> str:
 
 
 def quantity(value: float, unit: str | None) -> str:
-    """Return a number of two digits with its unit: seconds in ms, a share (None) in percent."""
+    """Return a number of two digits with its unit: below 0.1 s in ms, a share (None) in percent."""
     if unit is None:
         return percent(value)
-    if unit == "s":
+    if unit == "s" and value < 0.0995:
         value, unit = 1e3 * value, "ms"
     return f"{value:.2g} {unit}".strip()
 

@@ -134,6 +134,7 @@ def test_a_direction_is_named_with_its_proportion_and_size(
 def test_half_an_interval_is_a_share_a_time_or_a_plain_number_beside_its_unit() -> None:
     assert half_width_in_words((1.98, 2.02), 2.0, "kg m²") == "±1 %"
     assert half_width_in_words((0.011, 0.013), 0.012, "s") == "±1 ms"
+    assert half_width_in_words((-0.13, 0.53), 0.2, "s") == "±0.33 s"
     assert half_width_in_words((-1.0, 2.0), 0.5, "N s²/(rad m)") == "±1.5"
     assert half_width_in_words((None, 2.0), 0.5, "m") == ""
 
