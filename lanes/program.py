@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
-from itertools import pairwise
+from itertools import compress, pairwise
 from math import lcm, prod
 from typing import Any, TypeAlias
 
@@ -212,10 +212,7 @@ class Program:
         closed, shapes = jax.make_jaxpr(self._with_tangents(lengths), return_shape=True)(
             given, tangents
         )
-        # unread results of loops are not lowered and need no rule
-        used = [True] * len(closed.jaxpr.outvars)
-        jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, used, instantiate=True)
-        return closed.replace(jaxpr=jaxpr), shapes, lengths
+        return closed, shapes, lengths
 
     @property
     def stand_ins(self) -> dict[str, int]:
@@ -257,18 +254,22 @@ class Program:
             Pytree of arrays: (\\*shape, lanes) where each lane has its own, (lanes, \\*shape) where
             those lie apart, else (\\*shape).
         tangents
-            Of the arguments that move, in the order of their leaves: (Q, \\*shape) each.
+            Of the arguments that move, in the order of their leaves: (Q, \\*shape) each. None,
+            or Q = 0, computes values alone.
         lanes
             How many there are.
         turns
             The length named ``turns``, of loops.
         wanted
-            Pytree of truth values, one an output: None stands for one that is not. All by default.
+            Pytree of truth values, one an output, with those of the columns behind the values' if
+            there are tangents: None stands for one that is not. All by default.
         """
         leaves = [
             np.asarray(leaf, a.dtype)
             for leaf, a in zip(self.structure.flatten_up_to(values), self.arguments, strict=True)
         ]
+        if tangents and not len(tangents[0]):
+            tangents = None
         moved = [np.asarray(t, float) for t in (tangents or [])]
         lengths = self._lengths(leaves, turns)
         kernel = self._kernel(lanes * max(turns, 1))
@@ -290,12 +291,17 @@ class Program:
     def by_xla(self, values: Any, tangents: Any = None, *, turns: int = 0) -> Run:
         """Compute the same through `jax.vmap` and XLA; tests compare kernels with it."""
         leaves = [jnp.asarray(leaf) for leaf in self.structure.flatten_up_to(values)]
-        moved = [jnp.asarray(t) for t in (tangents or [])]
         lengths = self._lengths([np.asarray(leaf) for leaf in leaves], turns)
+        if tangents and not len(tangents[0]):
+            tangents = None
         run = self._xla(tuple(sorted(lengths.items())))
         if not self.moving:
-            return Run(jax.tree.map(np.asarray, run(leaves, moved)), None)
-        found, columns = run(leaves, moved)
+            return Run(jax.tree.map(np.asarray, run(leaves, [])), None)
+        shape = {number: self.arguments[number].shape for number in self.moving}
+        moved = tangents or [np.zeros((1, *shape[number])) for number in self.moving]
+        found, columns = run(leaves, [jnp.asarray(t) for t in moved])
+        if not tangents:
+            return Run(jax.tree.map(np.asarray, found), None)
         _, (shapes, _), stand_ins = self._traced
 
         def laid(leaf: Any, shape: Any) -> NDArray[Any]:
@@ -359,6 +365,8 @@ class _Compiled:
                 jax.ShapeDtypeStruct(tuple(shape), dtype) for shape, dtype in known["outputs"]
             ]
             self.moved = known["moved"]
+        #: of the values alone
+        self._values = self.structure.children()[0] if program.moving else self.structure
         self.code = Code(code, "run")
         void, whole = ctypes.c_void_p, ctypes.c_int64
         self.function = ctypes.CFUNCTYPE(None, *[void] * 5, *[whole] * 6)(self.code.address)
@@ -370,15 +378,18 @@ class _Compiled:
         outputs, structure = jax.tree.flatten(shapes)
         flags = [False] * len(program.arguments) + [True] * len(program.moving)
         moved = [bool(moves) for moves in dependent(closed.jaxpr, flags)]
+        kept = _kept(program, moved)
+        # unread results of loops are not lowered and need no rule
+        jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, kept, instantiate=True)
         began = time.perf_counter()
         text = module_text(
-            closed,
+            closed.replace(jaxpr=jaxpr),
             self.width,
             arguments=program.arguments,
             moving=program.moving,
             lengths=lengths,
-            outputs=outputs,
-            moved=moved,
+            outputs=list(compress(outputs, kept)),
+            moved=list(compress(moved, kept)),
         )
         code = object_code(text)
         spent = time.perf_counter() - began
@@ -407,7 +418,8 @@ class _Compiled:
     ) -> Run:
         """Compute all lanes and columns."""
         program, width = self.program, self.width
-        columns = len(tangents[0]) if tangents else 1
+        count = len(tangents[0]) if tangents else 0
+        columns = max(count, 1)
         tables = sum(
             leaf.nbytes
             for leaf, a in zip(leaves, program.arguments, strict=True)
@@ -433,14 +445,14 @@ class _Compiled:
             for leaf, a in zip(leaves, program.arguments, strict=True)
         ]
         begins = turn[::own_lanes] + np.arange(each)[:, None]
-        for number, t in zip(program.moving, tangents, strict=True):
+        for number, t in zip(program.moving if tangents else (), tangents, strict=True):
             rows = np.moveaxis(t.astype(program.arguments[number].dtype)[begins], 1, -1)
             repeated = np.repeat(rows, own_lanes, axis=-1)[..., : len(place)]
             given.append(np.ascontiguousarray(repeated))
         sizes = {stand_in: lengths[name] for name, stand_in in self.lengths.items()}
-        asked = (
-            [True] * len(self.outputs) if wanted is None else self.structure.flatten_up_to(wanted)
-        )
+        structure = self.structure if tangents else self._values
+        asked = [True] * structure.num_leaves if wanted is None else structure.flatten_up_to(wanted)
+        asked += [False] * (len(self.outputs) - len(asked))
         found: list[Any] = []
         for shape, moved, is_wanted in zip(self.outputs, self.moved, asked, strict=True):
             if not is_wanted:
@@ -450,7 +462,8 @@ class _Compiled:
             if moved:
                 own = (columns, *own)
             found.append(_on_whole_lines((lanes, *own), shape.dtype))
-        ins, outs = _addresses(given), _addresses(found)
+        ins = _addresses(given, len(program.arguments) + len(program.moving))
+        outs = _addresses(list(compress(found, _kept(program, self.moved))))
         values = (ctypes.c_int64 * max(len(self.lengths), 1))(
             *[lengths[name] for name in self.lengths]
         )
@@ -465,8 +478,8 @@ class _Compiled:
                 turn.ctypes.data,
                 len(place),
                 own_blocks,
-                columns,
-                each,
+                count,
+                min(each, count),
                 *task,
             )
 
@@ -481,10 +494,10 @@ class _Compiled:
             work(tasks[0])
         else:
             list(_threads().map(work, tasks))
-        if not program.moving:
-            return Run(jax.tree.unflatten(self.structure, found), None)
-        half = len(found) // 2
-        structure = self.structure.children()[0]
+        half = self._values.num_leaves
+        results = jax.tree.unflatten(self._values, found[:half])
+        if not tangents:
+            return Run(results, None)
         by_column = [
             None
             if not moved or array is None
@@ -495,9 +508,7 @@ class _Compiled:
                 found[half:], self.moved[half:], self.outputs[half:], strict=True
             )
         ]
-        return Run(
-            jax.tree.unflatten(structure, found[:half]), jax.tree.unflatten(structure, by_column)
-        )
+        return Run(results, jax.tree.unflatten(self._values, by_column))
 
 
 def _on_whole_lines(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
@@ -540,6 +551,13 @@ def _side_by_side(leaf: NDArray[Any], taken: NDArray[np.intp], lanes: int) -> ND
     return laid
 
 
-def _addresses(arrays: Sequence[NDArray[Any] | None]) -> Any:
+def _kept(program: Program, moved: Sequence[bool]) -> list[bool]:
+    """Return which results a kernel computes: values, and tangents that move."""
+    values = len(moved) // 2 if program.moving else len(moved)
+    return [True] * values + list(moved[values:])
+
+
+def _addresses(arrays: Sequence[NDArray[Any] | None], count: int = 1) -> Any:
+    """Return a table of addresses, of ``count`` at least; the others lead nowhere."""
     pointers = [None if a is None else a.ctypes.data for a in arrays]
-    return (ctypes.c_void_p * max(len(arrays), 1))(*pointers)
+    return (ctypes.c_void_p * max(len(arrays), count, 1))(*pointers)

@@ -159,6 +159,22 @@ def test_what_is_not_wanted_is_not_returned_and_changes_nothing(program):
     np.testing.assert_array_equal(some.columns[0]["twice"], whole.columns[0]["twice"])
 
 
+@pytest.mark.parametrize("none", [None, [np.zeros(0), np.zeros((0, 3))]])
+def test_a_differentiated_program_computes_values_alone(program, none):
+    values, tangents = given(19, 33)
+    moved = program(values, tangents, lanes=19, turns=33)
+    wanted = {"state": True, "twice": None, "high": True}, True
+    alone = program(values, none, lanes=19, turns=33, wanted=wanted)
+    assert alone.columns is None
+    assert alone.values[0]["twice"] is None
+    for name in ("state", "high"):
+        np.testing.assert_array_equal(alone.values[0][name], moved.values[0][name])
+    np.testing.assert_array_equal(alone.values[1], moved.values[1])
+    by_xla = program.by_xla(values, none, turns=33)
+    assert by_xla.columns is None
+    np.testing.assert_allclose(by_xla.values[1], alone.values[1], rtol=1e-13, atol=1e-13)
+
+
 def test_an_output_has_the_bits_of_all_inputs_that_it_depends_on():
     def function(x, y, z, flag):
         chosen = lax.cond(flag > 0.0, lambda: x, lambda: x * 2.0)

@@ -193,14 +193,15 @@ def innovations(
         Gains of the filter.
     tangents
         Directions along which is differentiated: coefficient -> (Q,), and ``"offsets"`` ->
-        (Q, offsets). None differentiates by nothing.
+        (Q, offsets). With none of them, Q = 0, the program of derivatives computes innovations
+        alone; for None there is one of its own.
     """
     moved = None
     if tangents is not None:
         still = np.zeros(len(tangents["offsets"]))
         names = sorted(assumed.coefficients)  # the order of the leaves
         moved = [tangents["offsets"], *(tangents.get(name, still) for name in names)]
-    wanted = (True, False) if moved is None else ((True, False), (False, True))
+    wanted = ((True, False), (False, True)) if moved and len(moved[0]) else (True, False)
     run = _run((_undelayed(schedule),), _given(inputs, assumed, gains), wanted, moved)
     return np.moveaxis(run.values[0], 0, -1), run.columns and run.columns[1]
 

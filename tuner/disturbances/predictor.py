@@ -439,7 +439,11 @@ class Predictor:
             tangents = {name: along[:, :count] @ slope for name, slope in slopes.items()}
             tangents["offsets"] = along[:, count:]
             errors, laid = innovations(
-                self.schedule, inputs, self.found.gains, assumed, tangents if some else None
+                self.schedule,
+                inputs,
+                self.found.gains,
+                assumed,
+                tangents if some or objective.differentiated else None,
             )
             residuals = samples_of_ticks(errors, inputs.widths, self.rows)
             if laid is not None:

@@ -80,6 +80,8 @@ class Objective(eqx.Module):
     """Names of the estimated per-flight conditions, of `tuner.vehicle.conditions`."""
     multiplicity: Float[Array, " N"] | None = None
     """Multiplicity of each flight in loss, gradient and Hessian; None is 1."""
+    differentiated: bool = eqx.field(static=True, default=True)
+    """Whether it is differentiated, too: the same program then computes values alone."""
 
     @property
     def of_flight(self) -> tuple[str, ...]:
@@ -141,6 +143,7 @@ class Objective(eqx.Module):
             states=criterion.states,
             conditions={name: values[self.flight] for name, values in conditions.items()},
             tangents=self._directions(point, moving) or None,
+            differentiated=self.differentiated and np.ndim(point.coefficients) == 1,
         )
 
     def compare(

@@ -52,10 +52,10 @@ MOTION, BODY_ATTITUDE, TRUE_ROTOR_SPEED, SETPOINTS = "motion", "turned", "speeds
 """Channels that no recording has: the centre of mass's position, velocity and body rate; the body's
 attitude; the true rotor speeds; and the set-points of rate and thrust."""
 
-MEASURED = ("position", "attitude", "body_rate", "rotor_speed", "command")
-LOGGED = (*MEASURED, MOTION, BODY_ATTITUDE, TRUE_ROTOR_SPEED, SETPOINTS)
-"""Channels of every program with derivatives, and without; those that are not requested are not
-written."""
+_UNMEASURED = (MOTION, BODY_ATTITUDE, TRUE_ROTOR_SPEED, SETPOINTS)
+LOGGED = ("position", "attitude", "body_rate", "rotor_speed", "command", *_UNMEASURED)
+"""Channels of every program, those that no recording has without derivatives; those that are not
+requested are not written."""
 EFFECTS = tuple(name for name, row in COEFFICIENTS.items() if row.is_effect)
 TERMS = tuple(name for name in EFFECTS if COEFFICIENTS[name].group)
 """Coefficients beyond the base model, and those of them that a fit may add."""
@@ -104,6 +104,7 @@ def fly(
     conditions: Mapping[str, Any] = MappingProxyType({}),
     tangents: Mapping[str, Array] | None = None,
     channels: tuple[str, ...] | None = None,
+    differentiated: bool = False,
 ) -> Flown:
     """Fly segments.
 
@@ -126,13 +127,15 @@ def fly(
         ``"states"`` -> (Q, L). None differentiates by nothing.
     channels
         Channels to log; by default the measured ones.
+    differentiated
+        Whether the program with derivatives flies without tangents, too: a fit has built it.
     """
     if conditions or {*model.vehicle.effects, *coefficients}.intersection(EFFECTS):
         model, conditions = _with_all_terms(model, segments, conditions)
     names = tuple(segments.measured) if channels is None else channels
-    moves = tangents is not None
+    moves = differentiated or tangents is not None
     # in one order, for it tells programs apart
-    logged = tuple(sorted({*(MEASURED if moves else LOGGED), *names}))
+    logged = tuple(sorted({*LOGGED, *names}))
     coefficients = {**coefficients_in(model), **coefficients}
     own = not moves or any(np.ndim(value) for value in coefficients.values())
     none = np.zeros((len(segments.free_rows), segments.count))
@@ -165,13 +168,13 @@ def fly(
         made_of=(static, moves, total.TERMS),
         packages=CODE,
     )
-    wanted = ({name: name in names for name in logged}, True)
+    asked = {name: name in names for name in logged}
     run = program(
         given,
         None if tangents is None else _directions(given, tangents),
         lanes=segments.count,
         turns=samples,
-        wanted=(wanted, wanted) if moves else wanted,
+        wanted=(asked, True) if tangents is None else ((asked, True), (asked, False)),
     )
     found, crash_time = run.values
     still: dict[str, Array | None] = dict.fromkeys(names)
@@ -285,7 +288,8 @@ def _flight(
 
     def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
         after, row = plant.sample(state, number)
-        return after, recorded_of(row, model, environment, given.conditions, channels)
+        seen = recorded_of(row, model, environment, given.conditions, channels)
+        return after, {**seen, **{name: lax.stop_gradient(seen[name]) for name in _UNMEASURED}}
 
     begin = replace(_moving(first), crash_time=first.crash_time)
     last, logged = lax.scan(sample, begin, jnp.arange(lengths["turns"]))

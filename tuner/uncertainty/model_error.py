@@ -128,6 +128,7 @@ class ModelErrors:
         pushed = replace(
             objective,
             segments=replace(segments, disturbance=self.disturbance),
+            differentiated=self.disturbance is None,
             model=eqx.tree_at(lambda m: m.controller.rate, model, rate),
         )
         return _with_speeds_earlier(pushed, self.speed_lag) if self.speed_lag else pushed
@@ -256,7 +257,7 @@ def alternatives_of(
     schedule = objective.schedule
     finer = replace(schedule, physics_rate=2 * schedule.physics_rate)
     return {
-        STEP: replace(objective, schedule=finer),
+        STEP: replace(objective, schedule=finer, differentiated=False),
         **limited,
         **with_other_readings(objective, point, flights),
     }
@@ -300,7 +301,8 @@ def _with_recorded_rotors(objective: Objective, flights: Sequence[Flight]) -> di
 
     swapped = tuple(map(with_rotors, parts))
     fed = eqx.tree_at(lambda i: i.parts, inlet, swapped) if len(parts) > 1 else swapped[0]
-    return {INPUT: replace(objective, segments=replace(segments, inlet=fed))}
+    fed_in = replace(segments, inlet=fed)
+    return {INPUT: replace(objective, segments=fed_in, differentiated=False)}
 
 
 def _with_speeds_earlier(objective: Objective, seconds: float) -> Objective:

@@ -129,3 +129,36 @@ def test_channels_in_another_order_are_no_other_program(monkeypatch, tangents):
         )
         assert list(found.channels) == list(names)
     assert asked[0] == asked[1]
+
+
+def test_what_is_differentiated_flies_without_derivatives_by_the_same_program(monkeypatch):
+    """Channels that only a flight without derivatives logs are in it, too."""
+    craft = round_airframe(4)
+    one = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], hover(craft, vec(0.0, 0.0, 1.0)))
+    commands = tuple(np.tile(0.9 * command, (STEPS + 2, 1)) for command in one.command)
+    segments = Segments(ActuatorInlet(commands), one, {}, np.zeros(1, int))
+    asked, program_of = set(), simulation.program_of
+
+    def program(*arguments, **options):
+        made = program_of(*arguments, **options)
+        asked.add(made)
+        return made
+
+    monkeypatch.setattr(simulation, "program_of", program)
+
+    def flown(channels, **options):
+        model = Model(craft, controller())
+        return simulation.fly(
+            model, segments, SCHEDULE, samples=STEPS, limits=AIRBORNE, channels=channels, **options
+        )
+
+    moved = flown(("position",), tangents={"mass": np.ones(1)})
+    still = flown(("position", "motion"), differentiated=True)
+    (_,) = asked
+    assert moved.columns["position"].any()
+    assert still.columns == {"position": None, "motion": None}
+    np.testing.assert_array_equal(still.channels["position"], moved.channels["position"])
+    apart = flown(("position", "motion"))
+    assert len(asked) == 2
+    for name, values in apart.channels.items():
+        np.testing.assert_allclose(still.channels[name], values, rtol=1e-12, atol=1e-12)
