@@ -17,7 +17,7 @@ FLIGHTS = Path(__file__).parents[1] / "reference_flights"
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunResult]:
     """Return the result folder, and its result; the flights' paths count from the root."""
-    from tuner.cli.profile import profiling  # noqa: PLC0415
+    from tuner.cli.progress import profiling  # noqa: PLC0415
     from tuner.config import Options  # noqa: PLC0415 (jax)
     from tuner.job.run import run  # noqa: PLC0415
 

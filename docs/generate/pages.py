@@ -13,7 +13,7 @@ from docs.generate.models import sections_of
 from docs.generate.text import GENERATED
 from tuner.config import JobFile
 from tuner.core.shipped import configs_folder
-from tuner.engine.cluster_file import ClusterFile
+from tuner.engine.engine import ClusterFile
 from tuner.ground.plan import BenchFile
 from tuner.result import RunResult
 from tuner.vehicle import COEFFICIENTS, Coefficient, ControllerFile, VehicleFile, Written

@@ -17,7 +17,7 @@ from docs.generate.pages import OPENAPI, REFERENCE, SCHEMA
 from docs.generate.pages import PAGES as GENERATED
 from tests.docs.pages import PAGES, ROOT, anchors, blocks, links, name_of
 from tuner.config import read_job
-from tuner.engine.cluster_file import read_cluster
+from tuner.engine.engine import read_cluster
 from tuner.findings.findings import Code
 from tuner.ground.plan import read_bench
 from tuner.recordings.topics import load_topic_map, read_sidecar

@@ -29,7 +29,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.terms import total
 from tests.memory import BEFORE_A_FIT, give_back
 from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
-from tuner.cli.options import FLATTENED, MANY_WORDS
+from tuner.cli.tune import FLATTENED, MANY_WORDS
 from tuner.config import JobFile, resolve_settings
 from tuner.core import shipped
 from tuner.core.errors import ConfigError, ExportError

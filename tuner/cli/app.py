@@ -15,8 +15,7 @@ from typing import NoReturn
 
 from cyclopts import App, CycloptsError
 
-from tuner.cli.options import MANY_WORDS, TYPED_WORDS
-from tuner.cli.tune import tune
+from tuner.cli.tune import MANY_WORDS, TYPED_WORDS, tune
 from tuner.core.errors import InputError, ServerFaultError, did_you_mean
 from tuner.core.phrases import printable
 

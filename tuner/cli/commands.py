@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from tuner.cli.options import FLATTENED, TYPED_WORDS, Quiet, Verbose
+from tuner.cli.tune import FLATTENED, TYPED_WORDS, Quiet, Verbose
 from tuner.core.errors import InputError
 from tuner.core.phrases import printable
 from tuner.options import (
@@ -187,9 +187,9 @@ def sensitivity(
         Propose next flights that fit into X,Y,Z in m: from wall to wall, and up. Default: what the
         recorded flights took, and a little more.
     """
-    from tuner.cli.options import arena_lengths
     from tuner.cli.progress import progress_on_terminal
     from tuner.cli.results import print_sensitivity
+    from tuner.cli.tune import arena_lengths
     from tuner.core.runtime import configure
 
     configure()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from tuner.cli.options import FLATTENED, Quiet
+from tuner.cli.tune import FLATTENED, Quiet
 from tuner.options import FitOptions
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from tuner.cli.options import MANY_WORDS
+from tuner.cli.tune import MANY_WORDS
 from tuner.core.errors import InputError
 
 if TYPE_CHECKING:

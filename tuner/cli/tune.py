@@ -1,12 +1,52 @@
-"""``tune --flights ...``: the job itself."""
+"""``tune --flights ...``: the job itself, and parameters that commands share."""
 
 from __future__ import annotations
 
+import math
 import time
-from typing import Annotated
+from collections.abc import Sequence
+from contextvars import ContextVar
+from typing import Annotated, Any, get_args
 
-from tuner.cli.options import FLATTENED, TYPED_WORDS, Quiet, Verbose
+from cyclopts import CoercionError, Parameter, Token, convert
+
+from tuner.core.errors import InputError
 from tuner.options import Options
+
+#: The command line as the user typed it, for the record of a run.
+TYPED_WORDS: ContextVar[str] = ContextVar("TYPED", default="")
+
+
+def _exactly(kind: Any, words: Sequence[Token]) -> Any:
+    """Return the values of words without rounding: ``1.7`` is no whole number."""
+    if int in (kind, *get_args(kind)) and not all(w.value.strip("+-").isdecimal() for w in words):
+        raise CoercionError(token=words[0], target_type=int)
+    return convert(kind, words)
+
+
+#: An option takes all words up to the next option, and a switch takes none.
+MANY_WORDS = Parameter(consume_multiple=True, negative=(), converter=_exactly)
+#: The fields of a class of `tuner.options` are options of the command.
+FLATTENED = Parameter(name="*")
+Quiet = Annotated[bool, Parameter(help="Print nothing but errors.")]
+Verbose = Annotated[bool, Parameter(help="Print all that the report says, and each message.")]
+
+
+def arena_lengths(word: str) -> tuple[float, ...]:
+    """Return the numbers of ``--arena``, such as ``8,6,3``.
+
+    Raises
+    ------
+    InputError
+        The word holds anything but numbers above zero.
+    """
+    try:
+        numbers = tuple(float(part) for part in word.split(","))
+    except ValueError:
+        numbers = ()
+    if not numbers or not all(math.isfinite(n) and n > 0 for n in numbers):
+        raise InputError("--arena", f"'{word}' is not a list of lengths in m", "write it as 8,6,3")
+    return numbers
 
 
 def tune(
@@ -27,13 +67,13 @@ def tune(
         Measure where the seconds go: a table by stage, on the terminal and in profile.csv, and
         profile.json, a trace that https://ui.perfetto.dev opens.
     """
-    from tuner.engine.cluster_file import engine_for, job_script_for
+    from tuner.engine.engine import engine_for, job_script_for
 
     if dry_run:
         print(job_script_for(options.cluster))
         return
     began = time.perf_counter()
-    from tuner.cli.profile import profiling
+    from tuner.cli.progress import profiling
     from tuner.core.spans import span
 
     with profiling(profile, quiet=quiet) as profile_into:

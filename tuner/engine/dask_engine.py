@@ -42,8 +42,17 @@ from tuner.core.content_store import ContentStore
 from tuner.core.disk import cache_folder
 from tuner.core.errors import EngineError, InputError
 from tuner.core.runtime import configure
-from tuner.engine.cluster_file import ClusterFile, JobQueue, Kubernetes, extra
-from tuner.engine.engine import HERE, Engine, Report, Task, using
+from tuner.engine.engine import (
+    HERE,
+    ClusterFile,
+    Engine,
+    JobQueue,
+    Kubernetes,
+    Report,
+    Task,
+    extra,
+    using,
+)
 
 
 class Stopped(Exception):  # noqa: N818 (no error: it was asked for)

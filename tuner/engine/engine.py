@@ -2,11 +2,13 @@
 
 A task is a module's function and one argument that can be pickled; it gives the same result
 wherever and however often it is computed, so that an engine may compute it again after losing a
-worker. While it works it may report, see `Report`.
+worker. While it works it may report, see `Report`. ``--workers`` and ``--cluster``, a cluster file,
+name the engine.
 """
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,7 +16,14 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from annotated_types import Interval
+from pydantic import StringConstraints, model_validator
+
+from tuner.core.errors import ConfigError, InputError
+from tuner.core.yaml_section import Section, Whole, build, read_model, refuse
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -137,3 +146,232 @@ def using(engine: Engine) -> Iterator[Engine]:
         yield engine
     finally:
         _CURRENT.reset(token)
+
+
+Memory = Annotated[str, StringConstraints(pattern=r"^[0-9]+(\.[0-9]+)? ?[KMGT]i?B$")]
+Address = Annotated[
+    str, StringConstraints(pattern=r"^(tcp|tls|ws|wss|ucx)://[^\s/]+:[0-9]{1,5}/?$")
+]
+System = Literal["slurm", "pbs", "lsf", "sge"]
+SCHEMES = ("tcp://", "tls://", "ws://", "wss://", "ucx://")
+
+
+class Tls(Section):
+    """Certificates by which workers, scheduler and client know each other; paths of PEM files."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+class JobQueue(Section):
+    """A batch system from which `dask_jobqueue` gets workers, one a job.
+
+    Attributes
+    ----------
+    system
+        The batch system.
+    queue, account, walltime
+        As the batch system names them.
+    directives
+        Further lines of the job script's head, without the comment sign that begins them.
+    prologue
+        Commands before the worker, as ``module load python``.
+    python
+        The Python of the nodes that has tune installed; None takes this one.
+    interface
+        The network interface by which the nodes reach each other, as ``ib0``.
+    scratch
+        A folder of the nodes for the workers' files.
+    logs
+        A folder for the jobs' output.
+    """
+
+    system: System
+    queue: str | None = None
+    account: str | None = None
+    walltime: str | None = None
+    directives: tuple[str, ...] = ()
+    prologue: tuple[str, ...] = ()
+    python: str | None = None
+    interface: str | None = None
+    scratch: str | None = None
+    logs: str | None = None
+
+
+class Kubernetes(Section):
+    """Workers that `dask_kubernetes` starts as pods; its operator runs in the cluster.
+
+    Attributes
+    ----------
+    image
+        Has tune with its extra ``cluster`` installed, the same versions as here.
+    namespace, name
+        Of the Dask cluster that is made.
+    """
+
+    image: str
+    namespace: str | None = None
+    name: str = "tune"
+
+
+class ClusterFile(Section):
+    """Where workers come from; without ``address``, ``queue`` and ``kubernetes``, this machine.
+
+    Attributes
+    ----------
+    workers
+        Their number.
+    cores
+        Processor cores of each.
+    memory
+        Of each, as ``2GiB``: a worker that takes more is ended and its task computed again. None
+        shares the machine's out, and is possible on this machine alone.
+    gpus
+        Of this machine, which its workers take in turn, each one alone.
+    address, tls
+        A running scheduler; its workers bring their own cores and memory.
+    jobs, kubernetes
+        What starts workers.
+    store
+        Folder or URL that all workers reach, from which they get data by content; None takes the
+        folder of what this program keeps, which must then be on a disk that all share.
+    """
+
+    workers: Annotated[Whole, Interval(ge=1, le=10_000)] = 1
+    cores: Annotated[Whole, Interval(ge=1, le=1024)] = 1
+    memory: Memory | None = None
+    gpus: Annotated[Whole, Interval(ge=0, le=64)] = 0
+    address: Address | None = None
+    tls: Tls | None = None
+    jobs: JobQueue | None = None
+    kubernetes: Kubernetes | None = None
+    store: str | None = None
+
+    @model_validator(mode="after")
+    def _contradict_nothing(self) -> Self:
+        given = [key for key in ("address", "jobs", "kubernetes") if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise refuse(f"both '{given[0]}' and '{given[1]}' are given", "keep one of them")
+        if given and given != ["address"] and self.memory is None:
+            raise refuse(f"'{given[0]}' needs the memory of a worker", "add memory: 2GiB")
+        if given and self.gpus:
+            raise refuse("'gpus' counts those of this machine", "leave it out")
+        if self.tls is not None and given != ["address"]:
+            raise refuse("'tls' belongs to an address", "give address: tls://HOST:8786")
+        return self
+
+
+def read_cluster(reference: str) -> ClusterFile:
+    """Read a cluster file; the address of a scheduler stands for a file that names it alone.
+
+    Raises
+    ------
+    ConfigError
+        In one line: the file, the key, its value, what it should be.
+    """
+    if reference.startswith(SCHEMES):
+        return build(ClusterFile, {"address": reference}, "--cluster")
+    path = Path(reference).expanduser()
+    file = read_model(ClusterFile, path)
+    if file.tls is None:
+        return file
+    folder = path.parent
+    found = {name: folder / getattr(file.tls, name) for name in Tls.model_fields}
+    return file.replace(tls=Tls(**found))
+
+
+PACKAGES = ("dask", "distributed", "dask_jobqueue", "dask_kubernetes", "cloudpickle", "fsspec")
+
+
+@contextmanager
+def extra() -> Iterator[None]:
+    """Turn a missing package of ``multirotor-tune[cluster]``, imported inside, into one line.
+
+    Raises
+    ------
+    InputError
+        It is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in PACKAGES:
+            raise
+        raise InputError(
+            "--workers and --cluster",
+            f"need {package}, which is not installed",
+            "pip install 'multirotor-tune[cluster]'",
+        ) from None
+
+
+def cluster_for(workers: int | None, cluster: str | None) -> ClusterFile | None:
+    """Return the cluster that the options name; None for this process.
+
+    Raises
+    ------
+    ConfigError
+        They contradict each other, or the cluster file cannot be used.
+    """
+    if cluster is None:
+        return None if workers is None else build(ClusterFile, {"workers": workers}, "--workers")
+    if workers is not None:
+        raise ConfigError("--workers", "cannot stand beside --cluster", "give one of them")
+    return read_cluster(cluster)
+
+
+@contextmanager
+def engine_for(workers: int | None = None, cluster: str | None = None) -> Iterator[Engine]:
+    """Start the engine that the options name, put it in force, and end it.
+
+    Parameters
+    ----------
+    workers
+        Local processes; None and no cluster is this process.
+    cluster
+        A cluster file, or the address of a scheduler.
+
+    Raises
+    ------
+    InputError
+        An option cannot be used, or no scheduler answers.
+    """
+    chosen = cluster_for(workers, cluster)
+    if chosen is None:
+        with using(HERE) as engine:
+            yield engine
+        return
+    with extra():
+        _quiet_dask()
+        from tuner.engine.dask_engine import on_dask  # noqa: PLC0415 (slow to import)
+
+    with on_dask(chosen) as engine, using(engine):
+        yield engine
+
+
+def job_script_for(cluster: str | None) -> str:
+    """Return the job script that a cluster file's batch system would be given.
+
+    Raises
+    ------
+    ConfigError
+        There is no cluster file, or it names no batch system.
+    """
+    file = cluster_for(None, cluster)
+    if file is None or file.jobs is None:
+        raise ConfigError(
+            "--dry-run", "prints the job script of a batch system", "name one with --cluster FILE"
+        )
+    with extra():
+        _quiet_dask()
+        from tuner.engine.dask_engine import job_script  # noqa: PLC0415 (slow to import)
+
+    return job_script(file, file.jobs)
+
+
+def _quiet_dask() -> None:
+    """Have Dask log nothing, unless the user has set that otherwise: what fails is raised."""
+    import dask.config  # noqa: PLC0415 (an extra)
+
+    dask.config.update_defaults({"logging": {"distributed": logging.CRITICAL + 1}})

@@ -12,7 +12,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from tuner.core.disk import write_text
@@ -124,7 +124,7 @@ def render(folder: str | Path, *, plots: bool = False) -> Path:
 
 
 def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
-    environment = _environment()
+    environment = templates("tuner.report")
     script = _source(environment, "figures.js") + _source(environment, "page.js")
     library, compressed = _library()
     run = contents.run
@@ -149,10 +149,10 @@ def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
 
 
 @cache
-def _environment() -> Environment:
-    """Return what renders templates, each compiled once."""
+def templates(*packages: str) -> Environment:
+    """Return what renders the templates of packages, each compiled once; all in them is escaped."""
     return Environment(
-        loader=PackageLoader("tuner.report"),
+        loader=ChoiceLoader([PackageLoader(package) for package in packages]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -22,7 +22,7 @@ from starlette.types import ASGIApp
 from tuner.core.errors import InputError
 from tuner.core.runtime import installed
 from tuner.core.yaml_section import first_complaint
-from tuner.engine.cluster_file import engine_for
+from tuner.engine.engine import engine_for
 from tuner.service import tokens
 from tuner.service.errors import ServiceError, over_http
 from tuner.service.http import api, watching

@@ -125,23 +125,19 @@ def _listener(channel: IO[str]) -> Any:
             # where this program lies here is nothing to a visitor
             say("message", text=f"{name}: {origin}".replace(f"{configs_folder()}/", ""))
 
-    def on_iteration(iteration: Any, left: float) -> None:
-        rest = None if math.isnan(left) else left
-        say("iteration", **iteration.model_dump(mode="json"), seconds_left=rest)
-
-    def on_estimates(estimates: Sequence[Any]) -> None:
-        say("estimates", estimates=[estimate.model_dump(mode="json") for estimate in estimates])
-
-    def on_folds(folds: Sequence[Any]) -> None:
-        without = {"coefficients"}
-        say("folds", folds=[fold.model_dump(mode="json", exclude=without) for fold in folds])
+    def rows(parts: Sequence[Any], **how: Any) -> list[dict[str, Any]]:
+        return [part.model_dump(mode="json", **how) for part in parts]
 
     return Listener(
         on_settings=on_settings,
-        on_iteration=on_iteration,
-        on_estimates=on_estimates,
+        on_iteration=lambda iteration, left: say(
+            "iteration",
+            **iteration.model_dump(mode="json"),
+            seconds_left=None if math.isnan(left) else left,
+        ),
+        on_estimates=lambda estimates: say("estimates", estimates=rows(estimates)),
         on_message=lambda text: say("message", text=text),
-        on_folds=on_folds,
+        on_folds=lambda folds: say("folds", folds=rows(folds, exclude={"coefficients"})),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lanes import Argument, Program
-from tuner.cli.profile import profiling, trace_of
+from tuner.cli.progress import profiling, trace_of
 from tuner.core.spans import (
     _RECORDER,
     BUILDING,

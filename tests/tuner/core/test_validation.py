@@ -15,7 +15,7 @@ import tuner
 from tuner.config import JobFile
 from tuner.core.errors import ConfigError
 from tuner.core.yaml_section import OTHER_FORM, PATTERN_PHRASES, Section, build, complaint, expected
-from tuner.engine.cluster_file import JobQueue
+from tuner.engine.engine import JobQueue
 from tuner.ground.plan import BenchFile
 from tuner.recordings.topics import TopicMap
 from tuner.vehicle import ControllerFile, VehicleFile
@@ -49,7 +49,7 @@ def models() -> list[type[BaseModel]]:
             (
                 "tuner.config",
                 "tuner.ground.plan",
-                "tuner.engine.cluster_file",
+                "tuner.engine.engine",
                 "tuner.recordings.topics",
                 "tuner.service.request",
                 "tuner.evaluate.closed_loop",

@@ -7,8 +7,8 @@ import pytest
 from tuner.cli import main
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
-from tuner.engine.cluster_file import ClusterFile, job_script_for, read_cluster
 from tuner.engine.dask_engine import dask, pod_specification
+from tuner.engine.engine import ClusterFile, job_script_for, read_cluster
 
 FOLDER = configs_folder() / "clusters"
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import anyio.to_thread
 from fastapi import APIRouter, Form, Query, Request
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment
 from markupsafe import Markup
 from pydantic import TypeAdapter, ValidationError
 from starlette.datastructures import FormData
@@ -26,7 +26,7 @@ from tuner.core.yaml_section import config_error, document_of
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
 from tuner.report.outcome import STYLE_OF, flights_table, outcome, warnings_of
-from tuner.report.page import LIBRARIES
+from tuner.report.page import LIBRARIES, templates
 from tuner.report.section import charts_json, figures
 from tuner.service import jobs, recordings, tokens
 from tuner.service.database import FINISHED, JobRow, RecordingRow, State
@@ -54,14 +54,8 @@ STATES: Mapping[str, tuple[str, str]] = {
 
 @cache
 def environment() -> Environment:
-    """Return the templates; whatever stands in them is escaped."""
-    made = Environment(
-        loader=ChoiceLoader([PackageLoader("tuner.service.web"), PackageLoader("tuner.report")]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    """Return the pages' templates, with what they call."""
+    made = templates("tuner.service.web", "tuner.report")
     filters: dict[str, Callable[..., object]] = {
         "charts": lambda charts: Markup(charts_json(charts)),
         "figures": figures,
