@@ -24,6 +24,7 @@ UNKNOWN = "…"
 
 #: Where a message comes from -> stage in which a user meets it; the first that matches.
 TOPICS: Mapping[str, str] = {
+    "service/": "The tuning service",
     "recording": "Reading recordings",
     "job_flights": "Reading recordings",
     "ground/": "Ground measurements",
@@ -34,7 +35,6 @@ TOPICS: Mapping[str, str] = {
     "core/shipped": "Vehicle, controller and job files",
     "evaluate/": "Simulating and comparing",
     "objective/trajectory": "Simulating and comparing",
-    "service/": "The tuning service",
     "engine/": "Workers and clusters",
     "cli/": "The command line",
     "core/": "Files and folders",
@@ -257,8 +257,10 @@ def _wordings(node: ast.expr, scope: ast.FunctionDef) -> list[str]:
             texts = _wordings(body, scope) + _wordings(orelse, scope)
         case ast.Call(func=ast.Name(id="did_you_mean")):
             texts = ["did you mean …?"]
-        case ast.Name(id=name):
-            texts = _assigned(name, scope) or texts
+        case ast.Name():
+            texts = _assigned(node, scope) or texts
+        case ast.FormattedValue(value=ast.Name() as name, format_spec=None):
+            texts = list(filter(_says_something, _assigned(name, scope))) or texts
     return texts
 
 
@@ -270,16 +272,63 @@ def _pairs(what: ast.expr, remedy: ast.expr, scope: ast.FunctionDef) -> Iterable
     return product(texts, remedies)
 
 
-def _assigned(name: str, scope: ast.FunctionDef) -> list[str]:
-    """Return the texts that a function gives a name."""
+Blocks = tuple[int, ...]
+
+
+def _assigned(name: ast.Name, scope: ast.FunctionDef) -> list[str]:
+    """Return the texts that a name may have where it stands in a function.
+
+    They are those of the last assignment before it that is always made, and of the later ones in
+    branches that do not leave the function.
+    """
+    made = [found for found in _assignments(name.id, scope.body, ()) if found[0] < name.lineno]
+    here = _blocks_of(name.lineno, scope.body, ())
     texts: list[str] = []
-    for node in ast.walk(scope):
-        if isinstance(node, ast.Assign) and any(
-            isinstance(target, ast.Name) and target.id == name for target in node.targets
-        ):
-            itself = any(isinstance(n, ast.Name) and n.id == name for n in ast.walk(node.value))
-            texts += [] if itself else _wordings(node.value, scope)
+    for _, value, blocks, leaves in reversed(made):
+        always = here[: len(blocks)] == blocks
+        itself = any(isinstance(n, ast.Name) and n.id == name.id for n in ast.walk(value))
+        if (always or not leaves) and not itself:
+            texts = _wordings(value, scope) + texts
+        if always and not itself:
+            break
     return texts
+
+
+def _inner(statement: ast.stmt) -> Iterator[list[ast.stmt]]:
+    """Yield the blocks of a statement; a function within has names of its own."""
+    if isinstance(statement, ast.FunctionDef):
+        return
+    for part in (statement, *getattr(statement, "handlers", ()), *getattr(statement, "cases", ())):
+        for field in ("body", "orelse", "finalbody"):
+            if block := getattr(part, field, None):
+                yield block
+
+
+def _assignments(
+    name: str, block: list[ast.stmt], blocks: Blocks
+) -> Iterator[tuple[int, ast.expr, Blocks, bool]]:
+    """Yield line, value and blocks of each assignment, and whether its block leaves."""
+    leaves = isinstance(block[-1], ast.Raise | ast.Return | ast.Continue | ast.Break)
+    for statement in block:
+        if isinstance(statement, ast.Assign):
+            for target in statement.targets:
+                pairs = [(target, statement.value)]
+                if isinstance(target, ast.Tuple) and isinstance(statement.value, ast.Tuple):
+                    pairs = list(zip(target.elts, statement.value.elts, strict=False))
+                for to, value in pairs:
+                    if isinstance(to, ast.Name) and to.id == name:
+                        yield statement.end_lineno or 0, value, blocks, leaves
+        for inner in _inner(statement):
+            yield from _assignments(name, inner, (*blocks, id(inner)))
+
+
+def _blocks_of(line: int, block: list[ast.stmt], blocks: Blocks) -> Blocks:
+    """Return the blocks within which a line stands, the outermost first."""
+    for statement in block:
+        for inner in _inner(statement):
+            if inner[0].lineno <= line <= (inner[-1].end_lineno or 0):
+                return _blocks_of(line, inner, (*blocks, id(inner)))
+    return blocks
 
 
 def _says_something(text: str) -> bool:

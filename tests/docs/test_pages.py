@@ -119,6 +119,16 @@ def test_messages_are_grouped_by_stage_and_have_an_answer():
     assert all(refusals)
 
 
+def test_a_message_has_the_remedy_that_goes_with_it():
+    remedies: dict[str, list[str]] = {}
+    for message in known_messages():
+        remedies.setdefault(message.what, []).append(message.remedy)
+    assert remedies["swings by … degrees"] == [
+        "release it within 20 degrees, the law is for small angles"
+    ]
+    assert remedies["shows … oscillations, fewer than …"] == ["let it swing longer"]
+
+
 def test_the_words_of_nearly_every_error_are_known():
     unknown = [place for place, messages in sites() if not messages]
     assert len(sites()) > 150

@@ -278,7 +278,7 @@ def read_columns(
 def _check_unit(path: Path, quantity: str, column: str, values: Array, arm: float) -> None:
     known = np.abs(values[np.isfinite(values)])
     if len(known) < MIN_SAMPLES:
-        raise RecordingError(path, f"column {column} holds hardly a number", "check the file")
+        raise RecordingError(path, f"column {column} holds almost no numbers", "check the file")
     top, low = float(np.quantile(known, 0.99)), float(np.nanquantile(values, 0.01))
     complaints = {
         "rotor_speed": (
@@ -352,7 +352,7 @@ def steady_flight(path: Path) -> tuple[Array, float, Curve]:
     measured = np.isfinite(speeds).any(axis=1)
     time, speeds = time[measured], speeds[measured]
     if len(time) < 20:
-        raise RecordingError(path, "has hardly a rotor speed", "give the point by its numbers")
+        raise RecordingError(path, "has almost no rotor speeds", "give the point by its numbers")
     mean = np.nanmean(speeds, axis=1)
     parts = find_plateaus(
         mean, time, shortest=MIN_STEADY_S, step=STEADY_TOLERANCE * float(np.median(mean))

@@ -328,7 +328,7 @@ class Client:
 
     def _no_token(self) -> InputError:
         remedy = "ask who runs it, and set TUNE_TOKEN"
-        return InputError("--token", f"is none of {self.url}", remedy)
+        return InputError("--token", f"is not known to {self.url}", remedy)
 
     def _not_a_service(self) -> InputError:
         return InputError("--server", f"{self.url} is no tuning service", "check the address")

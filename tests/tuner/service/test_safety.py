@@ -166,7 +166,7 @@ def test_logging_in_keeps_no_token_in_the_browser(guarded):
     client, token, _ = guarded
     wrong = client.post("/login", data={"token": "tune_guess"})
     assert wrong.status_code == 401
-    assert "is none of this server" in wrong.text
+    assert "is not known to this server" in wrong.text
     answer = client.post("/login", data={"token": token})
     cookie = answer.headers["set-cookie"].lower()
     assert "httponly" in cookie

@@ -248,7 +248,7 @@ def _request(
 ) -> JobRequest:
     """Return the request that a form makes."""
     if not used:
-        raise InputError("recordings", "are none", "drop some, or choose one to fit")
+        raise InputError("recordings", "are missing", "drop some, or choose one to fit")
     values: dict[str, Any] = {
         "recordings": [row.sha256 for row, _ in used],
         "names": {row.sha256: row.name for row, _ in used},
@@ -415,7 +415,7 @@ def login(
     """Open a session, which a cookie names that no script reads and no other site sends."""
     word = tokens.log_in(service.database, token.strip())
     if word is None:
-        error = NoTokenError("the token", "is none of this server", "ask who runs it for one")
+        error = NoTokenError("the token", "is not known to this server", "ask who runs it for one")
         return render("login.html.jinja", 401, problem=str(error))
     answer = RedirectResponse("/", status_code=303)
     answer.set_cookie(
