@@ -1,13 +1,14 @@
-"""Signals that physics ties together, and the readings in which they agree.
+"""Checks of recorded signals against each other, and corrections of their frames, signs and sizes.
 
 A recorded signal must be the change of another: body rate of the attitude, velocity and
-acceleration of the position, and body rate follows its set-point. Where one is not, the readings of
-`READINGS` are tried. A reading is believed if it leaves less than half of the residual, and little
-of the motion; there must be enough motion. Without one, the signal is doubted, as a whole or
-along single axes. A doubted recording may still be fitted: wind or a poor gyro explain a doubt. A
-contradiction may not. It takes a whole mission with much motion in which the attitude turns against
-the gyro or the position moves against the velocity, as in a reversed recording, or in which the
-acceleration opposes the tilt or does not depend on it, as with an attitude of another frame.
+acceleration of the position, and body rate follows its set-point. Where one is not, the other
+readings of `READINGS` are tried: axes, signs and units that loggers are known to confuse. A reading
+is believed if it leaves less than half of the residual, and little of the motion; there must be
+enough motion. Without one, the signal is doubted, as a whole or along single axes. A doubted
+recording may still be fitted: wind or a poor gyro explain a doubt. A contradiction may not. It
+takes a whole mission with much motion in which the attitude turns against the gyro or the position
+moves against the velocity, as in a reversed recording, or in which the acceleration opposes the
+tilt or does not depend on it, as with an attitude of another frame.
 """
 
 from __future__ import annotations

@@ -199,7 +199,7 @@ class Flight:
         return self.yaw_rate_setpoint is not None and not self.level_held
 
     @property
-    def tells_speeds(self) -> bool:
+    def has_tachometers(self) -> bool:
         """Whether every rotor has a tachometer."""
         speeds = self.series.get("rotor_speed")
         return speeds is not None and bool(np.isfinite(speeds.values).any(axis=0).all())

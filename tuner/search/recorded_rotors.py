@@ -325,7 +325,7 @@ def rotor_change_of(flight: Flight, vehicle: VehicleFile) -> RotorChange | None:
     vehicle
         Gives the curve from command to speed, where only commands were recorded.
     """
-    source: Source = "rotor_speed" if flight.tells_speeds else "command"
+    source: Source = "rotor_speed" if flight.has_tachometers else "command"
     recorded = {"position", "attitude", "body_rate", source} <= set(flight.series)
     if not recorded or len(vehicle.rotors) != 4 or flight.duration < 2.0 * MIN_SIDE_S:
         return None

@@ -6,6 +6,8 @@ the others are fitted given its value.
 
 A selected term that the flights do not determine and that ends at a bound is in the model by
 chance: it goes back to its initial value, whatever the loss.
+
+The profile of the likelihood shows how far one coefficient may go where all others follow.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
     model = objective.model_at(vector)
     conditions = objective.conditions_at(point)
     environment = environment_of(model, segments, conditions)
-    driven = [not flight.tells_speeds for flight in flights]
+    driven = [not flight.has_tachometers for flight in flights]
     commands = {
         number: flight.series["command"]
         for number, flight in enumerate(flights)
