@@ -459,6 +459,7 @@ class LinearisedInnovations:
             lumped=[name for name in begin if is_lumped(name)],
             excluding_gusts=list(begin),  # the filter estimates them
             min_gain=0.0,
+            white=True,
             without_refits=True,
         )
         change = self._change(model, tried, kept)
@@ -483,6 +484,7 @@ class LinearisedInnovations:
             {group: self._columns(own) for group, own in lags.items()},
             candidates=len(self.selected.rows),
             min_gain=0.0,
+            white=True,
             without_refits=True,
         )
         return tuple(kept)

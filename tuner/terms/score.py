@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to import
+from scipy.special import chdtrc, fdtrc  # scipy.stats takes a quarter of a second to import
 
 from tuner.core.numerics import Array, scaled_solve, symmetric_eigen, unit_diagonal
 from tuner.objective.information import BLOCK_S
@@ -185,6 +185,7 @@ def score(
     dropped: Columns = NO_COLUMNS,
     excludes_gusts: bool = False,
     min_gain: float = MIN_GAIN,
+    white: bool = False,
 ) -> Score:
     """Return the score of a group beside a model.
 
@@ -223,6 +224,10 @@ def score(
         the fit with it are at the noise level.
     min_gain
         Share of the loss below which a gain is no evidence.
+    white
+        Whether the loss is the negative log-likelihood of white innovations: twice the gain then
+        has a χ² distribution by chance (Wilks 1938), and has to be significant by that, too. The
+        scatter of few stretches may be too small.
     """
     group = linear.seen(group)
     columns = (model, np.concatenate([model, group]))
@@ -253,6 +258,8 @@ def score(
     chance = _hotelling_chance(linear, model, group, (alone, with_group), one_section_may_err=gusty)
     if not by_flight:
         chance = max(chance, chance_of_gusts(linear, model, group, without))
+    if white:
+        chance = max(chance, float(chdtrc(len(group), 2.0 * max(fit.of_stretch.sum(), 0.0))))
     if not _is_determined(linear, model, group):
         reason = SelectionCode.NO_INFORMATION
     elif fit.share < min_gain:
@@ -274,6 +281,7 @@ def backward_elimination(
     lumped: Collection[str] = (),
     excluding_gusts: Collection[str] = (),
     min_gain: float = MIN_GAIN,
+    white: bool = False,
     without_refits: bool = False,
 ) -> tuple[dict[str, Score], dict[str, Score]]:
     """Return the scores of the groups that backward elimination keeps, and of those it removes.
@@ -290,7 +298,7 @@ def backward_elimination(
 
     Parameters
     ----------
-    linear, candidates, min_gain
+    linear, candidates, min_gain, white
         As of `score`; the point is the fit with all groups.
     model
         Columns of the coefficients that stay.
@@ -318,6 +326,7 @@ def backward_elimination(
                 dropped=_concatenated([without, *gone]),
                 excludes_gusts=name in excluding_gusts,
                 min_gain=min_gain,
+                white=white,
             )
             for name, columns in left.items()
         }

@@ -96,6 +96,19 @@ def test_a_term_that_the_voltmeters_errors_explain_is_not_significant(size, acce
     assert found.gain_fit == score(linear, MODEL, FIRST, candidates=2).gain_fit
 
 
+@pytest.mark.parametrize(("size", "accepted"), [(1.0, True), (0.1, False)])
+def test_a_gain_of_a_likelihood_has_to_be_significant_by_itself(size, accepted):
+    """However little it scatters: residuals of a tenth of the noise scatter as little."""
+    linear = linear_fit(0.2)
+    little = replace(linear, score=size * linear.score, loss=size**2 * linear.loss)
+    assert score(little, MODEL, FIRST, candidates=2).is_accepted
+    assert score(little, MODEL, FIRST, candidates=2, white=True).is_accepted is accepted
+    columns = {"first": FIRST}
+    inside = moved_to_minimum(little, np.concatenate([MODEL, FIRST]))
+    kept, _ = backward_elimination(inside, MODEL, columns, candidates=2, white=True)
+    assert bool(kept) is accepted
+
+
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("correlated", [False, True])
 def test_noise_buys_no_term_even_where_it_is_correlated_in_time(seed, correlated):
