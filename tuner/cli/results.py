@@ -317,13 +317,12 @@ def _print_sections(contents: Contents, wanted: Callable[[str], bool]) -> None:
 
 def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
     """Print the results of each experiment and of all together, and the folder."""
-    from tuner.ground.measurement import agreement_in_words, bench_record, numbers_in_words
+    from tuner.ground.measurement import agreement_in_words, numbers_in_words
 
     screen = console()
-    record = bench_record(bench.combination, bench.measurements)
-    for experiment in record.experiments:
+    for experiment in bench.record.experiments:
         screen.print(f"{experiment.name}: {'; '.join(numbers_in_words(experiment))}")
-    screen.print(agreement_in_words(record))
+    screen.print(agreement_in_words(bench.record))
     print_run(bench.folder, bench.result, verbose=verbose)
 
 

@@ -12,6 +12,7 @@ from cyclopts import App, Parameter
 
 from tuner.cli.tune import MANY_WORDS
 from tuner.core.errors import InputError
+from tuner.core.runtime import extra
 
 if TYPE_CHECKING:
     from tuner.service.database import Database
@@ -86,7 +87,7 @@ def _serve(
     memory
         Let a job take so many GiB of memory.
     """
-    with _extra():
+    with extra("service", "tune serve"):
         from tuner.service.app import LOOPBACK, is_loopback
         from tuner.service.app import serve as run
     from tuner.service.settings import GIB, Limits, ServiceSettings, default_data
@@ -156,7 +157,7 @@ def names(*, data: Data = None, database: DatabaseUrl = None) -> None:
 @contextmanager
 def _database(data: Path | None, url: str | None) -> Iterator[Database]:
     """Open the database of a server, which may be running."""
-    with _extra():
+    with extra("service", "tune serve"):
         from tuner.service.database import Database
     from tuner.core.disk import make_folder
     from tuner.service.settings import ServiceSettings, default_data
@@ -169,20 +170,3 @@ def _database(data: Path | None, url: str | None) -> Iterator[Database]:
         yield opened
     finally:
         opened.close()
-
-
-@contextmanager
-def _extra() -> Iterator[None]:
-    """Turn a missing package of the extra, imported inside, into one line."""
-    packages = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "fsspec", "python_multipart")
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package not in (*packages, "prometheus_client", "starlette", "anyio"):
-            raise
-        raise InputError(
-            "tune serve",
-            f"needs {package}, which is not installed",
-            "pip install 'multirotor-tune[service]'",
-        ) from None

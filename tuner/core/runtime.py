@@ -16,13 +16,53 @@ import gc
 import logging
 import os
 import platform
-from contextlib import suppress
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
 
 from tuner.core.disk import cache_folder
+from tuner.core.errors import InputError
 
 PROGRAM = "multirotor-tune"
 LIBRARY_NAMES = ("jax", "jaxlib", "equinox", "numpy", "rosbags")
+
+
+EXTRAS: Mapping[str, Collection[str]] = {
+    "cluster": (
+        *("dask", "distributed", "dask_jobqueue", "dask_kubernetes", "cloudpickle"),
+        "fsspec",
+    ),
+    "postgresql": ("psycopg",),
+    "service": (
+        *("fastapi", "uvicorn", "sqlalchemy", "alembic", "fsspec", "python_multipart"),
+        *("prometheus_client", "starlette", "anyio", "httpx"),
+    ),
+}
+"""Extra of this program -> the packages that it brings, by the names that are imported."""
+
+
+@contextmanager
+def extra(name: str, asked_by: str, needs: str = "needs") -> Iterator[None]:
+    """Turn a missing package of an extra, imported inside, into one line.
+
+    Parameters
+    ----------
+    asked_by, needs
+        What needs it: a command or options; and the verb that goes with that.
+
+    Raises
+    ------
+    InputError
+        It is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in EXTRAS[name]:
+            raise
+        what = f"{needs} {package}, which is not installed"
+        raise InputError(asked_by, what, f"pip install 'multirotor-tune[{name}]'") from None
 
 
 def installed(distribution: str = PROGRAM) -> str:

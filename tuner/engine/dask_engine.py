@@ -41,8 +41,9 @@ from distributed.security import Security
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import cache_folder
 from tuner.core.errors import EngineError, InputError
-from tuner.core.runtime import configure
+from tuner.core.runtime import configure, extra
 from tuner.engine.engine import (
+    DASK,
     HERE,
     ClusterFile,
     Engine,
@@ -50,7 +51,6 @@ from tuner.engine.engine import (
     Kubernetes,
     Report,
     Task,
-    extra,
     using,
 )
 
@@ -357,7 +357,7 @@ def cluster_of(file: ClusterFile) -> AbstractContextManager[Any]:
     if file.jobs is not None:
         return _jobs(file, file.jobs)
     if file.kubernetes is not None:
-        with extra():
+        with extra("cluster", *DASK):
             from dask_kubernetes.operator import KubeCluster  # noqa: PLC0415 (few need it)
 
         pods = KubeCluster(custom_cluster_spec=pod_specification(file, file.kubernetes))
@@ -412,7 +412,7 @@ def job_script(file: ClusterFile, jobs: JobQueue) -> str:
 
 
 def _jobs(file: ClusterFile, jobs: JobQueue, *, submit: bool = True) -> AbstractContextManager[Any]:
-    with extra():
+    with extra("cluster", *DASK):
         import dask_jobqueue  # noqa: PLC0415 (few need it)
 
     kind = getattr(dask_jobqueue, CLASSES[jobs.system])
@@ -444,7 +444,7 @@ def _jobs(file: ClusterFile, jobs: JobQueue, *, submit: bool = True) -> Abstract
 
 def pod_specification(file: ClusterFile, pods: Kubernetes) -> dict[str, Any]:
     """Return the Dask cluster that dask_kubernetes' operator is asked for."""
-    with extra():
+    with extra("cluster", *DASK):
         from dask_kubernetes.operator import make_cluster_spec  # noqa: PLC0415 (few need it)
 
     assert file.memory is not None

@@ -22,7 +22,8 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from annotated_types import Interval
 from pydantic import StringConstraints, model_validator
 
-from tuner.core.errors import ConfigError, InputError
+from tuner.core.errors import ConfigError
+from tuner.core.runtime import extra
 from tuner.core.yaml_section import Section, Whole, build, read_model, refuse
 
 T = TypeVar("T")
@@ -281,29 +282,8 @@ def read_cluster(reference: str) -> ClusterFile:
     return file.replace(tls=Tls(**found))
 
 
-PACKAGES = ("dask", "distributed", "dask_jobqueue", "dask_kubernetes", "cloudpickle", "fsspec")
-
-
-@contextmanager
-def extra() -> Iterator[None]:
-    """Turn a missing package of ``multirotor-tune[cluster]``, imported inside, into one line.
-
-    Raises
-    ------
-    InputError
-        It is not installed.
-    """
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        if package not in PACKAGES:
-            raise
-        raise InputError(
-            "--workers and --cluster",
-            f"need {package}, which is not installed",
-            "pip install 'multirotor-tune[cluster]'",
-        ) from None
+DASK = ("--workers and --cluster", "need")
+"""What needs Dask, in a message."""
 
 
 def cluster_for(workers: int | None, cluster: str | None) -> ClusterFile | None:
@@ -342,7 +322,7 @@ def engine_for(workers: int | None = None, cluster: str | None = None) -> Iterat
         with using(HERE) as engine:
             yield engine
         return
-    with extra():
+    with extra("cluster", *DASK):
         _quiet_dask()
         from tuner.engine.dask_engine import on_dask  # noqa: PLC0415 (slow to import)
 
@@ -363,7 +343,7 @@ def job_script_for(cluster: str | None) -> str:
         raise ConfigError(
             "--dry-run", "prints the job script of a batch system", "name one with --cluster FILE"
         )
-    with extra():
+    with extra("cluster", *DASK):
         _quiet_dask()
         from tuner.engine.dask_engine import job_script  # noqa: PLC0415 (slow to import)
 

@@ -18,6 +18,7 @@ from tuner.core.shipped import find_config
 from tuner.findings.findings import Code, Finding
 from tuner.ground.experiments import measure, names_of
 from tuner.ground.measurement import (
+    BenchRecord,
     Combination,
     Measurement,
     bench_record,
@@ -64,14 +65,13 @@ class BenchResult:
         With ``result.json``, ``best_fit.yaml``, ``bench.json`` and ``report.html``.
     result
         The content of ``result.json``.
-    measurements
-        One for each experiment, in the order of ``bench.yaml``.
+    record
+        The content of ``bench.json``: each experiment, in the order of ``bench.yaml``, and all.
     """
 
     folder: Path
     result: RunResult
-    measurements: tuple[Measurement, ...]
-    combination: Combination
+    record: BenchRecord
 
 
 def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchResult:
@@ -159,14 +159,15 @@ def write_measurements(
             message=Ending.NO_FURTHER_GAIN,
         ),
     )
+    record = bench_record(combination, measurements)
     made_by = {"made_by": f"{PROGRAM} {result.versions[PROGRAM]}", **source}
     with result_folder(out) as folder:
         forget(folder)
         write_vehicle(vehicle.replace(source=made_by), folder / BEST_FIT_FILE, header=header)
-        bench_record(combination, measurements).write(folder)
+        record.write(folder)
         result.write(folder)
         render(folder)
-    return BenchResult(folder, result, measurements, combination)
+    return BenchResult(folder, result, record)
 
 
 def _measure_all(

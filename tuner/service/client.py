@@ -23,6 +23,7 @@ from tuner.config import Settings, resolve_settings
 from tuner.core.disk import exists, inside, result_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.core.files import ResultFile
+from tuner.core.runtime import extra
 from tuner.core.shipped import KINDS, configs_folder, find_config
 from tuner.core.yaml_section import Section, read_yaml
 from tuner.options import FILES, MODELS, FitOptions, taking
@@ -58,12 +59,8 @@ class Client:
     """
 
     def __init__(self, url: str | None = None, token: str | None = None) -> None:
-        try:
+        with extra("service", "--server"):
             import httpx  # noqa: PLC0415 (an extra)
-        except ModuleNotFoundError:
-            raise InputError(
-                "--server", "needs httpx", "pip install 'multirotor-tune[service]'"
-            ) from None
         url = url or os.environ.get("TUNE_SERVER") or DEFAULT_SERVER
         self.url = url.rstrip("/")
         token = token or os.environ.get("TUNE_TOKEN") or ""

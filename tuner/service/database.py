@@ -37,6 +37,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column, relationship
 
 from tuner.core.errors import InputError
+from tuner.core.runtime import extra
 from tuner.service.errors import UnavailableError
 
 #: An identity that SQLite counts by itself.
@@ -345,14 +346,11 @@ def _engine(given: str) -> Engine:
             url = url.set(drivername="postgresql+psycopg")
         if url.get_backend_name() not in ("sqlite", "postgresql"):
             raise ArgumentError
-        engine = create_engine(url, pool_pre_ping=True, pool_size=20, max_overflow=40)
+        with extra("postgresql", "--database"):
+            engine = create_engine(url, pool_pre_ping=True, pool_size=20, max_overflow=40)
     except (ArgumentError, NoSuchModuleError, ValueError):
         raise InputError(
             "--database", "is no URL of SQLite or PostgreSQL", "write postgresql://user@host/name"
-        ) from None
-    except ModuleNotFoundError as error:
-        raise InputError(
-            "--database", f"needs {error.name}", "pip install 'multirotor-tune[postgresql]'"
         ) from None
     if engine.dialect.name == "sqlite":
         event.listen(engine, "connect", _set_up_sqlite)

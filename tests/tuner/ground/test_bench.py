@@ -194,7 +194,7 @@ def test_a_spin_is_linearised_where_the_other_experiments_lead(tmp_path):
     path = tmp_path / "bench.yaml"
     path.write_text(yaml.safe_dump({"experiments": [SPIN, HOVER]}))
     result = bench(path, out=tmp_path / "out")
-    names = [measurement.experiment for measurement in result.measurements]
+    names = [experiment.name for experiment in result.record.experiments]
     assert names == ["yaw_spin", "hover_weights"]
     best = {name: row.best for name, row in result.result.coefficients.items()}
     ratio = best["rotor_drag_coefficient"] / (best["moment_constant"] * best["motor_constant"])

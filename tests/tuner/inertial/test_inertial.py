@@ -311,7 +311,7 @@ def test_what_cannot_be_used_is_left_out_and_what_is_held_out_is_predicted(
     flights, left_out = read_inertial_flights(settings)
     assert [flight.name for flight in flights] == ["log00", "log01", "log02"]
     run = fit_without_pose(settings, flights, left_out=left_out, out=tmp_path / "run")
-    assert [m.experiment for m in run.measurements] == ["log00"]
+    assert [experiment.name for experiment in run.record.experiments] == ["log00"]
     left = [f for f in run.result.findings if f.code is Code.LEFT_OUT]
     assert [finding.subject for finding in left] == ["log03", "log02"]
     assert "of the columns that the topic map lists" in one_line(left[1])
