@@ -166,6 +166,17 @@ class Message:
         return re.sub(r"[^a-z0-9]+", "-", self.what.lower().replace(UNKNOWN, " ")).strip("-")
 
 
+COMPLAINTS = tuple(
+    Message("Vehicle, controller and job files", what, remedy)
+    for what, remedy in (
+        (f"unknown key '{UNKNOWN}'", f"did you mean {UNKNOWN}?"),
+        (f"key '{UNKNOWN}' is missing", "add it"),
+        (f"{UNKNOWN} is {UNKNOWN}", f"it should be {UNKNOWN}, as a number, or more than 0"),
+    )
+)
+"""On a key of a file or a request: `tuner.core.yaml_section.complaint` words them, no error."""
+
+
 def messages_page() -> str:
     """Return the page."""
     parts = [f"{GENERATED}{INTRO}"]
@@ -202,7 +213,7 @@ def _shown(text: str) -> str:
 
 def known_messages() -> list[Message]:
     """Return the messages of all errors whose words stand in the source, each once."""
-    found = {message: None for _, messages in sites() for message in messages}
+    found = dict.fromkeys([*COMPLAINTS, *(m for _, messages in sites() for m in messages)])
     anchors: dict[tuple[str, str], Message] = {}
     for message in found:
         anchors.setdefault((message.what, message.remedy), message)
@@ -236,7 +247,8 @@ def _errors_made(scope: ast.FunctionDef) -> Iterator[ast.Call]:
         node = left.popleft()
         left += (n for n in ast.iter_child_nodes(node) if not isinstance(n, ast.FunctionDef))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-            made = node.func.id.endswith("Error") and len(node.args) == 3
+            ours = node.func.id.endswith("Error") and not node.func.id.startswith("Pydantic")
+            made = ours and len(node.args) == 3
             refused = node.func.id == "refuse" and len(node.args) == 2
             if made or refused:
                 yield node
