@@ -201,7 +201,7 @@ def _with_all_terms(
 
 def flown_part(segments: Segments) -> Segments:
     """Return the part of segments that is simulated, without measurements."""
-    flown: Segments = replace(segments, measured={}, flight=jnp.zeros(segments.count, int))
+    flown: Segments = replace(segments, measured={}, flight=np.zeros(segments.count, int))
     return flown
 
 
