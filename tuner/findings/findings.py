@@ -160,8 +160,11 @@ class Code(Worded):
     )
     LOGS_DIFFER = (
         "logs_differ",  # names: the parameters
-        "The logs differ: in {coefficients}; those of the first are simulated.",
-        "Fit them one by one.",
+        (
+            "Parameters differ between the logs, or change in one: {coefficients}; those that the "
+            "first log begins with are simulated."
+        ),
+        "Fit logs one by one, each flown with one set of parameters.",
     )
     ATTITUDE_FOLLOWED = (
         "attitude_followed",  # names: the inlet that it could have entered through

@@ -32,6 +32,9 @@ from tuner.recordings.recording import NS_PER_SECOND, Nanoseconds, Samples
 MIN_CLOCK_JUMP_NS = NS_PER_SECOND // 10
 #: Topics whose stamps differ by more from the others' have a clock of their own.
 MIN_CLOCK_OFFSET_NS = NS_PER_SECOND // 2
+#: Stamps that are further apart than so many messages, as whole seconds, are too coarse; those of a
+#: message for each of eight rotors are not.
+MAX_STAMP_RATIO = 12
 #: Share of a period by which a stamp may be off its tick.
 MAX_TICK_DEVIATION = 0.2
 #: s/s. No clock drifts faster: such stamps have another rate.
@@ -79,7 +82,9 @@ def message_times(
         receive_span, stamp_span = (
             np.ptp(np.quantile(t, (0.1, 0.9))) for t in (messages.receive, messages.stamp)
         )
-        if receive_span > NS_PER_SECOND and stamp_span < receive_span / 2:
+        apart = float(np.median(np.diff(np.unique(messages.stamp)))) if stamp_span else 0.0
+        is_coarse = apart > MAX_STAMP_RATIO * receive_span / len(messages.stamp)
+        if receive_span > NS_PER_SECOND and (is_coarse or stamp_span < receive_span / 2):
             unset_topics.append(topic)
             continue
         stamp, repaired = _repair_stamps(topic, messages.stamp, messages.receive)

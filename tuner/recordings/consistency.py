@@ -72,8 +72,9 @@ READING_PENALTY = 0.05
 """Each further misreading must improve the score by more."""
 MAX_BELIEVED_SHARE = 0.7
 """The largest residual, as a share of the motion, of a reading that is believed."""
-MAX_DOUBTED_AGREEMENT = 0.8
-"""A signal with a larger correlation is not doubted as a whole."""
+MAX_DOUBTED_AGREEMENT, MIN_CLEAR_GAIN = 0.8, 0.1
+"""A signal with a larger correlation is not doubted as a whole; of signals that hardly move, a
+reading with a larger one is believed, if that is larger by so much."""
 OPPOSED_CORRELATION = -0.5
 """Two signals that should agree are opposites below this."""
 UNRELATED_CORRELATION = 0.2
@@ -279,12 +280,11 @@ def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
     pair = PAIRS[signal]
     change, recorded = pair.compared[-1](flown)
     slower, faster = sorted((rms(change), rms(recorded)))
-    if slower < pair.min_motion:
+    moves = slower >= pair.min_motion
+    if not moves:
         ups = np.nansum([change[:, 2], recorded[:, 2]], axis=1)
         if signal == "acceleration" and ups[0] * ups[1] < 0.0:  # the weight alone tells the axes
             return READINGS[signal][0], []
-        unmatched = pair.doubt.note(left=1.0, agreement=0.0)
-        return None, [unmatched] if faster > pair.max_unmatched else []
     left, agreement = _residual_share(change, recorded), correlation(change, recorded)
     tried = {
         reading: pair.compared[-1](
@@ -299,13 +299,20 @@ def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
         reading: _residual_share(change, values)
         for reading, values in tried.items()
         # noise favours small units: the slope tells sizes apart whatever the noise
-        if 1 / MAX_SIZE_RATIO < alike[reading] * rms(values) / rms(change) < MAX_SIZE_RATIO
+        if rms(change)
+        < MAX_SIZE_RATIO * alike[reading] * rms(values)
+        < MAX_SIZE_RATIO**2 * rms(change)
     }
     best = min(shares, key=lambda reading: shares[reading], default=None)
     if best is not None:
         of_another_unit = shares[best] < left / 20 and alike[best] > MIN_AGREEMENT
-        if shares[best] < min(MAX_BELIEVED_SHARE, left / 2) or of_another_unit:
+        clear = alike[best] > max(MAX_DOUBTED_AGREEMENT, agreement + MIN_CLEAR_GAIN)
+        halved = shares[best] < min(MAX_BELIEVED_SHARE, left / 2) or of_another_unit
+        if halved if moves else clear:
             return best, []
+    if not moves:
+        unmatched = pair.doubt.note(left=1.0, agreement=0.0)
+        return None, [unmatched] if faster > pair.max_unmatched else []
     doubt = pair.doubt.note(left=left, agreement=agreement)
     alike_in_size = faster < MAX_SIZE_RATIO * slower
     believed = left <= pair.max_share or (agreement >= MAX_DOUBTED_AGREEMENT and alike_in_size)

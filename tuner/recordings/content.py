@@ -323,8 +323,10 @@ def _without_dead_rotors(
         change = np.fmax.reduce(commands.values, axis=0) - np.fmin.reduce(commands.values, axis=0)
         if (change == 0.0).any() and (change > MIN_COMMAND_RANGE).any():
             del others["command"]
-            rotors, topic = tuple(map(str, np.flatnonzero(change == 0.0))), topics["command"]
-            notes.append(NoteCode.COMMAND_DEAD.note(*rotors, topic=topic, count=len(rotors)))
+            rotors = tuple(map(str, np.flatnonzero(change == 0.0) + 1))
+            notes.append(
+                NoteCode.COMMAND_DEAD.note(*rotors, topic=topics["command"], count=len(rotors))
+            )
     if speeds is not None:
         low, high = np.fmin.reduce(speeds.values, axis=0), np.fmax.reduce(speeds.values, axis=0)
         still = (low == high) & (np.isfinite(speeds.values).sum(axis=0) >= MIN_SAMPLES)
@@ -334,7 +336,7 @@ def _without_dead_rotors(
         if not len(others["rotor_speed"].time):
             del others["rotor_speed"]
         missing = np.flatnonzero(np.isnan(turning.values).all(axis=0))
-        rotors, topic = tuple(map(str, missing)), topics["rotor_speed"]
+        rotors, topic = tuple(map(str, missing + 1)), topics["rotor_speed"]
         if rotors:
             notes.append(
                 NoteCode.NO_TACHOMETER.note(*rotors, kind="info", topic=topic, count=len(rotors))

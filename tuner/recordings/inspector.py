@@ -42,7 +42,7 @@ from tuner.recordings.inspection import (
 )
 from tuner.recordings.interpolation import RATE_HZ, derivative, resample, smooth, upward
 from tuner.recordings.loader import flights_of, flying_stretches, inertial_error, is_inertial
-from tuner.recordings.missions import yaw_spin
+from tuner.recordings.missions import mission_error, yaw_spin
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.recording import Samples, Topic
 from tuner.recordings.sources import choose_map, locate, sources_by_name
@@ -133,9 +133,10 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
     unusable = has_stale_attitude(content.series, content.notes) or contradiction_in(content.notes)
     if unusable:  # a fit leaves it out
         del measured["attitude"]
+    error = None if missions else mission_error(content.recording.path, content.series)
     return replace(
         _with_signals(content),
-        problem=None if missions else "nothing flies in it for 2 s: no mission was found",
+        problem=None if error is None else error.what,
         missions=missions,
         inlets=inlet_reports(measured, trajectory=sidecar.trajectory is not None),
         coefficients=() if unusable else coefficient_reports(content.series, measured, missions),

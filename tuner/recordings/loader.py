@@ -36,7 +36,7 @@ from tuner.recordings.content import (
 from tuner.recordings.flight import SIGNALS, Flight, Series
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.interpolation import max_gap, resample, runs, with_gaps_filled
-from tuner.recordings.missions import MAX_IDLE_COMMAND, stretches, yaw_spin
+from tuner.recordings.missions import MAX_IDLE_COMMAND, mission_error, stretches, yaw_spin
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.states import initial_state
 from tuner.recordings.topics import TopicMap
@@ -170,11 +170,7 @@ def load_flights(
     with readable(path):
         content = read_content(options)
     if not content.missions:
-        raise RecordingError(
-            path,
-            "nothing flies in it for 2 s: no mission was found",
-            "inspect it, or give 'start' and 'end' in a side-car",
-        )
+        raise mission_error(path, content.series)
     return flights_of(content, options, keep=cache)
 
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
 from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import runs
@@ -109,6 +111,23 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
             mission = Mission(begin, min(end, down, last), begins_with)
             missions += _split_at_pose_pauses(mission, series["position"].time)
     return tuple(m for m in missions if m.end - m.start >= MIN_MISSION_S)
+
+
+def mission_error(path: Path, series: Mapping[str, Series]) -> RecordingError:
+    """Return why a recording has no mission."""
+    position = series["position"]
+    turned = replace(position, values=position.values * [1.0, 1.0, -1.0])
+    if find_missions({**series, "position": turned}):
+        return RecordingError(
+            path,
+            "flies only if z of its position points down, as in NED axes",
+            "give position, and what else is so, frame: ned_frd in a topic map (--topics FILE)",
+        )
+    return RecordingError(
+        path,
+        "nothing flies in it for 2 s: no mission was found",
+        "inspect it, or give 'start' and 'end' in a side-car",
+    )
 
 
 def _split_at_pose_pauses(mission: Mission, pose: Array) -> list[Mission]:

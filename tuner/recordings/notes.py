@@ -45,7 +45,10 @@ class NoteCode(Worded):
         "no pose: {seconds:.1f} s of flight are fitted by body rate and specific force",
     )
     OTHER_CLOCK = "other_clock", "stamped by another clock, {seconds:.3f} s off: moved"
-    STAMPS_UNSET = "stamps_unset", "its stamps are not set: its times are those of recording"
+    STAMPS_UNSET = (
+        "stamps_unset",
+        "its stamps are not set, or too coarse: its times are those of recording",
+    )
     NO_HEADER = "no_header", "has no header: its times are those of recording"
     STAMPS_REPLACED = (
         "stamps_replaced",
@@ -109,10 +112,10 @@ class NoteCode(Worded):
         "{first} is unknown for {seconds:.2f} s, {longest:.2f} s at a time",
     )
     COMMAND_DEAD = (
-        "command_dead",  # names: the rotors
+        "command_dead",  # names: the rotors, from 1
         "the commands of rotors {all} never change while the others do: not read",
     )
-    NO_TACHOMETER = "no_tachometer", "rotors {all} have no tachometer"  # names: the rotors
+    NO_TACHOMETER = "no_tachometer", "rotors {all} have no tachometer"  # names: from 1
     FRAME_TURNED = (
         "frame_turned",  # names: the signal, the frame that it is in
         "{first} is {second}, which the topic map does not say: turned",

@@ -188,6 +188,21 @@ def parameters_of(path: Path) -> dict[str, float]:
     return {}
 
 
+def changed_parameters(path: Path) -> set[str]:
+    """Return the parameters that are set to more than one value in a PX4 log."""
+    values: dict[bytes, set[bytes]] = {}
+    for buffer, places in _blocks(path):
+        content = np.frombuffer(buffer, dtype=np.uint8)
+        kind = content[np.array(places[:-1], dtype=np.int64) + 2]
+        for at in np.flatnonzero(kind == ord("P")).tolist():
+            key, value = (
+                buffer[places[at] + 4 : places[at + 1] - 4],
+                buffer[places[at + 1] - 4 : places[at + 1]],
+            )
+            values.setdefault(key.partition(b" ")[2], set()).add(value)
+    return {name.decode(errors="replace") for name, of in values.items() if len(of) > 1}
+
+
 def _has(formats: Formats, kind: str, path: list[str]) -> bool:
     """Return whether a format has a field such as ``esc[0].esc_rpm``, given in its parts."""
     name, _, index = path[0].partition("[")

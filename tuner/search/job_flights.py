@@ -38,8 +38,8 @@ from tuner.recordings.consistency import contradiction_in
 from tuner.recordings.defects import has_stale_attitude
 from tuner.recordings.flight import Flight
 from tuner.recordings.loader import InertialFlight, load_flights, read_inertial
-from tuner.recordings.notes import NoteCode
-from tuner.recordings.ulog import parameters_of
+from tuner.recordings.notes import NoteCode, note_in_words
+from tuner.recordings.ulog import changed_parameters, parameters_of
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle.controller import PARAMETER_OF, with_parameters
 
@@ -83,14 +83,17 @@ def with_logged_parameters(settings: Settings) -> tuple[Settings, tuple[Finding,
     first, *others = logs.values()
     controller, changes = with_parameters(settings.controller, first)
     logged = [name for name in PARAMETER_OF.values() if name in first]
-    unlike = [name for name in logged if any(other.get(name) != first[name] for other in others)]
+    unlike = {name for name in logged if any(other.get(name) != first[name] for other in others)}
+    unlike.update(*(changed_parameters(path).intersection(logged) for path in logs))
     findings = []
     if changes:
         named = not settings.origin.get("controller", "default").startswith("default")
         level: Literal["warning", "info"] = "warning" if named else "info"
         findings.append(Finding(Code.LOGGED_GAINS, level, next(iter(logs)).stem, names=changes))
     if unlike:
-        findings.append(Finding(Code.LOGS_DIFFER, "warning", "flights", names=tuple(unlike)))
+        findings.append(
+            Finding(Code.LOGS_DIFFER, "warning", "flights", names=tuple(sorted(unlike)))
+        )
     origin = {**settings.origin, "controller": f"{settings.origin.get('controller', '')}, the log"}
     changed = replace(settings, controller=controller, origin=origin) if changes else settings
     return changed, tuple(findings)
@@ -458,7 +461,10 @@ def inlet_for(flight: Flight, requested: str) -> InletName:
 
 
 def _dropped(flight: Flight, signals: Sequence[str]) -> str:
-    """Return how many samples of some signals were dropped as corrupt, as a clause."""
+    """Return why some signals lack samples, as a clause: corrupt, or of a rotor that is dead."""
+    dead = [note for note in flight.notes if note.code is NoteCode.COMMAND_DEAD]
+    if dead and "command" in signals:
+        return f": {note_in_words(dead[0])}"
     counts = [
         (signal, sum(n.count for n in flight.notes if n.code in DROPPED and signal in n.names))
         for signal in signals

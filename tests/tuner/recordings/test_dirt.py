@@ -143,10 +143,13 @@ def test_motion_capture_behind_the_gyro_is_found_by_correlation(clean: Flight, d
     assert noted(got, NoteCode.POSE_MOVED).numbers["seconds"] == pytest.approx(0.08, abs=1.5e-3)
 
 
-def test_unset_header_stamps_give_way_to_receive_times(clean: Flight, dirty: Any) -> None:
+@pytest.mark.parametrize("ticks", [0, 1_000_000_000], ids=["not set", "whole seconds"])
+def test_unset_header_stamps_give_way_to_receive_times(
+    ticks: int, clean: Flight, dirty: Any
+) -> None:
     def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
         if topic == GYRO:
-            making.stamped(message, 0)
+            making.stamped(message, making.stamp_of(message) // ticks * ticks if ticks else 0)
         return [(time, message)]
 
     got = dirty(change)

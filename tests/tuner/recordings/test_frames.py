@@ -13,10 +13,11 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag1 import Writer as BagWriter
 from scipy.spatial.transform import Rotation
 
-from tests.tuner.recordings import making
+from tests.tuner.recordings import making, ways
 from tuner.cli import main
-from tuner.config import resolve_settings
+from tuner.config import TrajectorySettings, resolve_settings
 from tuner.core.errors import RecordingError
+from tuner.evaluate.closed_loop import simulate
 from tuner.findings.findings import Code, one_line
 from tuner.options import Options
 from tuner.recordings.consistency import contradiction, contradiction_in, correct_frames
@@ -26,6 +27,7 @@ from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.unit_detection import READINGS, SCALAR_FIRST, Reading
 from tuner.search.job_flights import load_flights, read_recordings
+from tuner.vehicle import ControllerFile, read_vehicle
 
 SHARED = Path(__file__).parents[4] / "shared"
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", SHARED / "flights"))
@@ -313,6 +315,22 @@ def test_markers_of_another_heading_show_in_real_flights(path: Path, heading: fl
     overlap = (fixed["attitude"].values * right.values).sum(axis=1)
     np.testing.assert_allclose(np.abs(overlap), 1.0, atol=1e-9)
     assert [note.code for note in notes] == [NoteCode.FRAME_TURNED]
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_the_gyro_of_a_gentle_flight_is_turned(noise: float) -> None:
+    shape = TrajectorySettings(name="lemniscate", radius=2.0, omega=0.7, speed_scale=0.7)
+    (flown,) = simulate(read_vehicle(ways.VEHICLE), ControllerFile(), shape, duration=20.0)
+    random, read = np.random.default_rng(0), {}
+    for name, error in (("position", 2e-4), ("attitude", 1e-3), ("body_rate", 0.01)):
+        values = flown.signals[name]
+        values = values + noise * error * random.normal(size=values.shape)
+        read[name] = Series(flown.time, making.frd(values) if name == "body_rate" else values)
+    corrected, notes = correct_frames(read, {})
+    assert [(note.code, note.names[0]) for note in notes] == [(NoteCode.FRAME_TURNED, "body_rate")]
+    again, notes = correct_frames(corrected, {})
+    assert notes == ()
+    np.testing.assert_array_equal(again["body_rate"].values, corrected["body_rate"].values)
 
 
 def test_the_weight_alone_tells_the_axes_of_an_accelerometer() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,15 @@ def test_logs_that_differ_are_named(messages, tmp_path: Path) -> None:
     _, findings = with_logged_parameters(resolve_settings(Options([str(path) for path in paths])))
     (differ,) = [finding for finding in findings if finding.code is Code.LOGS_DIFFER]
     assert differ.names == ("MC_ROLLRATE_P",)
+
+
+def test_parameters_that_change_in_a_log_are_named(messages, tmp_path: Path) -> None:
+    path = log(messages, tmp_path / "log.ulg", PARAMETERS)
+    key = b"float MC_ROLLRATE_P"
+    record = struct.pack("<HBB", len(key) + 5, ord("P"), len(key)) + key + struct.pack("<f", 0.3)
+    path.write_bytes(path.read_bytes() + record)
+    _, (_, differ) = with_logged_parameters(resolve_settings(Options([str(path)])))
+    assert (differ.code, differ.names) == (Code.LOGS_DIFFER, ("MC_ROLLRATE_P",))
 
 
 def test_parameters_that_no_controller_has_change_nothing(messages, tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from tuner.recordings.interpolation import rotate
 from tuner.recordings.loader import load_flight, read_inertial
 from tuner.recordings.matlab import MAGIC
 from tuner.recordings.notes import NoteCode, note_in_words
-from tuner.search.job_flights import read_recordings
+from tuner.search.job_flights import inlet_for, read_recordings
 from tuner.vehicle import read_vehicle, with_values
 
 COLUMNS = {
@@ -582,7 +582,7 @@ def test_a_rotor_speed_that_never_changes_is_none(value: float, tmp_path: Path) 
     flight = read(tmp_path, ways.changed({"rotor_speed_3": lambda n: 0 * n + value}))
     assert np.isnan(flight.series["rotor_speed"].values[:, 2]).all()
     (note,) = [n for n in flight.notes if n.code is NoteCode.NO_TACHOMETER]
-    assert note.names == ("2",)
+    assert note.names == ("3",)
     if not value:
         assert not read(tmp_path, ways.changed({"rotor_speed": lambda n: 0 * n})).has("rotor_speed")
 
@@ -603,7 +603,9 @@ def test_commands_of_a_rotor_that_never_change_are_not_believed(tmp_path: Path) 
     flight = read(tmp_path, ways.changed({"command_3": lambda u: 0 * u}))
     assert not flight.has("command")
     (note,) = [n for n in flight.notes if n.code is NoteCode.COMMAND_DEAD]
-    assert (note.kind, note.names) == ("warning", ("2",))
+    assert (note.kind, note.names) == ("warning", ("3",))
+    with pytest.raises(RecordingError, match="inlet: the commands of rotors 3 never change"):
+        inlet_for(flight, "actuator")
     hover = read(tmp_path, ways.changed({"command": lambda u: 0 * u + 0.5}))
     assert hover.has("command")
 
@@ -671,9 +673,26 @@ def _both(change: float, names: bool) -> str:
     return "\n".join([f"{lines[0]},drone", *rows])
 
 
+def _in_ned_from_the_ground() -> str:
+    """Return the flight after 3 s with motors off and 1 s of climb, its position in NED axes."""
+    off, climb, still = 300, 100, {"z", "ax", "ay", "vx", "vy", "vz", "wx", "wy", "wz"}
+    table = {}
+    for name, column in ways.flown().items():
+        rests = name in still or name.startswith(("command", "rotor"))
+        table[name] = np.concatenate([np.full(off, 0.0 if rests else column[0]),
+                                      np.full(climb, column[0]), column])  # fmt: skip
+    table["z"][off : off + climb] *= np.linspace(0.0, 1.0, climb)
+    table["time"] = np.arange(len(table["time"])) / ways.RATE
+    for axes in (ways.XYZ, ("vx", "vy", "vz")):
+        turned = making.ned(np.column_stack([table[axis] for axis in axes]))
+        table |= dict(zip(axes, turned.T, strict=True))
+    return ways.text(table)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
+        (_in_ned_from_the_ground, "flies only if z of its position points down, as in NED axes"),
         (lambda: _both(0.003, names=False), "at row 1402 and starts again there"),
         (lambda: _both(0.0, names=True), "2 vehicles in turn, by its 'drone': cf1, cf2"),
         (
