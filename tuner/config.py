@@ -69,6 +69,7 @@ ChannelName = Annotated[str, AfterValidator(lambda name: _require_known(name, CH
 
 
 Weight = Annotated[Number, Interval(ge=1e-6, le=1e6)]
+TimeOffset = Annotated[Number, Interval(ge=-10, le=10)] | Literal["free"]
 
 
 class Prior(Section):
@@ -203,7 +204,7 @@ class FlightSettings(Section):
 
     inlet: InletChoice | None = None
     weight: Weight = 1.0
-    time_offset: Number | Literal["free"] | None = None
+    time_offset: TimeOffset | None = None
     trajectory: TrajectorySettings | None = None
 
 
@@ -289,7 +290,7 @@ class JobFile(Section):
     channels: dict[ChannelName, Flag] = Field(default_factory=dict)
     weights: dict[ChannelName, Weight] = Field(default_factory=dict)
     inlet: InletChoice = "auto"
-    time_offset: Number | Literal["free"] = "free"
+    time_offset: TimeOffset = "free"
     search: Search = Search()
     flights: dict[str, FlightSettings] = Field(default_factory=dict)
     export: ExportSettings = ExportSettings()

@@ -201,7 +201,10 @@ def _report_internal_error(error: Exception) -> int:
 
 
 def _require_command(arguments: Sequence[str]) -> None:
-    """Refuse a first word that is neither an option nor a command."""
+    """Refuse a first word that is neither an option nor a command, and words that are empty."""
+    if any(not word or (word.startswith("--") and word.endswith("=")) for word in arguments):
+        remedy = "give each option its value: is a variable of the shell empty?"
+        raise InputError("command line", "a word is empty", remedy)
     if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         raise InputError("command line", f"no command '{arguments[0]}'", _remedy(arguments[0]))
 

@@ -271,7 +271,8 @@ def audit(
         for line in found.differences:
             screen.print(line, soft_wrap=True)
         if not found.faults and not quiet:
-            screen.print(f"{found.path.name}: no fault found, {found.mass:.4g} kg")
+            without = f" without {', '.join(found.unread)}, not read" if found.unread else ""
+            screen.print(f"{found.path.name}: no fault found, {found.mass:.4g} kg{without}")
     return 1 if found.faults else 0
 
 

@@ -76,12 +76,16 @@ class Rotor:
 
 @dataclass(frozen=True)
 class Audit:
-    """The audit of a model: its faults, and its differences from a run, a line each."""
+    """The audit of a model: its faults, and its differences from a run, a line each.
+
+    ``unread`` are the URIs of what it includes from elsewhere, whose mass is not counted.
+    """
 
     path: Path
     mass: float
     faults: tuple[str, ...]
     differences: tuple[str, ...]
+    unread: tuple[str, ...] = ()
 
 
 def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Audit:
@@ -118,7 +122,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
         faults += outside_range(parameters)
         faults += _parameter_faults(parameters, whole, rotors, speeds)
     differences = () if run is None else tuple(_differences_from(run, whole, rotors))
-    return Audit(path, whole.mass, tuple(dict.fromkeys(faults)), differences)
+    return Audit(path, whole.mass, tuple(dict.fromkeys(faults)), differences, tuple(model.included))
 
 
 def _rotors(model: Model) -> list[Rotor]:

@@ -37,6 +37,8 @@ def test_the_version_is_printed(capsys):
     ("arguments", "expected"),
     [
         (["simulat"], "no command 'simulat'; did you mean 'simulate'?"),
+        (["--flights", "x.bag", "--out", ""], "a word is empty; give each option its value"),
+        (["--flights", "x.bag", "--out="], "a word is empty; give each option its value"),
         (["lab/a.bag"], "for a fit write: tune --flights lab/a.bag"),
         (["simulate", "--trajectory", "square", "--out", "x.csv"], "no trajectory 'square'"),
         (["simulate", "--trajectory", "circle", "--rate", "fast", "--out", "x.csv"], "--rate"),

@@ -80,6 +80,7 @@ def test_paths_count_from_the_job_file_and_bare_names_are_shipped_files(tmp_path
         ("inlet: motors", "inlet is 'motors'"),
         ("search: {method: newton}", "search.method is 'newton'"),
         ("search: {starts: 0}", "search.starts is 0"),
+        ("time_offset: 12", "time_offset is 12; it should be at most 10"),
         ("search: {seed: 1.5}", "search.seed is 1.5"),
         ("flights: {a: {trajectory: {name: square}}}", "there is no trajectory 'square'"),
         ("export: {formats: [urdf]}", "unknown export format 'urdf'; did you mean 'sdf'?"),

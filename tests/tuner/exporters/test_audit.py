@@ -88,6 +88,13 @@ def test_nothing_is_found_in_a_good_model(model, capsys):
     assert "no fault found, 2.079 kg" in capsys.readouterr().out
 
 
+def test_what_is_included_from_elsewhere_is_named(tmp_path, capsys):
+    include = "<include><uri>model://gps</uri></include></model>"
+    (tmp_path / "m.sdf").write_text(CLASSIC.read_text().replace("</model>", include))
+    assert main(["audit", str(tmp_path / "m.sdf")]) == 0
+    assert "2.079 kg without model://gps, not read" in capsys.readouterr().out
+
+
 @pytest.mark.skipif(not SHIPPED.is_dir(), reason="PX4's models are not in ../shared/models")
 @pytest.mark.parametrize(
     "name",
