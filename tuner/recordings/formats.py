@@ -147,7 +147,7 @@ MAX_LINE_BYTES = 1 << 20
 MAX_PREAMBLE_LINES = 1000
 #: Byte order marks and their encodings.
 BOMS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
-COMMENT_MARKS = ("#", "%", "//")
+COMMENT_MARKS = ("#", "%", "//", "sep=")
 #: A table's rows begin within so many bytes and lines.
 MAX_PREAMBLE_BYTES = 4 * MAX_LINE_BYTES
 _NUMBER = re.compile(r"^[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?$|^[+-]?(nan|inf(inity)?)$", re.I)

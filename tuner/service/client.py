@@ -465,7 +465,7 @@ READERS: Mapping[str, Callable[[Path], Section]] = {
 """Key of a job file -> reader of a file that it names."""
 
 
-SUFFIXES = (".bag", ".mcap", ".db3", ".ulg", ".csv", ".parquet")
+SUFFIXES = (".bag", ".mcap", ".db3", ".ulg", ".csv", ".tsv", ".mat", ".parquet")
 LOOK_INTERVAL_S = 2.0
 """Between two looks into the folder."""
 Marks = tuple[int, int]

@@ -244,6 +244,7 @@ TABLES: Mapping[str, Callable[[], str | bytes]] = {
         {n: 1e3 * flown()[n] if n in ("time", *XYZ) else flown()[n] for n in POSE}
     ).replace("\n", "\n[ms],[mm],[mm],[mm],[],[],[],[]\n", 1),
     "semicolons and decimal commas": lambda: comma(pose(*POSE)),
+    "a spreadsheet's line on its separator": lambda: "sep=;\n" + comma(pose(*POSE)),
     "tabs": lambda: pose(*POSE, separator="\t"),
     "tabs and decimal commas": lambda: pose(*POSE, separator="\t").replace(".", ","),
     "blanks": lambda: "# " + pose(*POSE, separator="  "),

@@ -181,11 +181,11 @@ def test_files_that_options_name_travel_as_their_contents(table, tmp_path, updat
 
 @pytest.mark.usefixtures("server")
 def test_a_folder_s_new_recordings_become_one_job_once(client, table, tmp_path, capsys):
-    for name in ("a.csv", "b.csv"):
+    for name in ("a.csv", "b.tsv"):
         (tmp_path / name).write_bytes(table.read_bytes() + name.encode())
     arguments = ["watch-folder", str(tmp_path), "--settle", "0.1", "--once"]
     assert main(arguments) == 0
-    assert capsys.readouterr().out.startswith("a.csv, b.csv: job ")
+    assert capsys.readouterr().out.startswith("a.csv, b.tsv: job ")
     assert main(arguments) == 0
     assert capsys.readouterr().out == ""
     (tmp_path / "c.csv").write_bytes(table.read_bytes() + b"c")
