@@ -304,7 +304,7 @@ def trial_of(seed: int) -> Trial:
         *reporter.findings,
         *model_error_findings(examination.model_errors, examination.uncertainty),
         *flights_disagree(fitted, examination),
-        *term_findings(fitted, examination.uncertainty),
+        *term_findings(fitted, examination.uncertainty, selected.substitutes),
     )
     trial = Trial(lab, found, free, {}, seconds, reference, said)
     volts = _voltages(selected.job.fitted, fitted.objective.schedule)

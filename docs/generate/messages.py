@@ -117,7 +117,8 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.TERM_SHOWS: "A term that was found says something of the vehicle or its files: thrust "
     "grows with another power of the rotor speed than the second, motors have a second lag, gains "
     "or filters are not those of the controller file, the autopilot sits askew, its gyro's scale "
-    "is off, or rotor speeds were filtered. The line says by how much, and what to compare.",
+    "is off, or rotor speeds were filtered. The line says by how much, what to compare, and which "
+    "other term the flights do not tell from it.",
     Code.ROTOR_CHANGED: "From some time of this flight a rotor gives less, or more, thrust at the "
     "same speed than before: the flight is used up to there. Look at its propeller, motor and "
     "mount before you fly again.",

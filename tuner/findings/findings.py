@@ -377,8 +377,8 @@ class Code(Worded):
         "Look at its propeller, motor and mount before you fly again.",
     )
     TERM_SHOWS = (
-        "term_shows",  # NAME, NAME_error; names: NAMEs; the subject is their group
-        lambda finding: sentences.TERM_SENTENCES[finding.subject][0](finding.numbers),
+        "term_shows",  # NAME, NAME_error; OTHER; names: NAMEs; the subject is their group
+        sentences.term_shows,
         lambda finding: sentences.TERM_SENTENCES[finding.subject][1],
     )
     INPUT_LATE = (

@@ -357,6 +357,16 @@ def _milliseconds(numbers: Numbers, name: str) -> str:
     return f"{with_error(1e3 * abs(numbers[name]), 1e3 * numbers[f'{name}_error'])} ms"
 
 
+def term_shows(finding: Finding) -> str:
+    """Return what a term says, and what may act in its place."""
+    sentence = TERM_SENTENCES[finding.subject][0](finding.numbers)
+    own = (*finding.names, *(f"{name}_error" for name in finding.names))
+    others = [f"{name} = {v:.3g}" for name, v in finding.numbers.items() if name not in own]
+    if not others:
+        return sentence
+    return f"{sentence} Or it does not, and {listed(others)}: these flights do not tell which."
+
+
 TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
     "thrust_exponent": (
         _thrust_exponent,

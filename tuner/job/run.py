@@ -252,7 +252,7 @@ class _Run:
                 *finer_than_steps(uncertainty),
                 *model_error_findings(examination.model_errors, uncertainty),
                 *flights_disagree(fitted, examination),
-                *term_findings(fitted, uncertainty),
+                *term_findings(fitted, uncertainty, selected.substitutes),
             )
         )
         find = partial(sources_of, fitted, uncertainty, examination.known)

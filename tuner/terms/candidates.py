@@ -9,9 +9,10 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import expit
 
 from tuner.config import JobFile
-from tuner.core.numerics import Array, scaled_solve, symmetric_eigen
+from tuner.core.numerics import Z95, Array, scaled_solve, symmetric_eigen
 from tuner.objective.criterion import Point
 from tuner.objective.inlets import bypassed_by
 from tuner.objective.normal_equations import Objective, with_conditions
@@ -20,7 +21,7 @@ from tuner.search.continuation import RIDGE
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted, loop_of, with_loop
 from tuner.terms.linearisation import Columns, LinearisedLoss
-from tuner.terms.score import ACCEPTED
+from tuner.terms.score import ACCEPTED, long_run_covariance
 from tuner.uncertainty.covariance import STRETCH_S, overdispersion_factors, scatter
 from tuner.vehicle import COEFFICIENTS, condition_rows, term_groups, values_of
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
@@ -198,6 +199,9 @@ class Selected:
         Job and fit without any term; None if none was tried.
     refuted
         Whether the flights contradict the fit: neither terms nor disturbances explain them.
+    substitutes
+        Kept group -> values of coefficients that were left out and that flights do not exclude in
+        its place.
     """
 
     job: Job
@@ -206,6 +210,7 @@ class Selected:
     selection_shifts: Mapping[str, float] = field(default_factory=dict)
     base: tuple[Job, Fitted] | None = None
     refuted: bool = False
+    substitutes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 
     @property
     def kept(self) -> tuple[str, ...]:
@@ -244,7 +249,10 @@ is rounding, and the prior decides."""
 
 
 def selection_shifts(
-    linear: LinearisedLoss, model: Columns, groups: Iterable[tuple[Columns, float]]
+    linear: LinearisedLoss,
+    model: Columns,
+    groups: Iterable[tuple[Columns, float]],
+    substitutes: Iterable[Substitute] = (),
 ) -> Array:
     """Return the root mean square shift of each parameter (P,) of the model by omitted groups.
 
@@ -252,7 +260,9 @@ def selection_shifts(
     normal about their neutral values with a log-uniform size, from negligible to usual. Models
     without the group and with it in each size are averaged by their posterior probabilities. So an
     insignificant term adds little however far a refit would move, and one that is likely but not
-    significant adds its full shift. The mean squares of all groups add up.
+    significant adds its full shift. A group in place of one in the model (`substitutes_of`) adds
+    its shift by its probability, and so much that the interval holds it where flights do not
+    exclude it. The mean squares of all groups add up.
 
     Parameters
     ----------
@@ -262,6 +272,8 @@ def selection_shifts(
         Columns of the model's parameters.
     groups
         Columns of each omitted group, and the prior probability that the vehicle has it.
+    substitutes
+        Omitted groups that may be there in place of one in the model.
 
     Notes
     -----
@@ -280,7 +292,90 @@ def selection_shifts(
     for group, presence in groups:
         evidence = Evidence.of(linear, square, alone, model, linear.seen(group))
         squares[model] += evidence.mean_square(presence)
+    for one in substitutes:
+        share = max(one.probability, Z95**-2 if one.is_not_excluded else 0.0)
+        squares[model] += share * one.change[model] ** 2
     return np.asarray(np.sqrt(squares))
+
+
+MAX_CHANCE = 0.05
+"""Probability below which flights exclude a group in place of another."""
+
+
+@dataclass(frozen=True)
+class Substitute:
+    """A fit with an omitted group in place of a group in the model, to first order.
+
+    Attributes
+    ----------
+    kept
+        The group in the model.
+    values
+        Coefficient of the omitted group -> its value in that fit.
+    change
+        (P,) change from the model's minimum to that fit's.
+    probability
+        Of that fit, if one of the two is true and both are equally likely a priori.
+    """
+
+    kept: str
+    values: Mapping[str, float]
+    change: Array
+    probability: float
+
+    @property
+    def is_not_excluded(self) -> bool:
+        """Whether flights leave it possible."""
+        return self.probability > MAX_CHANCE
+
+
+def substitutes_of(
+    linear: LinearisedLoss,
+    model: Columns,
+    kept: Mapping[str, Columns],
+    left_out: Iterable[Columns],
+) -> list[Substitute]:
+    """Return the fits with each omitted group in place of each kept one.
+
+    Notes
+    -----
+    The likelihood ratio of two models that are not nested (Cox, "Tests of separate families of
+    hypotheses", 1961). Errors that are correlated in time scatter the scores of stretches more
+    than noise would along the change from one minimum to the other, and the logarithm of the ratio
+    is divided by that factor.
+    """
+
+    def loss(change: Array) -> float:
+        prior = (linear.pull + 0.5 * linear.prior @ change) @ change
+        return float(linear.change_of_loss(change).sum() + prior)
+
+    alone, square = linear.step(model), linear.information()
+    scores, before, found = linear.gradients(alone), loss(alone), list[Substitute]()
+    outside = list(left_out)
+    for group, own in kept.items():
+        without, rest = linear.to_neutral(own), np.setdiff1d(model, own)
+        for columns in outside:
+            there = linear.step(np.append(rest, linear.seen(columns)), from_=without)
+            change = there - alone
+            spread = float(long_run_covariance((scores @ change)[:, None], linear.flight)[0, 0])
+            excess = max(spread / max(float(change @ square @ change), 1e-300), 1.0)
+            probability = float(expit((before - loss(there)) / excess))
+            values = {
+                row.name: float(np.exp(scaled) if row.scale == "log" else scaled)
+                for column, scaled in zip(columns, (linear.scaled + there)[columns], strict=True)
+                if (row := COEFFICIENTS.get(linear.names[column])) is not None
+            }
+            found.append(Substitute(group, values, change, probability))
+    return found
+
+
+def values_instead(substitutes: Iterable[Substitute]) -> dict[str, dict[str, float]]:
+    """Return kept group -> values of coefficients that flights do not exclude in its place."""
+    found: dict[str, dict[str, float]] = {}
+    for one in substitutes:
+        if one.is_not_excluded:
+            found.setdefault(one.kept, {}).update(one.values)
+    return found
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,8 @@ from tuner.terms.candidates import (
     names_of,
     prior_presence_of,
     selection_shifts,
+    substitutes_of,
+    values_instead,
     with_free,
     with_groups,
 )
@@ -157,11 +159,12 @@ def with_disturbances(
     )
     alternatives = alternatives_of(again.objective, again.point, job.fitted)
     model_errors = _without_contradicted_lag(model_errors_of(again, job.fitted), seen)
+    doubted = seen.with_model_error(model_errors, predictor).with_doubts()
     examination = examine(
         again,
         alternatives=alternatives,
         predictor=predictor,
-        selection_shifts=seen.with_model_error(model_errors, predictor).selection_shifts(),
+        selection_shifts=doubted.selection_shifts,
         model_errors=model_errors,
     )
     if seen.selected is not simulated:
@@ -187,7 +190,7 @@ def with_disturbances(
         if not agree:
             on_message("It contradicts the fit of the simulated flights, which is kept.")
         better = agree and _is_sharper(examination.uncertainty, before.uncertainty)
-    return (replace(seen.selected, fitted=again), examination) if better else None
+    return (replace(doubted, fitted=again), examination) if better else None
 
 
 def _without_contradicted_lag(
@@ -398,23 +401,31 @@ class LinearisedInnovations:
             return self
         return LinearisedInnovations.of(self.selected, self.fitted, predictor, model_errors)
 
-    def selection_shifts(self) -> dict[str, float]:
-        """Return by how much omitted terms would shift each coefficient.
+    def with_doubts(self) -> Selected:
+        """Return the terms with the shifts by omitted ones, and with those that may act instead.
 
         The shifts of coefficients that set-points hide are those of least squares.
         """
-        left_out = groups_left_out(self.selected)
-        groups = [
+        outside = [
             (columns, prior_presence_of(names))
-            for names in left_out.values()
+            for names in groups_left_out(self.selected).values()
             if len(columns := self._columns(names))
         ]
-        if not groups:
-            return dict(self.selected.selection_shifts)
+        if not outside:
+            return self.selected
         model = self._model(self.fitted.objective.space.names)
-        moves = selection_shifts(self.linear, model, groups)
+        kept = {
+            row.group: columns
+            for row in self.selected.rows
+            if row.kept and row.reason in ACCEPTED and len(columns := self._columns(row.names))
+        }
+        substitutes = substitutes_of(self.linear, model, kept, (columns for columns, _ in outside))
+        moves = selection_shifts(self.linear, model, outside, substitutes)
         own = {self.space.names[i]: float(moves[i]) for i in model}
-        return {**self.selected.selection_shifts, **own}
+        shifts = {**self.selected.selection_shifts, **own}
+        return replace(
+            self.selected, selection_shifts=shifts, substitutes=values_instead(substitutes)
+        )
 
     def contradicts(self, name: str, value: float) -> bool:
         """Return whether the innovations contradict a value of an omitted coefficient."""

@@ -56,6 +56,8 @@ from tuner.terms.candidates import (
     offsets_of,
     prior_presence_of,
     selection_shifts,
+    substitutes_of,
+    values_instead,
     with_groups,
     with_terms,
 )
@@ -118,24 +120,25 @@ class Selection:
             state = grown
         base, rows = (self.job, self.fitted), self._rows(state, dropped)
         selected = Selected(*base, rows, base=base)
-        doubt = self._selection_shifts(state, selected.left_out)
+        selected = self._with_doubts(state, selected)
         if state.added:
             fitted = self._fitted(state, state.added, roughly=False)
             job, fitted = with_groups(base, state.added, fitted)
             selected = replace(selected, job=job, fitted=fitted)
-        return replace(selected, selection_shifts=doubt)
+        return selected
 
-    def _selection_shifts(
-        self, state: LinearisedFit, groups: Sequence[Sequence[str]]
-    ) -> dict[str, float]:
-        """Return the shift of each coefficient of the model by omitted groups."""
+    def _with_doubts(self, state: LinearisedFit, selected: Selected) -> Selected:
+        """Return the terms with the shifts by omitted ones, and with those that may act instead."""
         names = [*self.job.space.names, *names_of(state.added)]
-        linear = state.linear
-        outside = [(linear.columns_of(group), prior_presence_of(group)) for group in groups]
-        moves = selection_shifts(linear, linear.columns_of(names), outside)
+        linear, model = state.linear, state.linear.columns_of(names)
+        kept = {group: linear.columns_of(own) for group, own in state.added.items()}
+        outside = [(linear.columns_of(own), prior_presence_of(own)) for own in selected.left_out]
+        substitutes = substitutes_of(linear, model, kept, (columns for columns, _ in outside))
+        moves = selection_shifts(linear, model, outside, substitutes)
         coefficients = [name for name in names if name not in conditions_of(self.candidates)]
         own = linear.columns_of(coefficients)
-        return dict(zip(coefficients, moves[own].tolist(), strict=True))
+        shifts = dict(zip(coefficients, moves[own].tolist(), strict=True))
+        return replace(selected, selection_shifts=shifts, substitutes=values_instead(substitutes))
 
     def _worth_fitting(self, state: LinearisedFit, dropped: Reasons) -> dict[str, Score]:
         """Return the groups with a significant gain in the fit, whether they predict or not."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -336,10 +337,15 @@ SHAPES = ("tachometer_memory",)
 """Coefficients of these that tell how an effect acts, not whether there is one."""
 
 
-def term_findings(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ...]:
+def term_findings(
+    fitted: Fitted,
+    uncertainty: Uncertainty,
+    substitutes: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
+) -> tuple[Finding, ...]:
     """Return the findings on reported terms that differ significantly from neutral.
 
-    Each names those coefficients of its group that the flights identify.
+    Each names those coefficients of its group that the flights identify. Where flights do not
+    exclude others in its place (``substitutes``), their values are among its numbers.
     """
     findings = []
     for group in REPORTED_TERMS:
@@ -351,8 +357,12 @@ def term_findings(fitted: Fitted, uncertainty: Uncertainty) -> tuple[Finding, ..
             and estimate.identifiable
         }
         neutral = {name: COEFFICIENTS[name].neutral or 0.0 for name in identified}
-        if any(not e.ci95[0] <= neutral[name] <= e.ci95[1] for name, e in identified.items()):
+        instead = substitutes.get(group, {})
+        if any(
+            instead or not e.ci95[0] <= neutral[name] <= e.ci95[1] for name, e in identified.items()
+        ):
             numbers = {name: estimate.value for name, estimate in identified.items()}
+            numbers |= instead
             numbers |= {
                 f"{name}_error": estimate.std_error for name, estimate in identified.items()
             }

@@ -12,6 +12,7 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.config import JobFile
+from tuner.core.numerics import Z95
 from tuner.objective.information import FisherInformation
 from tuner.objective.space import Space, extended, space_of
 from tuner.search.problem import Job
@@ -100,7 +101,7 @@ def seen(
     )
     base = (NOBODY, NOBODY)
     selected = Selected(cast(Job, NOBODY), fitted, tuple(rows), selection_shifts or {}, base)
-    linear = linearised_from(said, scaled, scaled, loss)
+    linear = linearised_from(said, scaled, scaled, loss, names=space.names)
     return LinearisedInnovations(selected, fitted, space, vector, linear)
 
 
@@ -308,10 +309,30 @@ def test_shifts_by_omitted_terms_follow_from_innovations(alike: bool) -> None:
     before = {"inertia_xx": 9.0, "estimate_latency": 7.0}
     found = seen(
         [DRAG], {}, {"fuselage_drag": "inertia_xx"} if alike else {}, selection_shifts=before
-    ).selection_shifts()
-    assert found["estimate_latency"] == 7.0
-    assert (found["inertia_xx"] < 2e-3) != alike
-    assert found["inertia_xx"] < 9.0
+    )
+    shifts = found.with_doubts().selection_shifts
+    assert shifts["estimate_latency"] == 7.0
+    assert (shifts["inertia_xx"] < 2e-3) != alike
+    assert shifts["inertia_xx"] < 9.0
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_an_interval_holds_that_an_omitted_term_acts_in_place_of_a_kept_one(
+    monkeypatch, alike: bool
+) -> None:
+    """Where flights do not tell the two apart; else it is as narrow as it was."""
+    monkeypatch.setattr(f"{__name__}.TOLD", 0.3)
+    names, size = ("gyro_cutoff_factor", "derivative_cutoff_factor"), 0.28
+    gyro, other = (row(n, SelectionCode.SIGNIFICANT) for n in ("gyro_filter", "derivative_filter"))
+    there = fitted_at({names[0]: size}, [gyro], [other], dict([names]) if alike else {})
+    found = there.with_doubts()
+    shift = found.selection_shifts[names[0]]
+    if alike:
+        assert found.substitutes == {"gyro_filter": {names[1]: pytest.approx(1.2, abs=0.1)}}
+        assert Z95 * shift > size
+    else:
+        assert not found.substitutes
+        assert shift < 0.1 * size
 
 
 @dataclass(frozen=True)
@@ -342,9 +363,11 @@ def test_terms_are_judged_with_model_errors_acting(monkeypatch) -> None:
     said = LinearisedInnovations.of(plain.selected, fitted, cast(Any, there))
 
     def doubt(model_errors: Any) -> float:
-        return said.with_model_error(model_errors, cast(Any, there)).selection_shifts()[
-            "inertia_xx"
-        ]
+        return (
+            said.with_model_error(model_errors, cast(Any, there))
+            .with_doubts()
+            .selection_shifts["inertia_xx"]
+        )
 
     assert doubt(model_errors) > 10.0 * doubt(None) > 0.0
 
@@ -369,4 +392,4 @@ def test_a_steady_wind_is_a_disturbance_like_others() -> None:
     space = wide_space(())
     innovation = seen([DRAG], {}, selection_shifts={"inertia_xx": 9.0})
     alone = replace(innovation, selected=replace(innovation.selected, rows=(wind,)), space=space)
-    assert alone.selection_shifts() == {"inertia_xx": 9.0}
+    assert alone.with_doubts().selection_shifts == {"inertia_xx": 9.0}

@@ -210,7 +210,7 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
             selection=lambda *_, **__: next(chosen),
             contradicts=lambda *_: True,
             with_model_error=lambda model_errors, _: SimpleNamespace(
-                selection_shifts=lambda: {"acting": model_errors}
+                with_doubts=lambda: replace(selected, selection_shifts={"acting": model_errors})
             ),
         )
 

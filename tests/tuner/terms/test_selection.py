@@ -160,7 +160,7 @@ def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
     monkeypatch.setattr(own, "_with_all", lambda *_: searched.append(True))
     monkeypatch.setattr(own, "_with_added", lambda *_: standing)
     monkeypatch.setattr(own, "_rows", lambda *_: ())
-    monkeypatch.setattr(own, "_selection_shifts", lambda *_: {})
+    monkeypatch.setattr(own, "_with_doubts", lambda *given: given[-1])
     monkeypatch.setattr(selection, "with_groups", lambda base, *_, **__: base)
     groups = {"fuselage_drag": ("fuselage_drag",)}
     own(SimpleNamespace(), fitted, groups, Reporter()).run()
@@ -180,7 +180,7 @@ def test_eliminated_groups_are_not_tried_again(monkeypatch):
         own, "_with_added", lambda _, __, groups, ___: wanted.extend(groups) or standing
     )
     monkeypatch.setattr(own, "_rows", lambda _, __, dropped: rows.extend(dropped) or ())
-    monkeypatch.setattr(own, "_selection_shifts", lambda *_: {})
+    monkeypatch.setattr(own, "_with_doubts", lambda *given: given[-1])
     groups = {"fuselage_drag": ("fuselage_drag",), "linear_drag": ("linear_drag_x",)}
     own(SimpleNamespace(), fitted, groups, Reporter()).run()
     assert wanted == ["linear_drag"]

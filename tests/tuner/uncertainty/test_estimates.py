@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
+from tuner.findings.findings import sentence
 from tuner.objective.criterion import Point
 from tuner.objective.information import information_at
 from tuner.objective.normal_equations import Objective, normal_equations
@@ -155,6 +156,20 @@ def test_rotor_time_constants_and_command_delays_are_lags_and_the_estimates_late
     assert by_name["time_constant_up"] == pytest.approx(1.0 / float(moved["time_constant_up"]))
     assert by_name["actuator_latency"] == 1.0
     assert by_name["estimate_latency"] == by_name["inertia_xx"] == 0.0
+
+
+def test_a_term_that_another_may_replace_is_said_with_it_though_its_interval_holds_neutral():
+    wide = SimpleNamespace(value=1.1, std_error=0.06, ci95=(0.98, 1.22), identifiable=True)
+    fitted, known = (
+        SimpleNamespace(held={}),
+        SimpleNamespace(estimates={"gyro_cutoff_factor": wide}),
+    )
+    assert not term_findings(fitted, known)
+    other = {"gyro_filter": {"derivative_cutoff_factor": 1.5}}
+    (found,) = term_findings(fitted, known, other)
+    assert (found.subject, found.names) == ("gyro_filter", ("gyro_cutoff_factor",))
+    assert found.numbers["derivative_cutoff_factor"] == 1.5
+    assert "Or it does not, and derivative_cutoff_factor = 1.5:" in sentence(found)
 
 
 def test_terms_that_flights_do_not_identify_have_no_number_in_findings():
