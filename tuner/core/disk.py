@@ -191,6 +191,7 @@ _REFUSALS = {
     errno.EROFS: ("the file system is read-only", "name a place that can be written to"),
     errno.ENOSPC: ("the disk is full", "free some space and try again"),
     errno.EDQUOT: ("the disk quota is used up", "free some space and try again"),
+    errno.EFBIG: ("it is larger than this user may write", "raise ulimit -f and try again"),
     errno.ENAMETOOLONG: ("the path is too long", "give a shorter one"),
     errno.ENOTDIR: ("it lies inside a file", "name a place in a folder"),
     errno.EEXIST: ("it is a file", "name a folder"),

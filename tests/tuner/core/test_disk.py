@@ -31,21 +31,21 @@ from tuner.core.files import csv_text, read_arrays
 from tuner.core.shipped import configs_folder, find_config
 
 
-@pytest.fixture
-def full(monkeypatch):
-    """A disk on which nothing more fits."""
-
+@pytest.mark.parametrize(
+    ("refusal", "words"),
+    [
+        (errno.ENOSPC, r"x\.csv: cannot be written: the disk is full; free"),
+        (errno.EFBIG, r"x\.csv: cannot be written: it is larger than this user may write; raise"),
+    ],
+)
+def test_a_full_disk_is_one_line_and_what_stood_there_stays(refusal, words, tmp_path, monkeypatch):
     def refuse(*_, **__):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        raise OSError(refusal, os.strerror(refusal))
 
-    monkeypatch.setattr("pathlib.Path.write_text", refuse)
-
-
-@pytest.mark.usefixtures("full")
-def test_a_full_disk_is_one_line_and_what_stood_there_stays(tmp_path):
     path = tmp_path / "x.csv"
     path.write_bytes(b"before")
-    with pytest.raises(OutputError, match=r"x\.csv: cannot be written: the disk is full; free"):
+    monkeypatch.setattr("pathlib.Path.write_text", refuse)
+    with pytest.raises(OutputError, match=words):
         write_text(path, "after")
     assert path.read_bytes() == b"before"
     assert [file.name for file in tmp_path.iterdir()] == ["x.csv"]
