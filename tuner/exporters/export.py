@@ -63,7 +63,7 @@ RUN_CONDITIONS = (
     "every trajectory of the run is flown without a crash",
     "the exported numbers fly as the run says",
     "no flight that checks the run is worse than before",
-    "no coefficient sits on a bound",
+    "no coefficient that flights tell sits on a bound",
 )
 
 

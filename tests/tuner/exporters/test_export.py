@@ -12,6 +12,7 @@ from tuner.core.errors import ExportError, InputError, OutputError
 from tuner.exporters import export as exporting
 from tuner.exporters.effective import Effective
 from tuner.exporters.export import (
+    RUN_CONDITIONS,
     check,
     export,
     export_formats_of_job,
@@ -223,6 +224,7 @@ def test_a_coefficient_on_its_bound_that_moves_nothing_is_named(make_run, best, 
     run = make_run(coefficients={"actuator_latency": row})
     objections = check(run, run.vehicle, as_the_run_says)[-1].objections
     assert objections == (("actuator_latency 0.04 is its upper bound",) if refused else ())
+    assert RUN_CONDITIONS[-1] == "no coefficient that flights tell sits on a bound"
     (note,) = exported_vehicle(run, TODAY)[1]
     assert note.startswith(f"actuator_latency = {best:g} is")
     assert note.endswith(f"; it lies at its {side} bound")
