@@ -30,7 +30,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.state import State
 from sim_jax.terms import total
 from tuner.disturbances.covariance import Samples, Sparse, at, innovations_of, propagated
-from tuner.disturbances.disturbances import PROCESSES
+from tuner.disturbances.disturbances import PROCESSES, SLOW
 from tuner.disturbances.observer import (
     AssumedModel,
     FilterInput,
@@ -47,6 +47,8 @@ GATE_GROWTH = 4.0
 """Factor on the gate for each outlier in a row."""
 MAX_GATE_STEPS = 5
 """Outliers in a row after which the gate stays the same."""
+MIN_VARIANCE = 1e-12
+"""Least variance of a gust, (m/s)²: a thrust's mean over none has no slope at rest."""
 
 
 def gate_innovations(white: Array, beyond: Array) -> tuple[Array, Array]:
@@ -86,6 +88,8 @@ class Gains(eqx.Module):
         where nothing was sampled.
     factors
         (F, T, m, m) L, lower triangular.
+    draught
+        (F, T) m/s, standard error of the gusts upwards, as the filter estimates them.
     rate
         Hz of the filter's physics steps. With finer steps there are more commands in flight: the
         correction of each is repeated for those of its time.
@@ -93,11 +97,13 @@ class Gains(eqx.Module):
 
     gain: Float[AnyArray, "F T m n"]
     factors: Float[AnyArray, "F T m m"]
+    draught: Float[AnyArray, "F T"]
     rate: int = eqx.field(static=True)
 
     def of_flights(self, flights: NDArray[np.intp]) -> Gains:
         """Return those of some flights."""
-        return replace(self, gain=self.gain[flights], factors=self.factors[flights])
+        own = {name: getattr(self, name)[flights] for name in ("gain", "factors", "draught")}
+        return replace(self, **own)
 
 
 class Filtered(eqx.Module):
@@ -167,10 +173,10 @@ def filtered(
         effect: with the same number in flight, one program serves all filters.
     """
     short, in_flight = _shortly_delayed(_undelayed(schedule), assumed, latency)
-    wanted = (*[True] * 3, *[gains] * 2)
-    *rows, gain, factors = _run((short, in_flight), _given(inputs, assumed), wanted).values
+    wanted = (*[True] * 3, *[gains] * 3)
+    *rows, gain, factors, draught = _run((short, in_flight), _given(inputs, assumed), wanted).values
     white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)
-    kept = Gains(gain, factors, schedule.physics_rate) if gains else None
+    kept = Gains(gain, factors, draught, schedule.physics_rate) if gains else None
     return Filtered(white, root, loss, kept)
 
 
@@ -286,13 +292,14 @@ def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Arra
 
 
 def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[str, int]) -> Any:
-    """Filter one segment: white, root and loss of `Filtered`, gains and factors of `Gains`."""
+    """Filter one segment: white, root and loss of `Filtered`, then the arrays of `Gains`."""
     observer, first = Observer.of(schedule, given.inputs, given.assumed)
     processes = observer.processes
     first_sd = jnp.asarray(first_errors(first, in_flight))
     size, wide = len(first_sd) + PROCESSES, len(given.assumed.noise)
     shown = len(first_errors(first, 0))  # to samples: commands on their way are not, nor pushes
     process_noise = jnp.concatenate([jnp.zeros(size - PROCESSES), processes.added])
+    gust = size - PROCESSES + SLOW.index("gust_z")
 
     def tick(carried: Any, number: Array) -> Any:
         state, pushed, matrices, before, beyond = carried
@@ -310,6 +317,7 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
         samples = Samples(
             jnp.concatenate(error), variance, Sparse.of(changes, shown), *_sampled(given, number)
         )
+        draught = jnp.sqrt(jnp.maximum(covariance[gust, gust], MIN_VARIANCE))
         update = innovations_of(covariance, gain, samples)
         white, factors = update.white, update.factors
         root = jnp.stack([factors[i, i] for i in range(wide)])
@@ -322,7 +330,7 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
 
         def advance(change: Array) -> tuple[Array, State]:
             moved = observer.corrected(state, change[:-PROCESSES], number, in_flight)
-            after = observer.next(moved, pushed + change[-PROCESSES:], number)
+            after = observer.next(moved, pushed + change[-PROCESSES:], number, draught)
             numbers = observer.numbers(after, number + 1, in_flight)
             return jnp.concatenate([numbers, processes.retention * change[-PROCESSES:]]), after
 
@@ -339,7 +347,7 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
         gains = update.gain.astype(jnp.float32)
         matrices = covariance, update.gain, scratch
         carried = after, pushed * processes.retention, matrices, before, beyond
-        return carried, (white, root, loss, gains, factors.astype(jnp.float32))
+        return carried, (white, root, loss, gains, factors.astype(jnp.float32), draught)
 
     sd = jnp.concatenate([first_sd, processes.sd])
     diagonal = jnp.arange(size)[:, None] == jnp.arange(size)
@@ -362,7 +370,7 @@ def _innovations(
     """
     assert given.gains is not None
     observer, first = Observer.of(schedule, given.inputs, given.assumed)
-    gains, factors = given.gains.gain, given.gains.factors
+    gains, factors, draughts = given.gains.gain, given.gains.factors, given.gains.draught
     wide, size = gains.shape[1:]
     in_flight, finer = commands_in_flight(first, size - PROCESSES), 1
     if in_flight:
@@ -404,7 +412,7 @@ def _innovations(
         state = observer.corrected(state, change[:-PROCESSES], number, in_flight * finer)
         pushed = pushed + change[-PROCESSES:]
         before = observer.outputs(state, number)
-        after = observer.next(state, pushed, number)
+        after = observer.next(state, pushed, number, row_of(draughts, number))
         carried = after, pushed * observer.processes.retention, before, beyond
         return carried, (white, white.astype(jnp.float32))
 

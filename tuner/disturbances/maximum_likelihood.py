@@ -107,7 +107,7 @@ def _loss(predictor: Predictor, objective: Objective, point: Point, criterion: C
 
 
 class _Equations(NamedTuple):
-    """Gradient (P + 7,) and Hessian of the loss, by P parameters and then by the strengths."""
+    """Gradient (P + 8,) and Hessian of the loss, by P parameters and then by the strengths."""
 
     gradient: Array
     hessian: Array

@@ -22,7 +22,7 @@ from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroMemory
 from sim_jax.state import AIRBORNE, State
-from tuner.disturbances.disturbances import Processes, disturbance_of, processes_of
+from tuner.disturbances.disturbances import Processes, processes_of
 from tuner.disturbances.ticks import TickSamples
 from tuner.objective.criterion import OFFSET_UNIT, AnyArray, units_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
@@ -73,14 +73,14 @@ class AssumedModel(eqx.Module):
     coefficients
         Name -> value of every coefficient; replaces the model's.
     strengths
-        (7, F) of the disturbances, each segment's own.
+        (8, F) of the disturbances, each segment's own.
     noise
         (m, F) factors on the standard deviations of the samples.
     """
 
     model: Model
     coefficients: dict[str, AnyArray]
-    strengths: Float[AnyArray, "7 F"]
+    strengths: Float[AnyArray, "8 F"]
     noise: Float[AnyArray, "m F"]
 
 
@@ -168,16 +168,19 @@ class Observer(eqx.Module):
         schedule = self.plant.schedule
         return tick * round(schedule.physics_rate / schedule.log_rate)
 
-    def next(self, state: State, pushed: Array, tick: Array) -> State:
-        """Return the state a tick later, with disturbances of values (D, *F)."""
-        acting = disturbance_of((self.processes.acts * pushed.T).T)
+    def next(self, state: State, pushed: Array, tick: Array, draught: Array) -> State:
+        """Return the state a tick later, with disturbances of values (D, *F).
+
+        ``draught`` (*F) is the standard error of the estimated gusts upwards, in m/s.
+        """
+        acting = self.processes.disturbance(pushed)
         if self.plant.environment.disturbance is not None:
             known: Disturbance = row_of(self.plant.environment.disturbance, tick)
             acting = acting.plus(known)
         environment = eqx.tree_at(
             lambda e: (e.disturbance, e.draught),
             self.plant.environment,
-            (acting, self.processes.draught),
+            (acting, draught),
             is_leaf=lambda leaf: leaf is None,
         )
         plant = eqx.tree_at(lambda p: p.environment, self.plant, environment)

@@ -54,10 +54,10 @@ PARAMETERS_AT_ONCE = 16
 MAX_OUTLIER_SHARE = 0.05
 """Share of a channel's innovations beyond the gate above which the filter has lost a flight."""
 STRENGTHS_FROM_S = 18.0
-"""Part of each flight that strengths are estimated from: each of the seven takes another filter."""
+"""Part of each flight that strengths are estimated from: each of the eight takes another filter."""
 SEGMENTS_AT_ONCE = 8
 """Segments filtered side by side for derivatives by the strengths."""
-STATE_SIZE = 65
+STATE_SIZE = 66
 """Numbers of state and disturbances that samples correct, with four commands in flight, a second
 lag of motors and the lag of tachometers: for an estimate of memory."""
 MIN_LIKELIHOOD_GAIN = 0.5 * 3.0**2
@@ -85,7 +85,7 @@ class Predictor:
     rows
         Channel -> (n, F) the tick of each sample, -1 for one that is not used.
     strengths
-        (7,) of the disturbances, and of the noise of commands.
+        (8,) of the disturbances, and of the noise of commands.
     noise
         Channel -> factor on the samples' standard deviations.
     computed
@@ -183,7 +183,7 @@ class Predictor:
         return Slopes(slope / share, information / share, ticks, sizes / share)
 
     def coupling(self, objective: Objective, point: Point, sizes: Array) -> Array:
-        """Return (7, P) what the sizes of innovations say of strengths and coefficients together.
+        """Return (8, P) what the sizes of innovations say of strengths and coefficients together.
 
         Strengths are forces and moments; innovations show the accelerations, by mass and moments
         of inertia. So an error of these makes an error of the strengths.
@@ -209,7 +209,7 @@ class Predictor:
     def _with_strengths(
         self, objective: Objective, point: Point, strengths: Array, ticks: int
     ) -> Iterator[Filtered]:
-        """Yield the filter's results for the first ticks with each column of strengths (7, n).
+        """Yield the filter's results for the first ticks with each column of strengths (8, n).
 
         Filters run side by side as far as they fill a kernel's block of segments.
         """
@@ -320,7 +320,7 @@ class Predictor:
     def _assumed(
         self, objective: Objective, point: Point, strengths: Array | None = None
     ) -> AssumedModel:
-        """Return the model at a point with strengths (7, segments), or the flights' own."""
+        """Return the model at a point with strengths (8, segments), or the flights' own."""
         if strengths is None:
             strengths = np.tile(self.strengths[:, None], self.inputs.offsets.shape[-1])
         widths, shape = self.inputs.widths, strengths.shape[1:]
@@ -474,13 +474,13 @@ class Slopes(NamedTuple):
     Attributes
     ----------
     slope
-        (7,) gradient.
+        (8,) gradient.
     information
-        (7, 7) Fisher information.
+        (8, 8) Fisher information.
     moved
-        (7, T, m, F) derivatives of the innovations in units of their standard deviations.
+        (8, T, m, F) derivatives of the innovations in units of their standard deviations.
     sizes
-        (7, t, m, F) those of the logarithms of these standard deviations, times √2, in the ticks
+        (8, t, m, F) those of the logarithms of these standard deviations, times √2, in the ticks
         that strengths are estimated from.
     """
 
@@ -496,7 +496,7 @@ def change_of_size(here: Filtered, there: Filtered, step: float) -> Array:
 
 
 def difference_steps(strengths: Array) -> Array:
-    """Return the finite-difference steps (7,) of the strengths' logarithms, inside the bounds."""
+    """Return the finite-difference steps (8,) of the strengths' logarithms, inside the bounds."""
     return np.where(strengths + STEP <= MAX_STRENGTHS, STEP, -STEP)
 
 
@@ -510,7 +510,7 @@ def slopes_of(here: Filtered, beside: Iterable[Filtered], steps: Array) -> Slope
     beside
         The results with each of them a step away.
     steps
-        (7,) see `difference_steps`.
+        (8,) see `difference_steps`.
     """
     moves, spreads = np.zeros((2, len(steps), *here.white.shape))
     slope, loss = np.zeros(len(steps)), float(np.sum(here.loss))
@@ -600,11 +600,11 @@ def with_strengths(
     information
         With the strengths among its changes.
     of_strengths
-        (7, 7) B, the innovations' covariance included.
+        (8, 8) B, the innovations' covariance included.
     strengths
-        (7,) logarithms: one at its bound is fixed.
+        (8,) logarithms: one at its bound is fixed.
     coupling, fitted
-        C (7, P), and how many of the P coefficients, the first, were fitted.
+        C (8, P), and how many of the P coefficients, the first, were fitted.
     """
     learnt = np.flatnonzero((strengths > MIN_STRENGTHS) & (strengths < MAX_STRENGTHS))
     changes = dict(information.changes)

@@ -337,7 +337,7 @@ class Code(Worded):
         "Predict less far ahead, or with more recorded.",
     )
     DISTURBANCES_FOLLOWED = (
-        "disturbances_followed",  # gust, thrust (shares), both _seconds
+        "disturbances_followed",  # wind (m/s), gust, thrust (shares), gust_, thrust_seconds
         sentences.estimated_disturbances,
         "",
     )

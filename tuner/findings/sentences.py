@@ -168,8 +168,9 @@ def estimated_disturbances(finding: Finding) -> str:
     numbers = finding.numbers
     return (
         "The residuals hold more than measurement noise, as in gusts: an extended Kalman filter "
-        f"estimates a disturbance force of {100.0 * numbers['gust']:.2g} % of the weight "
-        f"(correlation time {numbers['gust_seconds']:.2g} s) and thrust that varies by "
+        f"estimates wind that varies by {numbers['wind']:.2g} m/s and pushes by another "
+        f"{100.0 * numbers['gust']:.2g} % of the weight (correlation time "
+        f"{numbers['gust_seconds']:.2g} s) and thrust that varies by "
         f"{100.0 * numbers['thrust']:.2g} % ({1e3 * numbers['thrust_seconds']:.0f} ms). The "
         "coefficients are those that predict each sample best from the samples before."
     )

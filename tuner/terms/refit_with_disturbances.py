@@ -315,8 +315,9 @@ def _findings_with_disturbances(
     flights = zip(job.fitted, predictor.matched, strict=True)
     matched = [flight.name for flight, one in flights if one]
     others = [finding for finding in fitted.findings if finding.code not in UNMATCHED_CODES]
-    gust, _, _, thrust, gust_seconds, thrust_seconds, _ = np.exp(predictor.strengths).tolist()
+    gust, _, _, thrust, gust_seconds, thrust_seconds, _, wind = np.exp(predictor.strengths).tolist()
     numbers = {
+        "wind": wind,
         "gust": gust,
         "gust_seconds": gust_seconds,
         "thrust": thrust,

@@ -21,7 +21,7 @@ from sim_jax.state import hover
 from tests.conftest import KERNELS
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
 from tuner.disturbances import extended_kalman_filter as ekf
-from tuner.disturbances.disturbances import INITIAL_STRENGTHS, PROCESSES
+from tuner.disturbances.disturbances import INITIAL_STRENGTHS, PROCESSES, SLOW
 from tuner.disturbances.observer import AssumedModel, FilterInput, first_errors
 from tuner.disturbances.ticks import TickSamples
 from tuner.objective.segments import Segments
@@ -136,9 +136,9 @@ def test_innovations_are_those_of_a_filter_in_matrices() -> None:
         now = observer.outputs(observer.corrected(state, change, number, in_flight), number)
         return jnp.concatenate(observer.errors(now, now, read)), observer.sampled(read)
 
-    def later(change, state, pushed, number):
+    def later(change, state, pushed, number, draught):
         moved = observer.corrected(state, change[:-PROCESSES], number, in_flight)
-        after = observer.next(moved, pushed + change[-PROCESSES:], number)
+        after = observer.next(moved, pushed + change[-PROCESSES:], number, draught)
         kept = observer.processes.retention * (pushed + change[-PROCESSES:])
         numbers = observer.numbers(after, number + 1, in_flight)
         return jnp.concatenate([numbers, kept]), after
@@ -148,6 +148,7 @@ def test_innovations_are_those_of_a_filter_in_matrices() -> None:
     processes, pushed = observer.processes, jnp.zeros(PROCESSES)
     sd = np.concatenate([first_errors(state, in_flight), processes.sd])
     covariance, fresh = np.diag(sd**2), np.diag([*np.zeros(size - PROCESSES), *processes.added])
+    gust = size - PROCESSES + SLOW.index("gust_z")
     for number in range(TICKS):
         error, sampled, slopes = map(
             np.asarray, told_by(jnp.zeros(size - PROCESSES), state, jnp.asarray(number))
@@ -162,7 +163,8 @@ def test_innovations_are_those_of_a_filter_in_matrices() -> None:
         change = jnp.asarray(-alone @ gain)
         state = observer.corrected(state, change[:-PROCESSES], jnp.asarray(number), in_flight)
         pushed = pushed + change[-PROCESSES:]
-        follow, state = moved_by(jnp.zeros(size), state, pushed, jnp.asarray(number))
+        draught = jnp.sqrt(covariance[gust, gust])
+        follow, state = moved_by(jnp.zeros(size), state, pushed, jnp.asarray(number), draught)
         pushed = pushed * processes.retention
         covariance = follow @ (covariance - gain.T @ gain) @ follow.T + fresh
 

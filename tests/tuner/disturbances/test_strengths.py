@@ -16,8 +16,9 @@ from tuner.disturbances.disturbances import (
     MAX_STRENGTHS,
     MIN_STRENGTHS,
     SLOW,
+    STRENGTHS,
+    UPWARDS,
     clipped,
-    disturbance_of,
     processes_of,
 )
 from tuner.disturbances.extended_kalman_filter import Filtered
@@ -32,7 +33,7 @@ SAMPLES, WIDE = 3000, 5
 def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Filtered]:
     """Return the likelihood of samples whose covariance strengths make up, and trade off in."""
     rng = np.random.default_rng(seed)
-    shapes = np.random.default_rng(0).standard_normal((7, WIDE, WIDE))
+    shapes = np.random.default_rng(0).standard_normal((len(STRENGTHS), WIDE, WIDE))
     shapes = shapes @ np.swapaxes(shapes, 1, 2)
 
     def root(strengths: np.ndarray) -> np.ndarray:
@@ -58,11 +59,11 @@ def differenced(filtered: Callable[[np.ndarray], Filtered], strengths: np.ndarra
 
 
 def test_the_likelihoods_slope_is_that_of_its_differences() -> None:
-    at = INITIAL_STRENGTHS + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7])
+    at = INITIAL_STRENGTHS + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7, 0.5])
     filtered = drawn(at, seed=2)
     differences = [
         (filtered(at + 1e-4 * axis).loss - filtered(at - 1e-4 * axis).loss) / 2e-4
-        for axis in np.eye(7)
+        for axis in np.eye(len(STRENGTHS))
     ]
     slope, information, *_ = differenced(filtered, at)
     error = 1.0 / np.sqrt(np.diag(information))  # of a strength by itself
@@ -70,7 +71,7 @@ def test_the_likelihoods_slope_is_that_of_its_differences() -> None:
 
 
 def test_slopes_scatter_about_none_as_fishers_information_says() -> None:
-    at = INITIAL_STRENGTHS + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7])
+    at = INITIAL_STRENGTHS + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7, 0.5])
     drawn_many = [differenced(drawn(at, seed=seed), at) for seed in range(100)]
     told = np.sqrt(np.diag(drawn_many[0].information))
     slopes = np.array([found.slope for found in drawn_many]) / told
@@ -79,7 +80,7 @@ def test_slopes_scatter_about_none_as_fishers_information_says() -> None:
 
 
 def test_no_strength_is_displaced_beyond_its_limits() -> None:
-    at = np.where(np.arange(7) % 2, MAX_STRENGTHS, MIN_STRENGTHS)
+    at = np.where(np.arange(len(STRENGTHS)) % 2, MAX_STRENGTHS, MIN_STRENGTHS)
     steps = difference_steps(at)
     np.testing.assert_allclose(clipped(at + steps), at + steps)
     np.testing.assert_allclose(np.abs(steps), STEP)
@@ -106,16 +107,30 @@ def test_thrusts_that_wander_alone_at_each_rotor_turn_a_vehicle_as_its_arms_say(
 
 
 def test_slow_and_fast_moments_add_up() -> None:
-    values = jnp.arange(1.0, len(ORDER) + 1.0)[:, None] * jnp.ones(2)
-    acting = disturbance_of(values)
-    assert acting.force is not None
+    processes = processes_of(vehicle(), jnp.asarray(INITIAL_STRENGTHS), 400.0)
+    values = np.arange(1.0, len(ORDER) + 1.0)
+    acting = processes.disturbance(jnp.asarray(values)[:, None] * jnp.ones(2))
     assert acting.moment is not None
-    np.testing.assert_allclose(acting.force.stacked()[:, 0, 0], [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(acting.moment.stacked()[:, 0, 0], [4.0 + 7.0, 5.0 + 8.0, 9.0])
+    acts = np.asarray(processes.acts) * values
+    together = [acts[[at for at, name in enumerate(ORDER) if name == f"moment_{a}"]] for a in "xyz"]
+    assert [len(parts) for parts in together] == [2, 2, 1]
+    expected = [parts.sum() for parts in together]
+    np.testing.assert_allclose(acting.moment.stacked()[:, 0, 0], expected)
 
 
-def test_a_draught_is_as_strong_as_what_it_takes_of_the_thrust() -> None:
-    craft = vehicle()
-    fastest = float(craft.aerodynamics.max_relative_airspeed)
-    draught = processes_of(craft, jnp.asarray(INITIAL_STRENGTHS), 400.0).draught
-    assert float(draught) == pytest.approx(np.exp(INITIAL_STRENGTHS[1]) * fastest)
+def test_a_gust_is_wind_that_also_pushes() -> None:
+    """Its force sideways goes with it, that upwards is another's."""
+    craft, strengths = vehicle(), jnp.asarray(INITIAL_STRENGTHS)
+    processes = processes_of(craft, strengths, 400.0)
+    gust, lift, wind = np.exp(
+        INITIAL_STRENGTHS[[STRENGTHS.index(n) for n in ("gust", "lift", "wind")]]
+    )
+    acting = processes.disturbance(processes.sd[:, None])
+    assert acting.gust is not None
+    assert acting.force is not None
+    velocity = wind * np.array([1.0, 1.0, UPWARDS])
+    np.testing.assert_allclose(acting.gust.stacked()[:, 0, 0], velocity)
+    weight = float(craft.body.mass) * GRAVITY
+    np.testing.assert_allclose(
+        acting.force.stacked()[:, 0, 0], weight * np.array([gust, gust, lift])
+    )

@@ -66,7 +66,7 @@ MADE = {
         Code.DISTURBANCES_FOLLOWED,
         "info",
         "flights",
-        {"gust": 0.0027, "gust_seconds": 1.0, "thrust": 0.004, "thrust_seconds": 0.02},
+        {"wind": 0.1, "gust": 0.0027, "gust_seconds": 1.0, "thrust": 0.004, "thrust_seconds": 0.02},
     ),
     Code.INLET_CHOSEN: Finding(
         Code.INLET_CHOSEN,
