@@ -18,6 +18,7 @@ from tuner.report.section import Cell, Table
 from tuner.result import ExportRecord, FlightResult, RunResult
 from tuner.uncertainty.records import Knowledge
 from tuner.uncertainty.verdict import Verdict, verdict_in_words
+from tuner.vehicle import COEFFICIENTS
 
 MAX_NAMES_LETTERS = 90
 """The names of flights in a sentence take at most so many letters."""
@@ -299,8 +300,11 @@ def _usability(
     if words & {"worse", "crashes"} or any(one.word == "crashes" for one in flights):
         return Usability.UNUSABLE
     codes = {found.code for found in result.findings}
-    not_found = {Code.WRONG_VEHICLE, Code.HOLDING_BETTER} <= codes  # from another vehicle
+    other_vehicle = codes & {Code.WRONG_VEHICLE, Code.VEHICLE_NOT_GIVEN}
+    not_found = other_vehicle and codes & {Code.HOLDING_BETTER, Code.RATE_WORSE}
     if not_found or any(found.level == "failure" for found in result.findings):
+        return Usability.UNUSABLE
+    if _is_unfounded(result, flights):
         return Usability.UNUSABLE
     fitted = [row for row in result.coefficients.values() if row.fitted]
     unsure = (
@@ -311,6 +315,17 @@ def _usability(
         any(f.level == "warning" and f.code in DOUBT_CODES for f in result.findings),
     )
     return Usability.WITH_CARE if any(unsure) else Usability.USABLE
+
+
+def _is_unfounded(result: RunResult, flights: Sequence[FlightOutcome]) -> bool:
+    """Return whether flights determine nothing of the motor model, and none is predicted."""
+    base = [
+        row.identifiable
+        for name, row in result.coefficients.items()
+        if row.fitted and not COEFFICIENTS[name].is_effect
+    ]
+    unknown = bool(base) and all(identifiable is False for identifiable in base)
+    return unknown and bool(flights) and not any(one.held_out for one in flights)
 
 
 def _fit_summary(result: RunResult) -> str:
@@ -369,7 +384,11 @@ def _reasons(result: RunResult, checks: Sequence[FlightOutcome]) -> tuple[str, .
         floor = "" if noise is None else f"; the noise of its recording alone is {metres(noise)}"
         sentences.append(f"{flight.name}, {what}: position error from {moved}{floor}.")
     if result.flights and not any(flight.held_out for flight in checks):
-        sentences.append("No flight was held out, so that nothing checks the fit: hold one out.")
+        unfounded = "its flights tell no coefficient of the motor model, and "
+        sentences.append(
+            f"No flight was held out, so that {unfounded if _is_unfounded(result, checks) else ''}"
+            "nothing checks the fit: hold one out."
+        )
     if not result.search.converged:
         sentences.append("The search stopped at its limit of iterations: resume it.")
     return tuple(sentences)

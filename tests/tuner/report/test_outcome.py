@@ -17,6 +17,7 @@ from tuner.report.outcome import (
 )
 from tuner.result import ExportRecord
 from tuner.uncertainty.verdict import Verdict
+from tuner.vehicle import COEFFICIENTS
 
 CRASHED = AxesRmse(x=None, y=None, z=None, roll=None, pitch=None, yaw=None)
 
@@ -95,6 +96,27 @@ def test_another_vehicle_that_predicts_worse_than_holding_is_not_usable(result):
     worse = Finding(Code.HOLDING_BETTER, "warning", "circle", ahead, ("position",))
     assert outcome(noticing(result, worse)).usability is Usability.WITH_CARE
     assert outcome(noticing(result, other, worse)).usability is Usability.UNUSABLE
+
+
+def test_a_vehicle_not_given_whose_rate_is_predicted_worse_than_before_is_not_usable(result):
+    default = Finding(Code.VEHICLE_NOT_GIVEN, "warning", "hovergames", {"mass": 2.079})
+    ahead = {"before": 3.6, "after": 5.9, "hold": 3.7, "seconds": 0.4}
+    worse = Finding(Code.RATE_WORSE, "warning", "log15", ahead)
+    for alone in (default, worse):
+        assert outcome(noticing(result, alone)).usability is not Usability.UNUSABLE
+    assert outcome(noticing(result, default, worse)).usability is Usability.UNUSABLE
+
+
+def test_flights_that_tell_nothing_of_the_vehicle_and_check_nothing_are_not_usable(result):
+    rows = {
+        name: row.model_copy(update={"identifiable": COEFFICIENTS[name].is_effect})
+        for name, row in result.coefficients.items()
+    }
+    unknown = result.model_copy(update={"coefficients": rows})
+    assert outcome(unknown).usability is not Usability.UNUSABLE
+    found = outcome(with_held(unknown, split="fit"))
+    assert found.usability is Usability.UNUSABLE
+    assert "tell no coefficient of the motor model, and nothing checks" in found.reasons[-1]
 
 
 def test_what_nothing_checks_or_something_doubts_is_used_with_care(result, tmp_path):
