@@ -331,6 +331,7 @@ class Substitute:
 
 def substitutes_of(
     linear: LinearisedLoss,
+    space: Space,
     model: Columns,
     kept: Mapping[str, Columns],
     left_out: Iterable[Columns],
@@ -360,10 +361,9 @@ def substitutes_of(
             spread = float(long_run_covariance((scores @ change)[:, None], linear.flight)[0, 0])
             excess = max(spread / max(float(change @ square @ change), 1e-300), 1.0)
             probability = float(expit((before - loss(there)) / excess))
-            values = {
-                row.name: float(np.exp(scaled) if row.scale == "log" else scaled)
-                for column, scaled in zip(columns, (linear.scaled + there)[columns], strict=True)
-                if (row := COEFFICIENTS.get(linear.names[column])) is not None
+            scaled = linear.scaled + there
+            values = {  # conditions of flights are columns beyond the space's
+                linear.names[i]: space.from_scaled(i, scaled[i]) for i in columns if i < len(space)
             }
             found.append(Substitute(group, values, change, probability))
     return found

@@ -420,7 +420,9 @@ class LinearisedInnovations:
             for row in self.selected.rows
             if row.kept and row.reason in ACCEPTED and len(columns := self._columns(row.names))
         }
-        substitutes = substitutes_of(self.linear, model, kept, (columns for columns, _ in outside))
+        substitutes = substitutes_of(
+            self.linear, self.space, model, kept, (columns for columns, _ in outside)
+        )
         moves = selection_shifts(self.linear, model, outside, substitutes)
         own = {self.space.names[i]: float(moves[i]) for i in model}
         shifts = {**self.selected.selection_shifts, **own}

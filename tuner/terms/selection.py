@@ -133,7 +133,9 @@ class Selection:
         linear, model = state.linear, state.linear.columns_of(names)
         kept = {group: linear.columns_of(own) for group, own in state.added.items()}
         outside = [(linear.columns_of(own), prior_presence_of(own)) for own in selected.left_out]
-        substitutes = substitutes_of(linear, model, kept, (columns for columns, _ in outside))
+        substitutes = substitutes_of(
+            linear, state.fitted.objective.space, model, kept, (columns for columns, _ in outside)
+        )
         moves = selection_shifts(linear, model, outside, substitutes)
         coefficients = [name for name in names if name not in conditions_of(self.candidates)]
         own = linear.columns_of(coefficients)
