@@ -384,11 +384,9 @@ def _reasons(result: RunResult, checks: Sequence[FlightOutcome]) -> tuple[str, .
         floor = "" if noise is None else f"; the noise of its recording alone is {metres(noise)}"
         sentences.append(f"{flight.name}, {what}: position error from {moved}{floor}.")
     if result.flights and not any(flight.held_out for flight in checks):
-        unfounded = "its flights tell no coefficient of the motor model, and "
-        sentences.append(
-            f"No flight was held out, so that {unfounded if _is_unfounded(result, checks) else ''}"
-            "nothing checks the fit: hold one out."
-        )
+        sentences.append("No flight was held out, so that nothing checks the fit: hold one out.")
+    if _is_unfounded(result, checks):
+        sentences.append("Its flights determine no coefficient of the motor model.")
     if not result.search.converged:
         sentences.append("The search stopped at its limit of iterations: resume it.")
     return tuple(sentences)
