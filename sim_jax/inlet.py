@@ -90,6 +90,13 @@ class Inlet(eqx.Module):
         """Return for how many rotors something is fed in; empty where nothing is."""
         return set()
 
+    def trimmed(self, trim: PerRotor) -> Inlet:
+        """Return the inlet with a steady difference of each rotor, if something is fed into rotors.
+
+        Commands are increased by ``trim``, rotor speeds by that share of themselves.
+        """
+        return self
+
 
 class ReferenceInlet(Inlet):
     """The whole loop is simulated; leaves of ``points`` are (ticks, \\*batch), one a control tick.
@@ -152,6 +159,10 @@ class ActuatorInlet(Inlet):
     def rotor_counts(self) -> set[int]:
         return {len(self.command)}
 
+    def trimmed(self, trim: PerRotor) -> Inlet:
+        pairs = zip(self.command, trim, strict=True)
+        return ActuatorInlet(tuple(command + more for command, more in pairs))
+
 
 class RotorSpeedInlet(Inlet):
     """Rotor speeds in rad/s replace control and motors; leaves are (physics steps, \\*batch)."""
@@ -170,6 +181,10 @@ class RotorSpeedInlet(Inlet):
 
     def rotor_counts(self) -> set[int]:
         return {len(self.speed)}
+
+    def trimmed(self, trim: PerRotor) -> Inlet:
+        pairs = zip(self.speed, trim, strict=True)
+        return RotorSpeedInlet(tuple(speed * (1.0 + more) for speed, more in pairs))
 
 
 class AttitudeInlet(Inlet):
@@ -256,6 +271,9 @@ class MixedInlet(Inlet):
 
     def rotor_counts(self) -> set[int]:
         return set().union(*(part.rotor_counts() for part in self.parts))
+
+    def trimmed(self, trim: PerRotor) -> Inlet:
+        return MixedInlet(tuple(part.trimmed(trim) for part in self.parts), self.kind)
 
     def _of_each(self, result: Callable[[Inlet], T]) -> T:
         """Return for every vehicle the result of its own part."""

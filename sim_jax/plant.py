@@ -38,7 +38,7 @@ from sim_jax.sensing import (
     unpack_motion,
 )
 from sim_jax.state import Limits, Setpoints, State
-from sim_jax.terms.total import total_wrench
+from sim_jax.terms import total_wrench
 from sim_jax.vehicle import PerRotor, Vehicle
 
 T = TypeVar("T")

@@ -25,7 +25,7 @@ from sim_jax.motor import command_of
 from sim_jax.numeric import Array, Scalar, where
 from sim_jax.rigid_body import Motion
 from sim_jax.state import Start, hover_speed
-from sim_jax.terms.total import total_wrench
+from sim_jax.terms import total_wrench
 from sim_jax.vehicle import PerRotor, Vehicle
 
 _Row: TypeAlias = list[Scalar]

@@ -10,7 +10,7 @@ from sim_jax.environment import Air
 from sim_jax.geometry import Vec3
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench
-from sim_jax.terms.total import total_wrench
+from sim_jax.terms import total_wrench
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 from tests.golden_check.table import Deviation, Table, deviation, merged
 

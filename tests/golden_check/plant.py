@@ -15,7 +15,7 @@ from sim_jax.rigid_body import Motion, acceleration, angular_acceleration
 from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
-from sim_jax.terms.total import total_wrench
+from sim_jax.terms import total_wrench
 from sim_jax.vehicle import PerRotor, Vehicle
 from tests.golden_check.coefficients import GOLDEN_GRAVITY, golden_vehicle
 from tests.golden_check.controllers import golden_controller

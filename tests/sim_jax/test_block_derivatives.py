@@ -21,7 +21,7 @@ from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.sensing import MAX_CUTOFF, GyroFilter, GyroMemory, filter_gyro, look_back
-from sim_jax.terms.total import total_wrench
+from sim_jax.terms import total_wrench
 from sim_jax.trajectory import Circle, publish
 from sim_jax.vehicle import PerRotor, Rotor, Vehicle
 from tests.sim_jax.derivatives import Differences, assert_derivatives

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from jax import Array
 
+from sim_jax import terms
 from sim_jax.environment import STILL_AIR, Air, Environment
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet, RotorSpeedInlet
@@ -20,8 +21,7 @@ from sim_jax.rigid_body import Motion
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
-from sim_jax.terms import total
-from sim_jax.terms.beyond import fuselage_drag
+from sim_jax.terms import fuselage_drag
 from sim_jax.vehicle import Vehicle
 from tests.sim_jax.support import (
     apart,
@@ -69,8 +69,8 @@ def test_an_absent_coefficient_and_no_environment_cost_no_operation(
 
     absent = operations(vehicle())
     assert operations(with_effects(vehicle(), {"fuselage_drag": 0.03})) > absent
-    base = tuple(term for term in total.TERMS if term is not fuselage_drag)
-    monkeypatch.setattr(total, "TERMS", base)
+    base = tuple(term for term in terms.TERMS if term is not fuselage_drag)
+    monkeypatch.setattr(terms, "TERMS", base)
     assert operations(vehicle()) == absent
 
 

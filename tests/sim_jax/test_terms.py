@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim_jax import terms
 from sim_jax.environment import STILL_AIR, Air, Environment
 from sim_jax.rigid_body import Motion
-from sim_jax.terms import total
-from sim_jax.terms.beyond import fuselage_drag
+from sim_jax.terms import fuselage_drag
 from tests.sim_jax.support import quaternion, vec, vehicle
 
 CRAFT = vehicle()
@@ -19,7 +19,7 @@ SPEEDS = (jnp.asarray(600.0),) * 4
 
 def force(craft, velocity):
     motion = Motion(vec(0, 0, 1), velocity, quaternion(1, 0, 0, 0), vec(0, 0, 0))
-    return total.total_wrench(craft, motion, SPEEDS, Air.around(craft, motion)).force.stacked()
+    return terms.total_wrench(craft, motion, SPEEDS, Air.around(craft, motion)).force.stacked()
 
 
 def draggy(coefficient):
@@ -42,8 +42,8 @@ def test_its_derivatives_are_finite_at_rest():
 def test_a_term_without_its_coefficient_is_not_traced(monkeypatch):
     velocity = vec(3.0, -4.0, 0.0)
     absent = str(jax.make_jaxpr(lambda v: force(CRAFT, v))(velocity))
-    assert fuselage_drag in total.TERMS
-    monkeypatch.setattr(total, "TERMS", tuple(t for t in total.TERMS if t is not fuselage_drag))
+    assert fuselage_drag in terms.TERMS
+    monkeypatch.setattr(terms, "TERMS", tuple(t for t in terms.TERMS if t is not fuselage_drag))
     assert str(jax.make_jaxpr(lambda v: force(CRAFT, v))(velocity)) == absent
 
 
@@ -53,7 +53,7 @@ def test_a_draught_leaves_of_thrust_and_damping_what_gusts_leave_in_the_mean(cli
     motion = Motion(vec(0, 0, 1), vec(0, 0, climbs), quaternion(1, 0, 0, 0), vec(0.3, -0.2, 0.0))
 
     def acting(around):
-        wrench = total.total_wrench(CRAFT, motion, SPEEDS, Air.around(CRAFT, motion, around))
+        wrench = terms.total_wrench(CRAFT, motion, SPEEDS, Air.around(CRAFT, motion, around))
         return jnp.concatenate([wrench.force.stacked(), wrench.moment.stacked()])
 
     blown = jax.vmap(lambda w: acting(Environment(wind=vec(0, 0, w))))(jnp.asarray(gusts))

@@ -15,8 +15,7 @@ from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import Tachometer
 from sim_jax.state import hover_speed
-from sim_jax.terms.rotor import thrust_terms_act
-from sim_jax.terms.total import total_wrench, wrench_of_each_term
+from sim_jax.terms import thrust_terms_act, total_wrench, wrench_of_each_term
 from tests.sim_jax.support import (
     compiled_rollout,
     controller,

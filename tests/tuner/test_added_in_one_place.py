@@ -20,13 +20,13 @@ from cyclopts import App
 
 import tuner
 from docs.generate.models import sections_of
+from sim_jax import terms
 from sim_jax.environment import Environment
 from sim_jax.geometry import Vec3
 from sim_jax.numeric import safe_sqrt
 from sim_jax.rigid_body import Wrench
 from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
-from sim_jax.terms import total
 from tests.memory import BEFORE_A_FIT, give_back
 from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
 from tuner.cli.tune import FLATTENED, MANY_WORDS
@@ -132,7 +132,7 @@ def test_an_option_is_one_field_for_the_command_line_python_the_job_file_and_htt
 def added(monkeypatch):
     """The row and the term, and nothing else."""
     monkeypatch.setitem(COEFFICIENTS, NAME, ROW)
-    monkeypatch.setattr(total, "TERMS", (*total.TERMS, sail_drag))
+    monkeypatch.setattr(terms, "TERMS", (*terms.TERMS, sail_drag))
 
 
 @pytest.fixture

@@ -25,10 +25,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from lanes import Argument, Run, program_of
+from sim_jax import terms
 from sim_jax.numeric import row_of
 from sim_jax.schedule import Schedule
 from sim_jax.state import State
-from sim_jax.terms import total
 from tuner.disturbances.covariance import Samples, Sparse, at, innovations_of, propagated
 from tuner.disturbances.disturbances import PROCESSES, SLOW
 from tuner.disturbances.observer import (
@@ -275,7 +275,7 @@ def _run(
         arguments,
         *static,
         name=kind,
-        made_of=(kind, static, moves, total.TERMS),
+        made_of=(kind, static, moves, terms.TERMS),
         packages=CODE,
     )
     count, ticks = inputs.offsets.shape[-1], len(given.order)

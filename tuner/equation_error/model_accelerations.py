@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanes import Argument, program_of
+from sim_jax import terms
 from sim_jax.environment import Air
 from sim_jax.rigid_body import angular_acceleration
-from sim_jax.terms import total
-from sim_jax.terms.total import total_wrench
 from tuner.core.numerics import Array
 from tuner.equation_error.recorded_accelerations import (
     Mask,
@@ -170,7 +169,7 @@ def _modelled(
         jax.tree.map(partial(Argument.of, lanes=True), given[2]),
     )
     program = program_of(
-        _accelerations, arguments, name="accelerations", made_of=total.TERMS, packages=CODE
+        _accelerations, arguments, name="accelerations", made_of=terms.TERMS, packages=CODE
     )
     run = program(given, tangents, lanes=steps[1].shape[1])
     columns = np.zeros((*run.values.shape, 0)) if run.columns is None else run.columns
@@ -186,7 +185,7 @@ def _accelerations(given: Any, _: Mapping[str, int]) -> jax.Array:
     speeds, changes = jnp.split(rotors, 2)
     vehicle = with_coefficients(model, numbers).vehicle
     air = Air.around(vehicle, motion, rotor_acceleration=tuple(changes))
-    acting = total_wrench(vehicle, motion, tuple(speeds), air)
+    acting = terms.total_wrench(vehicle, motion, tuple(speeds), air)
     turning = angular_acceleration(vehicle.body, motion.body_rate, acting.moment)
     pull = acting.force * (1.0 / vehicle.body.mass)
     return jnp.concatenate([pull.stacked(), turning.stacked()])

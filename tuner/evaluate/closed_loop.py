@@ -21,6 +21,7 @@ from annotated_types import Interval
 from jax import lax
 
 from lanes import Argument, program_of
+from sim_jax import terms
 from sim_jax.constants import GRAVITY
 from sim_jax.environment import STILL_AIR, Air, Environment
 from sim_jax.geometry import Quaternion, Vec3
@@ -31,8 +32,6 @@ from sim_jax.rigid_body import Motion
 from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.state import State, hover
-from sim_jax.terms import total
-from sim_jax.terms.total import wrench_of_each_term
 from sim_jax.vehicle import Vehicle
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError, did_you_mean
@@ -134,10 +133,10 @@ def forces_of_terms(
         *(Argument.of(rows, lanes=True) for rows in of_lanes),
     )
     program = program_of(
-        _sample_forces, arguments, name="forces", made_of=total.TERMS, packages=CODE
+        _sample_forces, arguments, name="forces", made_of=terms.TERMS, packages=CODE
     )
     acted: dict[str, Array] = program(inputs, lanes=flights * samples).values
-    names = (*(term.__name__ for term in total.TERMS), WEIGHT)
+    names = (*(term.__name__ for term in terms.TERMS), WEIGHT)
     return {n: acted[n].reshape(flights, samples, 6) for n in names if n in acted}
 
 
@@ -151,7 +150,7 @@ def _sample_forces(inputs: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:
     ambient = Environment(wind=Vec3.of(wind))
     rotor_speeds = tuple(speeds[i] for i in range(rotors))
     air = Air.around(vehicle, body_motion, ambient, tuple(accelerations[i] for i in range(rotors)))
-    wrenches = wrench_of_each_term(vehicle, body_motion, rotor_speeds, air)
+    wrenches = terms.wrench_of_each_term(vehicle, body_motion, rotor_speeds, air)
     acting = {name: (wrench.force, wrench.moment) for name, wrench in wrenches.items()}
     weight = air.up * (-GRAVITY * vehicle.body.mass)
     acting[WEIGHT] = weight, Vec3.zeros(jnp.zeros(()))
@@ -442,7 +441,7 @@ def _run_flights(
         schedule,
         precision,
         name="simulated flight",
-        made_of=(schedule, precision, total.TERMS),
+        made_of=(schedule, precision, terms.TERMS),
         packages=CODE,
     )
     lanes = len(next(iter(columns.values()))) if columns else 1

@@ -12,20 +12,17 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from sim_jax.geometry import Quaternion, Vec3
-from sim_jax.inlet import Inlet, MixedInlet
 from sim_jax.motor import reference_speed
 from sim_jax.numeric import Array
 from sim_jax.rigid_body import Motion
 from sim_jax.state import Start
 from sim_jax.vehicle import Vehicle
-from tuner.objective.inlets import recorded_inlet_of
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.vehicle import of_scope
 
@@ -204,21 +201,16 @@ def with_change(start: Start, change: Float[Array, "L F"]) -> Start:
     )
 
 
-def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inlet:
-    """Return an inlet with a constant torque trim about three axes added to its rotor signals."""
-    if isinstance(inlet, MixedInlet):
-        parts = (trimmed(part, vehicle, change) for part in inlet.parts)
-        changed: Inlet = eqx.tree_at(lambda i: i.parts, inlet, tuple(parts))
-        return changed
+def rotor_trim(vehicle: Vehicle, change: Float[Array, "L F"]) -> tuple[Any, ...]:
+    """Return each rotor's share (F,) of a constant torque trim about three axes."""
     roll, pitch, yaw = change[ROWS["trim"]]
     arms: list[tuple[Any, Any]] = [(rotor.position.x, rotor.position.y) for rotor in vehicle.rotors]
     width = sum(abs(y) for _, y in arms) / len(arms)
     length = sum(abs(x) for x, _ in arms) / len(arms)
-    trim = [
+    return tuple(
         roll * (y / width) - pitch * (x / length) - yaw * rotor.spin
         for (x, y), rotor in zip(arms, vehicle.rotors, strict=True)
-    ]
-    return recorded_inlet_of(inlet).trimmed(inlet, trim)
+    )
 
 
 def with_commanded_rotors(

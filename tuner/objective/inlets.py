@@ -12,7 +12,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
-import jax
 import numpy as np
 
 from sim_jax.control.geometric import ReferencePoint
@@ -144,8 +143,6 @@ class RecordedInlet(ABC):
     """How recordings feed an inlet of the simulator."""
 
     name: ClassVar[InletName]
-    feeds: ClassVar[type[Inlet]]
-    """The simulator's inlet."""
     needs: ClassVar[tuple[str, ...]]
     """Signals that a recording must hold, the characteristic one first."""
     not_compared: ClassVar[tuple[str, ...]] = ("acceleration",)
@@ -216,11 +213,6 @@ class RecordedInlet(ABC):
             All but the reference enter at its ``physics_rate``.
         """
 
-    def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
-        """Return the simulator's inlet with a steady difference (F,) of each rotor."""
-        del trim
-        return inlet
-
     def _resampled(
         self, signal: str, flights: Sequence[Flight], schedule: Schedule, *, mean: bool = False
     ) -> list[Array]:
@@ -256,7 +248,6 @@ class RecordedReference(RecordedInlet):
     """The reference trajectory: the whole loop is simulated."""
 
     name = "reference"
-    feeds = ReferenceInlet
     needs = ("reference_position",)
     ignores = ("trim",)
     starts_recorded = False
@@ -294,7 +285,6 @@ class RecordedBodyRate(RecordedInlet):
     """Rate and thrust set-points, from the rate controller on."""
 
     name = "body_rate"
-    feeds = BodyRateInlet
     needs = ("rate_setpoint", "thrust_setpoint")
     replaces = ("estimate",)
     ignores = ("trim",)
@@ -312,7 +302,6 @@ class RecordedCommand(RecordedInlet):
     """Motor commands, from the motors on."""
 
     name = "actuator"
-    feeds = ActuatorInlet
     needs = ("command",)
     not_compared = ("command", "acceleration")
     replaces = ("estimate", "rate control")
@@ -325,18 +314,11 @@ class RecordedCommand(RecordedInlet):
         """Lay the commands out step by step."""
         return ActuatorInlet(tuple(self._resampled("command", flights, schedule, mean=True)))
 
-    def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
-        """Add the trim to the commands."""
-        assert isinstance(inlet, ActuatorInlet)
-        pairs = zip(inlet.command, trim, strict=True)
-        return ActuatorInlet(tuple(command + more for command, more in pairs))
-
 
 class RecordedRotorSpeed(RecordedInlet):
     """Measured rotor speeds, into the aerodynamics."""
 
     name = "rotor_speed"
-    feeds = RotorSpeedInlet
     needs = ("rotor_speed",)
     not_compared = ("command", "rotor_speed", "acceleration")
     replaces = ("estimate", "rate control", "motors", "tachometer")
@@ -348,18 +330,11 @@ class RecordedRotorSpeed(RecordedInlet):
         """Lay the speeds out step by step."""
         return RotorSpeedInlet(tuple(self._resampled("rotor_speed", flights, schedule)))
 
-    def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
-        """Change the speeds by the trim's share."""
-        assert isinstance(inlet, RotorSpeedInlet)
-        pairs = zip(inlet.speed, trim, strict=True)
-        return RotorSpeedInlet(tuple(speed * (1.0 + more) for speed, more in pairs))
-
 
 class _RecordedThrust(RecordedInlet):
     """Thrust set-points as commands that are the same for all rotors: a drive, no inlet."""
 
     name = "attitude"
-    feeds = ActuatorInlet
     needs = ("thrust_setpoint",)
     ignores = ()
     computed_at = "position_control_rate"
@@ -378,7 +353,6 @@ class RecordedAttitude(RecordedInlet):
     """
 
     name = "attitude"
-    feeds = AttitudeInlet
     needs = ("attitude",)
     not_compared = ("attitude", "body_rate", "command", "rotor_speed")
     replaces = ("estimate", "rate control", "turning", "tachometer")
@@ -485,9 +459,3 @@ def inlet_of(
         ]
         parts.append(inlet.lay_out(feeding, schedule))
     return MixedInlet(tuple(parts), np.asarray([used.index(inlet) for inlet in recorded]))
-
-
-def recorded_inlet_of(inlet: Inlet) -> RecordedInlet:
-    """Return the recorded inlet that feeds an inlet of the simulator."""
-    (recorded,) = (r for r in INLETS.values() if type(inlet) is r.feeds)
-    return recorded

@@ -21,6 +21,7 @@ from jax import lax
 from jaxtyping import Float
 
 from lanes import Argument, program_of
+from sim_jax import terms
 from sim_jax.environment import Air, Environment
 from sim_jax.frames import gyro_of, markers_of
 from sim_jax.geometry import Vec3
@@ -31,15 +32,13 @@ from sim_jax.rigid_body import Motion
 from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.state import Limits, Start, State
-from sim_jax.terms import total
-from sim_jax.terms.total import total_wrench
 from sim_jax.trim import trimmed_start
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.core.numerics import Array
 from tuner.objective.battery import relative_log_voltage
 from tuner.objective.initial_conditions import (
     ROWS,
-    trimmed,
+    rotor_trim,
     with_all_rows,
     with_change,
     with_commanded_rotors,
@@ -165,7 +164,7 @@ def fly(
         arguments,
         *static,
         name="flight of a segment",
-        made_of=(static, moves, total.TERMS),
+        made_of=(static, moves, terms.TERMS),
         packages=CODE,
     )
     asked = {name: name in names for name in logged}
@@ -384,7 +383,7 @@ def beginning_of(
         change = with_all_rows(states * segments.start_sd, segments.free_rows)
         start = with_change(start, change)
         if ROWS["trim"].start in segments.free_rows:
-            inlet = trimmed(inlet, model.vehicle, change)
+            inlet = inlet.trimmed(rotor_trim(model.vehicle, change))
     return start, inlet, environment
 
 
@@ -400,7 +399,7 @@ def accelerometer(
     It is the specific force (all forces but gravity, over the mass) plus the bias.
     """
     air = Air.around(vehicle, motion, environment, tuple(jnp.zeros_like(w) for w in rotor_speed))
-    pull = total_wrench(vehicle, motion, rotor_speed, air).force * (1.0 / vehicle.body.mass)
+    pull = terms.total_wrench(vehicle, motion, rotor_speed, air).force * (1.0 / vehicle.body.mass)
     x, y, z = (getattr(pull, axis) + biases.get(f"accelerometer_{axis}", 0.0) for axis in "xyz")
     return x, y, z
 

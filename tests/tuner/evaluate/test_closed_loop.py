@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from lanes.program import _program_of
+from sim_jax import terms
 from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Wrench
-from sim_jax.terms import total
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
@@ -200,7 +200,7 @@ PUSH = {"newton": 0.0}
 
 
 def test_a_force_that_is_defined_elsewhere_is_never_taken_from_what_is_kept(vehicle, monkeypatch):
-    monkeypatch.setattr(total, "TERMS", (*total.TERMS, pushed_east))
+    monkeypatch.setattr(terms, "TERMS", (*terms.TERMS, pushed_east))
     east = []
     for newton in (0.0, 1.0):
         monkeypatch.setitem(PUSH, "newton", newton)

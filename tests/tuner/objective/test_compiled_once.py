@@ -10,7 +10,7 @@ import pytest
 
 from lanes.machine import digest_of
 from lanes.program import _program_of
-from sim_jax.terms import total
+from sim_jax import terms
 from tests.tuner.recorded import recordings_of
 from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.config import JobFile, Search, resolve_settings
@@ -73,7 +73,7 @@ def test_windows_from_recorded_and_from_free_starts_are_the_same_program(full_fl
 
 
 def test_programs_of_flights_are_kept_for_other_processes():
-    assert digest_of((simulation._flight, total.TERMS), simulation.CODE)
+    assert digest_of((simulation._flight, terms.TERMS), simulation.CODE)
 
 
 def test_columns_do_not_depend_on_other_free_coefficients():

@@ -11,7 +11,7 @@ import pytest
 from sim_jax.environment import Air
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
-from sim_jax.terms.total import total_wrench
+from sim_jax.terms import total_wrench
 from tuner.config import JobFile
 from tuner.core.shipped import find_config
 from tuner.objective.space import space_of

@@ -1,1 +1,0 @@
-"""Forces and moments on the vehicle, one pure function each."""
