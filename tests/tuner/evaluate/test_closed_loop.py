@@ -1,18 +1,26 @@
+import importlib
 import math
+import sys
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lanes.program import _program_of
 from sim_jax import terms
 from sim_jax.geometry import Vec3
 from sim_jax.rigid_body import Wrench
+from sim_jax.trajectory import Shape
+from tuner.cli import main
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
+from tuner.design.ranking import Arena, candidates
 from tuner.evaluate import closed_loop
-from tuner.evaluate.closed_loop import simulate
+from tuner.evaluate.closed_loop import COMPONENTS, simulate
+from tuner.evaluate.simulation_files import write_flights
 from tuner.objective.trajectory import at_speed, published
 from tuner.options import SimulationOptions
 from tuner.recordings.flight import SIGNALS
@@ -209,3 +217,138 @@ def test_a_force_that_is_defined_elsewhere_is_never_taken_from_what_is_kept(vehi
         east.append(hover.signals["position"][-1, 0])
     _program_of.cache_clear()
     assert east[1] - east[0] > 0.01
+
+
+# what acts along a flight, term by term, is what moved it
+
+#: Every term beyond the motor model's four, with what makes it felt.
+EFFECTS = {
+    "fuselage_drag": 0.05,
+    "linear_drag_x": 0.1,
+    "thrust_inflow_coefficient": 1e-4,
+    "flapping_moment_coefficient": -2e-6,
+    "rotor_inertia": 6e-5,
+    "angular_drag_y": 0.01,
+    "torque_trim_x": 0.02,
+    "center_of_mass_x": 0.01,
+    "rotor_thrust_scale_1": 1.05,
+}
+TERMS = [
+    *("thrust", "rotor_drag", "rolling_moment", "drag_torque", "fuselage_drag", "linear_drag"),
+    *("thrust_inflow", "flapping_moment", "gyroscopic_moment", "angular_drag", "torque_trim"),
+    "gravity",
+]
+QUICK = TrajectorySettings(name="lemniscate", speed_scale=6.0)
+
+
+@pytest.fixture(scope="module")
+def flown(vehicle):
+    heavy = with_values(vehicle, EFFECTS)
+    (flight,) = simulate(heavy, ControllerFile(), QUICK, duration=4.0, rate=400.0, forces=True)
+    return flight
+
+
+def check(acting, change):
+    """Compare with differences, which round off the kinks where the controller's ticks are."""
+    inside = slice(10, -10)
+    error = (acting - change)[inside]
+    assert np.abs(error).max() < 0.03 * np.abs(change).max()
+    assert np.sqrt(np.mean(error**2)) < 0.01 * np.sqrt(np.mean(change[inside] ** 2))
+
+
+def test_forces_add_up_to_mass_times_acceleration(flown, vehicle):
+    assert list(flown.forces.of_term) == TERMS
+    attitude = Rotation.from_quat(flown.signals["attitude"], scalar_first=True)
+    force = attitude.apply(sum(flown.forces.of_term.values())[:, :3])
+    slope = vehicle.mass * np.gradient(flown.signals["velocity"], flown.time, axis=0)
+    assert np.abs(slope).max() > 1.0
+    check(force, slope)
+
+
+def test_moments_turn_the_body_as_euler_says(flown, vehicle):
+    rate = flown.signals["body_rate"]
+    momentum = rate * [vehicle.inertia.xx, vehicle.inertia.yy, vehicle.inertia.zz]
+    moment = sum(flown.forces.of_term.values())[:, 3:]
+    change = np.gradient(momentum, flown.time, axis=0) + np.cross(rate, momentum)
+    assert np.abs(change).max() > 0.05
+    check(moment, change)
+
+
+def test_no_term_is_idle(flown):
+    for name, values in flown.forces.of_term.items():
+        assert np.abs(values).max() > 1e-4, name
+
+
+def test_the_forces_of_a_grid_go_into_one_table(vehicle, tmp_path):
+    grid = {"mass": np.array([2.243, 9.0])}
+    hover = TrajectorySettings(name="hover")
+    flights = simulate(vehicle, ControllerFile(), hover, duration=4.0, grid=grid, forces=True)
+    write_flights(flights, tmp_path / "f.csv", forces=tmp_path / "forces.csv")
+    table = pd.read_csv(tmp_path / "forces.csv")
+    assert list(table.columns[:3]) == ["mass", "time", "thrust_fx"]
+    assert list(table.columns[-6:]) == [f"gravity_{name}" for name in COMPONENTS]
+    light, heavy = table[table["mass"] < 3], table[table["mass"] > 3]
+    assert light["thrust_fz"].iloc[-1] == pytest.approx(2.243 * 9.81, rel=1e-3)
+    assert light["gravity_fz"].iloc[-1] == pytest.approx(-2.243 * 9.81, rel=1e-6)
+    assert 0 < len(heavy) < len(light) == 401  # it crashes, and what lies still is not written
+
+
+def test_forces_go_into_a_table_of_their_own(circle, tmp_path):
+    for name in ("c.csv", "f.txt"):
+        with pytest.raises(InputError, match="csv of their own"):
+            write_flights([circle], tmp_path / "c.csv", forces=tmp_path / name)
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"):
+        write_flights([circle], tmp_path / "c.csv", forces=tmp_path / "file" / "f.csv")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert math.isclose(circle.time[-1], 4.0)
+
+
+# a trajectory is one place: a subclass of `Shape`, here in a module made for the test
+
+SQUIRCLE = '''
+"""A rounded square."""
+
+import jax.numpy as jnp
+
+from sim_jax.trajectory import Shape
+from sim_jax.geometry import Vec3
+
+
+class Squircle(Shape):
+    name = "squircle"
+    peak_speed = 1.5
+    peak_acceleration = 2.0
+    extent = (1.25, 1.25)
+
+    def position(self, angle):
+        x = jnp.cos(angle) + 0.25 * jnp.cos(3 * angle)
+        y = jnp.sin(angle) + 0.25 * jnp.sin(3 * angle)
+        return Vec3(self.radius * x, self.radius * y, jnp.zeros_like(angle)) + self.origin
+'''
+
+
+@pytest.fixture
+def squircle(tmp_path, monkeypatch):
+    """Write the module and import it; it is gone after the test."""
+    (tmp_path / "squircle_module.py").write_text(SQUIRCLE)
+    monkeypatch.syspath_prepend(tmp_path)
+    before = Shape.__subclasses__()
+    shape = importlib.import_module("squircle_module").Squircle
+    yield shape
+    del sys.modules["squircle_module"]
+    Shape.__subclasses__ = lambda: before  # the class itself outlives the test in JAX's caches
+
+
+def test_a_new_trajectory_is_simulated_and_proposed(squircle, tmp_path, capsys):
+    out = tmp_path / "flight.csv"
+    flown = ["simulate", "--trajectory", "squircle", "--radius", "1", "--speed", "1"]
+    assert main([*flown, "--duration", "4", "--out", str(out)]) == 0
+    table = np.genfromtxt(out, delimiter=",", names=True)
+    assert table["ref_x"][0] == pytest.approx(1.25)
+    assert abs(table["x"] - table["ref_x"]).max() < 0.2
+    names = [*candidates(Arena(8.0, 6.0, 3.0))]
+    assert "a squircle of 2 m radius at 1.5 m/s" in names
+    capsys.readouterr()
+    assert main(["simulate", "--trajectory", "square", "--out", str(out)]) == 2
+    assert squircle.name in capsys.readouterr().err

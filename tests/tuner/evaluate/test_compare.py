@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lxml import html
 
-from tests.tuner.evaluate.test_rmse import errors
+from tests.tuner.evaluate.test_comparison import errors
 from tuner.cli import main
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder

@@ -1,17 +1,33 @@
 """Open-loop predictions: the truth predicts, nothing of the flight ahead is looked at."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from benchmarks import fast_flights
+from benchmarks.prediction import (
+    HELD_OUT,
+    Regression,
+    cut,
+    options_for_set,
+    weighed_mass,
+    with_pose,
+)
+from tuner.config import resolve_settings
+from tuner.core.errors import InputError
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.prediction import FlightPredictor, Predictions, hold_state
+from tuner.evaluate.prediction import LAGS, FlightPredictor, Predictions, TorqueObserver, hold_state
 from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.objective.segments import stamped_earlier
+from tuner.options import Options
 from tuner.recordings.flight import Series
+from tuner.recordings.loader import InertialFlight
 from tuner.recordings.states import MIN_HALF_WIDTH_S
-from tuner.search.job_flights import Recording
+from tuner.search.job_flights import Recording, read_recordings
 from tuner.vehicle import ControllerFile, with_values
 
 
@@ -192,3 +208,168 @@ def test_rotors_of_a_window_followed_the_commands_at_their_corrected_times(full_
     )
     apart = np.abs(corrected - plain).max(axis=1)
     assert np.median(apart) < 1e-9  # few windows lack the commands before them
+
+
+# what turns a vehicle unseen: told from the samples before a prediction, and from them alone
+
+LASTS = 0.08
+"""s that the racer's hidden torques last."""
+
+
+@pytest.fixture(scope="module")
+def flights():
+    racer = fast_flights.drawn(4)
+    return racer, fast_flights.fly(racer, seed=4, seconds=7.0)
+
+
+@pytest.fixture(scope="module", params=["rotor_speed", "command"])
+def flown(request, flights, tmp_path_factory):
+    """The racer as it is, its recordings and what observes it."""
+    folder, (racer, signals) = tmp_path_factory.mktemp("fast"), flights
+    paths = fast_flights.write(racer, signals, folder, seed=4, fed=request.param)
+    settings = resolve_settings(
+        Options([str(path) for path in paths], config=str(folder / "tune.yaml"))
+    )
+    recordings, _ = read_recordings(settings)
+    motor = {
+        "input_scaling": fast_flights.FASTEST - fast_flights.IDLE,
+        "zero_position_armed": fast_flights.IDLE,
+        "time_constant_up": fast_flights.MOTOR_LAG,
+        "time_constant_down": fast_flights.MOTOR_LAG,
+    }
+    vehicle = with_values(settings.vehicle, racer.values | motor)
+    known = [(r.flight, r.inlet, 0.0) for r in recordings if not r.holdout]
+    observer = TorqueObserver.of(vehicle, settings.controller, known)
+    return vehicle, settings.controller, recordings, observer
+
+
+def test_a_hidden_torque_lasts_as_long_as_it_was_made_to(flown):
+    *_, observer = flown
+    early = LAGS <= 0.05
+    made = np.exp(-LAGS[early] / LASTS)
+    for axis in (0, 1):  # about z it is as small as the gyro's noise
+        np.testing.assert_allclose(observer.autocorrelation[early, axis], made, atol=0.13)
+    assert not observer.autocorrelation[-1].any()
+
+
+def test_what_is_known_of_it_predicts_turning_better(flown):
+    vehicle, controller, recordings, observer = flown
+    for recording in recordings:
+        if not recording.holdout:
+            continue
+        predictor = FlightPredictor(recording.flight, recording.inlet, stride=0.05)
+        alone, observed = (predictor.predict(vehicle, controller, of) for of in (None, observer))
+        for seconds, quantity, most in ((0.05, "body_rate", 0.75), (0.1, "attitude", 0.75)):
+            assert observed.mean(seconds)[quantity] < most * alone.mean(seconds)[quantity]
+
+
+def test_it_is_told_by_no_sample_that_is_yet_to_come(flown):
+    *_, recordings, observer = flown
+    flight, inlet = recordings[0].flight, recordings[0].inlet
+    begins = np.array([1.0, 3.0, 5.0])
+
+    def moment(given):
+        acting = observer.disturbance((given, inlet, 0.0), begins).moment
+        return np.stack([acting.x, acting.y, acting.z])
+
+    series = dict(flight.series)
+    for name in ("body_rate", "rotor_speed", "command"):
+        if name in series:
+            rows = series[name]
+            filtered = MIN_HALF_WIDTH_S if name == "body_rate" else 1e-9
+            later = (rows.time > 3.0 + filtered)[:, None]
+            series[name] = Series(rows.time, np.where(later, 0.9 * rows.values, rows.values))
+    here, elsewhere = moment(flight), moment(replace(flight, series=series))
+    np.testing.assert_array_equal(elsewhere[..., :2], here[..., :2])
+    assert np.abs(elsewhere[..., 2] - here[..., 2]).max() > 1e-3
+
+
+def test_noise_alone_is_not_carried_on(full_flight, updated):
+    gyro = full_flight.series["body_rate"]
+    noisy = gyro.values + 0.01 * np.random.default_rng(0).normal(size=gyro.values.shape)
+    series = dict(full_flight.series) | {"body_rate": Series(gyro.time, noisy)}
+    flight = replace(full_flight, series=series)
+    observer = TorqueObserver.of(updated, ControllerFile(), [(flight, "rotor_speed", 0.0)])
+    predictor = FlightPredictor(flight, "rotor_speed", stride=0.2)
+    alone, observed = (predictor.predict(updated, ControllerFile(), of) for of in (None, observer))
+    for seconds in (0.1, 0.5):
+        assert observed.mean(seconds) == pytest.approx(alone.mean(seconds), rel=0.05)
+
+
+def test_a_flight_that_no_recorded_rotor_turns_tells_nothing(full_flight, updated):
+    fed = (full_flight, "attitude", 0.0)
+    assert TorqueObserver.of(updated, ControllerFile(), [fed]) is None
+    by_rotors = (full_flight, "rotor_speed", 0.0)
+    observer = TorqueObserver.of(updated, ControllerFile(), [fed, by_rotors])
+    assert observer.disturbance(fed, np.array([1.0])) is None
+
+
+# the predictors that a fit is held against, and what a set of recordings is fitted with
+
+
+def test_linear_regression_predicts_better_than_one_that_holds(full_flight):
+    begins, ahead = np.arange(0.2, 5.0, 0.1), np.arange(1, 51) * 0.01
+    regression = Regression.of([full_flight], "rotor_speed")
+    predicted = regression.predict(full_flight, begins, ahead)
+    naive = hold_state(full_flight, begins, ahead)
+    for name in ("position", "velocity", "attitude"):
+        assert predicted.mean(0.5)[name] < 0.3 * naive.mean(0.5)[name], name
+    assert predicted.errors["body_rate"].shape == (50, len(begins))
+
+
+def test_a_set_brings_its_own_job_or_two_flights_are_held_out(tmp_path):
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    with pytest.raises(InputError, match="holds no recording"):
+        options_for_set(folder)
+    for name in ("a.csv", "b.csv", "c.csv", "d.csv", "README.md", "LICENSE"):
+        (folder / name).write_text("")
+    options = options_for_set(folder)
+    assert [path.rsplit("/", 1)[1] for path in options.flights] == [f"{n}.csv" for n in "abcd"]
+    assert options.holdout == ["c", "d"]
+    assert options.config is None
+    (folder / "tune.yaml").write_text("holdout: [a]")
+    assert options_for_set(folder).holdout is None
+    assert options_for_set(folder).config == str(folder / "tune.yaml")
+    known = tmp_path / "nanobench"
+    folder.rename(known)
+    (known / "tune.yaml").unlink()
+    assert options_for_set(known).config.endswith("configs/jobs/crazyflie.yaml")
+    assert options_for_set(known).holdout == list(HELD_OUT["nanobench"])
+
+
+def test_the_second_half_of_a_flight_is_that_half(full_flight):
+    half = cut(full_flight, 0.5, 1.0)
+    assert half.duration == pytest.approx(full_flight.duration / 2, abs=0.02)
+    shift = full_flight.time[-1] - half.time[-1]
+    there = np.searchsorted(full_flight.time, shift + half.time[10] - 1e-9)
+    np.testing.assert_array_equal(
+        half.signals["position"][10], full_flight.signals["position"][there]
+    )
+    begin = full_flight.signals["position"][there - 10]
+    np.testing.assert_allclose(half.initial.position, begin, atol=0.01)
+    last = full_flight.series["rotor_speed"].time[-1] - shift
+    assert half.series["rotor_speed"].time[-1] == pytest.approx(last)
+
+
+def test_the_mass_beside_a_flight_is_read(tmp_path):
+    path = tmp_path / "info1.yaml"
+    path.write_text("motors: upgraded\nmass: 0.0375\n")
+    assert weighed_mass(path) == 0.0375
+    path.write_text("motors: upgraded\n")
+    with pytest.raises(InputError, match="no mass"):
+        weighed_mass(path)
+
+
+def test_the_attitude_of_a_flight_without_a_pose_is_that_of_its_gyro(full_flight):
+    series = {name: full_flight.series[name] for name in ("body_rate", "command")}
+    begin, end = 1.0, full_flight.duration - 1.0
+    flight = with_pose(InertialFlight("a", "a", series, ((begin, end),), ()))
+    assert flight.duration == pytest.approx(end - begin, abs=0.02)
+    recorded = full_flight.signals["attitude"]
+    turned = Rotation.from_quat(
+        recorded[np.searchsorted(full_flight.time, [begin, begin + 2.0])], scalar_first=True
+    )
+    there = Rotation.from_quat(flight.signals["attitude"][200], scalar_first=True)
+    error = (turned[0].inv() * turned[1]).inv() * there
+    assert error.magnitude() < 0.02

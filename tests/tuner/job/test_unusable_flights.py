@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim_jax.schedule import Schedule
-from tests.tuner.evaluate.test_rmse import errors
+from tests.tuner.evaluate.test_comparison import errors
 from tests.tuner.recorded import recordings_of
 from tuner.config import JobFile, Search, resolve_settings
 from tuner.core.errors import ConfigError, RecordingError

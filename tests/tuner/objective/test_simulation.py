@@ -2,29 +2,43 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
+from typing import get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from lanes import Run, joined
-from sim_jax.inlet import ActuatorInlet
+from lanes.machine import digest_of
+from lanes.program import _program_of
+from sim_jax import terms
+from sim_jax.inlet import ActuatorInlet, Inlet, MixedInlet
 from sim_jax.rollout import rollout
 from sim_jax.state import AIRBORNE, hover
 from tests.sim_jax.support import controller, vec
 from tests.sim_jax.test_rotor_counts import SCHEDULE, STEPS, round_airframe
 from tests.tuner.recorded import recordings_of
-from tuner.config import resolve_settings
+from tests.tuner.uncertainty.making import criterion_of, problem
+from tuner.config import CHANNELS, InletName, JobFile, Search, resolve_settings
+from tuner.core.errors import RecordingError
+from tuner.findings.findings import Code, one_line
 from tuner.objective import simulation
+from tuner.objective.initial_conditions import STATES
+from tuner.objective.inlets import INLETS
 from tuner.objective.segments import Segments
+from tuner.objective.setpoints import match_setpoints, setpoint_findings
 from tuner.objective.simulation import beginning_of, recorded_of
 from tuner.options import Options
+from tuner.recordings.flight import Series
+from tuner.recordings.inspector import inlet_reports
+from tuner.search.job_flights import choose_inlet, inlet_for
 from tuner.search.problem import job_of
+from tuner.vehicle import COEFFICIENTS, ControllerFile
 from tuner.vehicle.model import Model, coefficients_in, with_coefficients
-
-pytestmark = pytest.mark.usefixtures("optimised")
 
 MOVING = ("inertia_xx", "time_constant_up", "rotor_drag_coefficient", "estimate_latency")
 SAMPLES = 120
@@ -39,6 +53,7 @@ def objective(request, flight, full_flight, updated):
     return job.windows or job.objective
 
 
+@pytest.mark.usefixtures("optimised")
 def test_a_kernel_flies_as_jax_does_and_so_do_its_derivatives(objective):
     model = objective.model_at(objective.space.initial)
     segments, schedule = objective.segments, objective.schedule
@@ -88,6 +103,7 @@ def test_a_kernel_flies_as_jax_does_and_so_do_its_derivatives(objective):
         np.testing.assert_allclose(columns / scale, slope / scale, atol=1e-8)
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("effects", [{}, {"linear_drag_x": np.asarray(0.1)}])
 def test_six_rotors_fly_from_where_they_were_recorded(effects):
     """In the base model, and with a term, with which all others are computed."""
@@ -103,6 +119,7 @@ def test_six_rotors_fly_from_where_they_were_recorded(effects):
     np.testing.assert_allclose(place, np.broadcast_to([0.0, 0.0, 1.0], place.shape), atol=1e-6)
 
 
+@pytest.mark.usefixtures("optimised")
 @pytest.mark.parametrize("tangents", [None, {"mass": np.ones(1)}])
 def test_channels_in_another_order_are_no_other_program(monkeypatch, tangents):
     """Recordings name them in theirs, and what a search cuts out of a problem in the alphabet's."""
@@ -131,6 +148,7 @@ def test_channels_in_another_order_are_no_other_program(monkeypatch, tangents):
     assert asked[0] == asked[1]
 
 
+@pytest.mark.usefixtures("optimised")
 def test_what_is_differentiated_flies_without_derivatives_by_the_same_program(monkeypatch):
     """Channels that only a flight without derivatives logs are in it, too."""
     craft = round_airframe(4)
@@ -162,3 +180,231 @@ def test_what_is_differentiated_flies_without_derivatives_by_the_same_program(mo
     assert len(asked) == 2
     for name, values in apart.channels.items():
         np.testing.assert_allclose(still.channels[name], values, rtol=1e-12, atol=1e-12)
+
+
+# every inlet of the simulator has one class that feeds it, and every table names the same ones
+
+
+def test_every_inlet_has_one_name_in_job_files_and_inspections():
+    names = list(INLETS)
+    assert list(get_args(InletName)) == names
+    assert [inlet.name for inlet in inlet_reports({}, trajectory=False)] == names
+
+
+def test_every_inlet_of_the_simulator_is_fed_by_one_class():
+    feeds = [get_type_hints(type(inlet).lay_out)["return"] for inlet in INLETS.values()]
+    assert len(set(feeds)) == len(feeds)
+    own = {kind for kind in Inlet.__subclasses__() if kind.__module__ == Inlet.__module__}
+    assert set(feeds) == own - {MixedInlet}  # a test may have brought one of its own
+
+
+@pytest.mark.parametrize("inlet", INLETS.values(), ids=lambda inlet: inlet.name)
+def test_channels_and_states_that_an_inlet_ignores_exist(inlet, flight):
+    assert set(inlet.not_compared) <= set(CHANNELS)
+    assert set(inlet.ignores) <= set(STATES)
+    assert inlet.can_be_fed(flight) == all(flight.has(signal) for signal in inlet.needs)
+
+
+@pytest.mark.parametrize(
+    ("part", "without"),
+    [("motors", {"rotor_speed"}), ("turning", {"attitude"}), ("", set())],
+)
+def test_a_coefficients_row_says_which_inlets_say_nothing_of_it(part, without, monkeypatch):
+    row = replace(COEFFICIENTS["mass"], name="gadget", part=part)
+    monkeypatch.setitem(COEFFICIENTS, "gadget", row)
+    assert {name for name, inlet in INLETS.items() if "gadget" in inlet.bypasses} == without
+
+
+def test_an_inlet_that_a_recording_cannot_feed_names_the_missing_signals(flight):
+    without = type(flight)(**(vars(flight) | {"signals": {}}))
+    with pytest.raises(RecordingError, match="no rate_setpoint and no thrust_setpoint"):
+        inlet_for(without, "body_rate")
+    with pytest.raises(RecordingError, match="neither a reference"):
+        inlet_for(without, "auto")
+
+
+# recorded rate set-points against those of the controller file: factor, delay, bias, heading
+
+OURS = ControllerFile()
+
+
+def with_setpoints(flight, change):
+    series = flight.series["rate_setpoint"]
+    changed = Series(series.time, change(series.values))
+    return replace(flight, series={**flight.series, "rate_setpoint": changed})
+
+
+def test_the_controller_that_flew_is_recognised(flight):
+    match = match_setpoints(flight, OURS)
+    assert match.is_ours
+    assert match.heading_is_ours
+    for axis in match.axes[:2]:
+        assert axis.gain == pytest.approx(1.0, abs=0.05)
+        assert axis.correlation > 0.98
+        assert abs(axis.bias) < 0.01
+    assert setpoint_findings(flight, OURS) == ()
+    assert choose_inlet(flight, "auto", None, OURS) == ("reference", None)
+
+
+def test_a_flight_is_matched_within_a_blink(flight):
+    """XLA once computed anew for each result what several share: three seconds a flight."""
+    match_setpoints(flight, OURS)
+    before = time.process_time()
+    match_setpoints(flight, OURS)
+    assert time.process_time() - before < 0.5
+
+
+def test_another_attitude_law_is_reported_before_the_search(flight):
+    lee = OURS.replace(attitude=OURS.attitude.replace(law="rotation_matrix"))
+    findings = setpoint_findings(flight, lee)
+    assert {finding.code for finding in findings} == {Code.SETPOINTS_SCALED}
+    line = one_line(findings[0])
+    assert "Roll rate set-points are 0.5 times the controller file's" in line
+    assert "as those of the quaternion law would be" in line
+
+
+def test_a_gain_and_a_bias_are_distinguished(flight):
+    tripled = with_setpoints(flight, lambda values: values * [1.0, 3.0, 1.0])
+    (finding,) = setpoint_findings(tripled, OURS)
+    assert (finding.code, finding.names) == (Code.SETPOINTS_SCALED, ("pitch", ""))
+    assert finding.numbers["gain"] == pytest.approx(3.0, rel=0.05)
+    (finding,) = setpoint_findings(with_setpoints(flight, lambda v: v + np.eye(3)[0] * 0.2), OURS)
+    assert finding.code is Code.SETPOINTS_BIASED
+    assert finding.numbers == {"roll": pytest.approx(0.2, abs=0.01)}
+
+
+def test_a_noisy_attitude_is_no_smaller_gain(flight):
+    """Its noise makes the computed set-points larger than those that were recorded."""
+    series = flight.series["attitude"]
+    noise = Rotation.from_rotvec(0.25 * np.random.default_rng(0).normal(size=(len(series.time), 3)))
+    turned = Rotation.from_quat(series.values, scalar_first=True) * noise
+    read = Series(series.time, turned.as_quat(scalar_first=True))
+    noisy = replace(flight, series={**flight.series, "attitude": read})
+    roll, pitch, _ = match_setpoints(noisy, OURS).axes
+    assert max(roll.gain, pitch.gain) < 1.0 / 1.4
+    assert not any(f.code is Code.SETPOINTS_SCALED for f in setpoint_findings(noisy, OURS))
+
+
+def test_set_points_that_answer_an_old_state_are_reported(flight):
+    prompt = match_setpoints(flight, OURS).delay
+    assert prompt < 0.03
+    series = dict(flight.series)
+    for name in ("position", "velocity", "attitude"):
+        if name in series:
+            series[name] = Series(series[name].time - 0.048, series[name].values)
+    held_back = replace(flight, series=series)
+    assert match_setpoints(held_back, OURS).delay == pytest.approx(prompt + 0.048, abs=0.005)
+    (finding,) = setpoint_findings(held_back, OURS)
+    assert finding.code is Code.SETPOINTS_LATE
+    assert "ms old" in one_line(finding)
+
+
+def test_set_points_of_another_controller_enter_below_the_reference(flight):
+    foreign = with_setpoints(flight, lambda values: values[::-1] * [1.0, -1.0, 1.0])
+    inlet, because = choose_inlet(foreign, "auto", None, OURS)
+    assert inlet == "body_rate"
+    assert because.code is Code.SETPOINTS_FOREIGN
+    assert choose_inlet(foreign, "reference", None, OURS) == ("reference", None)
+
+
+def test_a_heading_flown_by_hand_is_recognised(flight):
+    time = flight.series["rate_setpoint"].time
+    stick = 0.5 * np.sign(np.sin(1.3 * time))[:, None] * [0.0, 0.0, 1.0]
+    flown = with_setpoints(flight, lambda values: values * [1.0, 1.0, 0.0] + stick)
+    codes = [finding.code for finding in setpoint_findings(flown, OURS)]
+    assert codes == [Code.HEADING_FLOWN]
+
+
+# other recordings, lengths, bounds and free coefficients find the program built for the first
+
+
+def built(objective):
+    """Return how many programs a Jacobian of a problem has built."""
+    before = _program_of.cache_info().misses
+    objective.sums(objective.start(objective.space.initial), criterion_of(objective))
+    return _program_of.cache_info().misses - before
+
+
+def shortened(flight, seconds):
+    """Return a flight without its last seconds."""
+    kept = flight.time <= flight.time[-1] - seconds
+    end = flight.time[kept][-1]
+    return replace(
+        flight,
+        time=flight.time[kept],
+        signals={name: rows[kept] for name, rows in flight.signals.items()},
+        series={
+            name: Series(signal.time[signal.time <= end], signal.values[signal.time <= end])
+            for name, signal in flight.series.items()
+        },
+    )
+
+
+@pytest.mark.parametrize("free", [("inertia_zz", "mass", "moment_constant"), ("estimate_latency",)])
+def test_other_coefficients_and_bounds_are_the_same_program(free):
+    built(problem(("inertia_xx", "motor_constant")))
+    prior = {"coefficients": {free[0]: {"prior": {"mean": 0.03, "sd": 0.01}}}}
+    assert built(problem(free, job=prior)) == 0
+
+
+def test_a_flight_of_another_length_needs_no_other_program(flight, updated):
+    settings = resolve_settings(Options(flights=(str(flight.path),), vehicle=updated))
+    whole, part = (
+        job_of(settings, recordings_of(settings, [each])).objective
+        for each in (flight, shortened(flight, 7.3))
+    )
+    assert whole.samples != part.samples
+    built(whole)
+    assert built(part) == 0
+
+
+def test_windows_from_recorded_and_from_free_starts_are_the_same_program(full_flight, updated):
+    settings = resolve_settings(Options(flights=(str(full_flight.path),), vehicle=updated))
+    windows = JobFile(free=("motor_constant",), inlet="actuator", search=Search(window=0.5))
+    settings = replace(settings, job=windows)
+    recorded = job_of(settings, recordings_of(settings, [full_flight])).objective
+    assert recorded.segments.start_sd is None
+    sd = np.ones((len(recorded.segments.free_rows), recorded.segments.count))
+    free = replace(recorded, segments=replace(recorded.segments, start_sd=sd))
+    built(recorded)
+    assert built(free) == 0
+
+
+def test_programs_of_flights_are_kept_for_other_processes():
+    assert digest_of((simulation._flight, terms.TERMS), simulation.CODE)
+
+
+def test_columns_do_not_depend_on_other_free_coefficients():
+    groups = ("inertia_xx", "inertia_zz", "mass"), ("motor_constant", "moment_constant")
+    fit = problem((*groups[0], *groups[1]))
+    names, criterion = list(fit.space.names), criterion_of(fit)
+    together = fit.jacobian(fit.start(fit.space.initial), criterion)
+    for group in groups:
+        part = problem(group)
+        alone = part.jacobian(part.start(part.space.initial), criterion)
+        for channel, columns in alone.columns.items():
+            for number, name in enumerate(part.space.names):
+                np.testing.assert_allclose(
+                    together.columns[channel][names.index(name)],
+                    columns[number],
+                    rtol=1e-9,
+                    atol=1e-9,
+                )
+            offsets = together.columns[channel][len(names) :]
+            np.testing.assert_allclose(offsets, columns[len(group) :], rtol=1e-9, atol=1e-9)
+
+
+def test_segments_give_the_same_sums_one_at_a_time_as_many_at_once():
+    """Those that the memory does not hold at once take turns."""
+    fit = problem(("inertia_xx", "time_constant_up"))
+    which = np.arange(11) % fit.segments.count
+    segments = jax.tree.map(lambda leaf: np.asarray(leaf)[..., which], fit.segments)
+    many = replace(fit, segments=replace(segments, flight=np.arange(len(which))))
+    small = replace(many, memory=1)
+    point = many.start(np.asarray(many.space.initial))
+    want = many.sums(point, criterion_of(many))
+    got = small.sums(point, criterion_of(small))
+    np.testing.assert_allclose(got.hessian, want.hessian, rtol=1e-12)
+    np.testing.assert_allclose(got.loss, want.loss, rtol=1e-12)
+    alone, beside = (of.jacobian(point, criterion_of(of)) for of in (small, many))
+    jax.tree.map(np.testing.assert_array_equal, alone, beside)

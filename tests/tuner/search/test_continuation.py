@@ -1,6 +1,10 @@
 """The growing horizon on two short simulated flights whose truth is known."""
 
+import importlib
+import sys
+from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -8,14 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tuner.uncertainty.making import problem
+from tests.tuner.uncertainty.making import NOISE, PHYSICS, problem, truth, with_data
 from tuner.objective.criterion import Point, picked
+from tuner.objective.initial_conditions import ROWS, start_sd_of_spin
 from tuner.objective.normal_equations import normal_equations, sums_at
-from tuner.objective.segments import OFFSETS
+from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search import continuation, optimisers
-from tuner.search.continuation import _clocks_that_differ, run_stages
-from tuner.search.progress import criterion_of, initial_progress
-from tuner.search.stages import schedule_of
+from tuner.search.continuation import OPTIMISERS, _clocks_that_differ, run_stages
+from tuner.search.optimisers import MAX_STATE_SD, estimated_states, need_relinearising
+from tuner.search.progress import Loop, criterion_of, initial_progress, loop_of, with_loop
+from tuner.search.stages import WHOLE_LENGTH, Stage, plan, schedule_of
 
 FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input_scaling")
 
@@ -132,3 +138,290 @@ def test_a_stage_begins_with_the_trust_that_the_last_one_earned(fit):
     for old, new in borders:
         assert new.damping == pytest.approx(min(old.damping, 1.0)) or new.damping == 1.0, new.stage
     assert borders[-1][1].damping < 1e-2
+
+
+# an optimiser is added by one function: a stage names it, and so does a search's method
+
+OF_THREE = ("inertia_zz", "motor_constant", "moment_constant")
+MODULE = '''
+import numpy as np
+
+from tuner.objective.normal_equations import evaluate
+from tuner.objective.criterion import Point, picked
+from tuner.search.continuation import OPTIMISERS
+from tuner.search.progress import Iterate
+
+
+def coordinate_search(problem):
+    """Try each coefficient a little higher and lower; halve the step when none helps."""
+    width, vector = 0.2, np.asarray(problem.points.coefficients[problem.best])
+    while True:
+        reach = width * np.eye(len(vector))[problem.free.coefficients]
+        tried = np.concatenate([vector[None], vector + reach, vector - reach])
+        point = picked(problem.points, problem.best)
+        losses = np.asarray(evaluate(problem.objective, tried, point, problem.criterion).loss)
+        best = int(np.argmin(losses.sum(axis=-1)))
+        width, vector = width if best else 0.5 * width, tried[best]
+        yield Iterate(
+            points=Point(vector[None], problem.points.offsets),
+            losses=np.array([float(losses[best].sum())]),
+            accepted=np.array([best > 0]),
+            position_rmse=float("nan"),
+            converged=width < 1e-3,
+        )
+
+
+OPTIMISERS["coordinate_search"] = coordinate_search
+'''
+
+
+@pytest.fixture
+def added(tmp_path, monkeypatch):
+    """The name of an optimiser that a module of its own adds."""
+    (tmp_path / "coordinate_search.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.import_module("coordinate_search")
+    yield "coordinate_search"
+    del OPTIMISERS["coordinate_search"], sys.modules["coordinate_search"]
+
+
+def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
+    fit = problem(OF_THREE)
+    rate = float(fit.schedule.log_rate)
+    stages = plan(added, fit.samples, rate, windows=False, robust=False, steps=40)
+    stages = [stage for stage in stages if stage.name in ("first 3 s", WHOLE_LENGTH)]
+    reports = []
+    start = np.asarray(fit.space.initial) + np.array([0.3, -0.2, 0.0])
+    progress = run_stages(
+        fit,
+        tuple(stages),
+        initial_progress(fit, start[None]),
+        free=Point(np.array([True, True, False]), np.zeros((len(OFFSETS), 2), bool)),
+        undecided={},
+        on_progress=reports.append,
+    )
+    assert {report.iterations[-1].stage for report in reports} == {"first 3 s", WHOLE_LENGTH}
+    assert reports[-1].iterate.points is progress.points
+    assert progress.points.coefficients[0] == pytest.approx(fit.space.initial, abs=0.01)
+    assert all(iteration.damping is None for iteration in progress.iterations)
+
+
+def test_least_squares_reports_its_damping():
+    fit = problem(OF_THREE)
+    stage = plan("gradient", fit.samples, 200.0, windows=False, robust=False, steps=3)[3]
+    progress = run_stages(
+        fit,
+        (stage,),
+        initial_progress(fit, np.asarray(fit.space.initial)[None] + [[0.05], [0.06]]),
+        free=Point(np.ones(len(OF_THREE), bool), np.zeros((len(OFFSETS), 2), bool)),
+        undecided={},
+        on_progress=lambda _: None,
+    )
+    first, second, *_ = (iteration.damping for iteration in progress.iterations)
+    assert first == 1.0
+    assert second == pytest.approx(0.2)  # the model predicted well: five times longer a step
+
+
+# what is undecided of the loop is decided by the recordings
+
+FRAME = {"marker_tilt_x": 0.0105, "marker_tilt_y": -0.0157, "motor_constant": 1.5e-5}
+
+
+@pytest.mark.parametrize("flown", [0.0, 1.0])
+@pytest.mark.parametrize("written", [0.0, 1.0])
+def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, written):
+    free = problem(tuple(FRAME))
+    truth = Point(jnp.asarray(free.space.vector_of(FRAME)), free.start(free.space.initial).offsets)
+    noise = np.random.default_rng(3)
+    recorded = with_data(with_loop(free, Loop(sees_markers=flown)), truth, noise=noise)
+    fit = with_loop(recorded, Loop(sees_markers=written))
+    progress = run_stages(
+        fit,
+        schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=10),
+        initial_progress(fit, np.asarray(fit.space.initial)[None]),
+        free=Point(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
+        undecided={"sees_markers": np.ones(2, bool)},
+        on_progress=lambda _: None,
+    )
+    assert progress.loop == Loop(sees_markers=flown)
+    assert loop_of(with_loop(fit, progress.loop)).sees_markers == flown
+    found = fit.space.numbers(progress.points.coefficients[0])
+    for name, value in FRAME.items():
+        assert float(found[name]) == pytest.approx(value, rel=0.05)
+
+
+def test_who_sees_the_markers_is_tried_from_where_the_search_began():
+    """By another choice the first seconds lead the markers to where none of them flies."""
+    fit = problem(tuple(FRAME))
+    stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=2)
+    at = next(number for number, stage in enumerate(stages) if stage.tries_choices)
+    start = initial_progress(fit, np.asarray(fit.space.initial)[None])
+    astray = start.points.coefficients + 3.0
+    reports, seen = [], Loop(sees_markers=1.0)
+    there = replace(start, stage=at, points=Point(astray, start.points.offsets))
+    progress = run_stages(
+        with_loop(with_data(with_loop(fit, seen), fit.start(fit.space.initial)), Loop()),
+        stages[: at + 1],
+        there,
+        free=Point(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
+        undecided={"sees_markers": np.ones(2, bool)},
+        on_progress=reports.append,
+        start=start,
+    )
+    assert progress.loop == seen
+    np.testing.assert_allclose(progress.points.coefficients, start.points.coefficients, atol=1e-3)
+    for report in reports:  # a checkpoint of them begins with the stage again
+        np.testing.assert_array_equal(report.points.coefficients, astray)
+        assert (report.stage, report.loop) == (at, start.loop)
+        assert len(report.iterations) == report.evaluations == report.steps
+
+
+@pytest.mark.parametrize("flown", [0.0, 1.0])
+def test_saturation_feedback_is_decided_by_the_flights_that_clip(flown):
+    """The other was recorded metres away, which takes up most of the loss."""
+    fit, turning = problem(("inertia_zz",)), jnp.asarray([0.0, 12.0])
+    fit = eqx.tree_at(lambda o: o.segments.inlet.yaw_rate, fit, turning)
+    recorded = with_data(with_loop(fit, Loop(flown)), fit.start(fit.space.initial))
+    recorded = with_loop(recorded, Loop(1.0 - flown))
+    away = np.array([2000.0, 0.0]) * NOISE["position"]
+    fit = eqx.tree_at(
+        lambda o: o.segments.measured["position"].values, recorded, replace_fn=lambda p: p + away
+    )
+    stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=4)
+    stages = [stage for stage in stages if stage.tries_choices]
+    progress = run_stages(
+        fit,
+        tuple(stages),
+        initial_progress(fit, np.asarray(fit.space.initial)[None]),
+        free=Point(np.ones(1, bool), np.zeros((len(OFFSETS), 2), bool)),
+        undecided={"saturation_feedback": np.array([False, True])},
+        on_progress=lambda _: None,
+    )
+    assert progress.loop.saturation_feedback == flown
+
+
+# clocks that recordings can do without are right; those that differ from the others stay late
+
+COUNT, POSE = 3, 0
+KNOWN, ALONE = 1e4, 10.0
+"""Information about latency and clock together, and about each clock by itself."""
+
+
+def stays(monkeypatch, late):
+    """Return which pose clocks stay, of flights whose poses are late by so much at the minimum.
+
+    What is recorded says when the vehicle moved: latency (the one coefficient) and clock together.
+    """
+    kinds = len(OFFSETS)
+    rows = np.zeros((COUNT, 1 + kinds * COUNT))
+    rows[:, 0] = 1.0
+    rows[np.arange(COUNT), 1 + POSE * COUNT + np.arange(COUNT)] = 1.0
+    hessian = KNOWN * rows.T @ rows + ALONE * np.eye(1 + kinds * COUNT)
+    monkeypatch.setattr(
+        continuation, "normal_equations", lambda *_: (100.0, np.zeros(len(hessian)), hessian)
+    )
+    objective = SimpleNamespace(space=[None], flights=COUNT, flight=np.arange(COUNT))
+    offsets = np.zeros((1, kinds, COUNT))
+    offsets[0, POSE] = late
+    offsets[0, -1] = 1.0  # a gyro's bias is no clock
+    points = Point(jnp.zeros((1, 1)), jnp.asarray(offsets))
+    free = Point(np.ones(1, bool), np.ones(offsets.shape[1:], bool))
+    problem = SimpleNamespace(objective=objective, points=points, criterion=None, free=free)
+    stay = continuation._clocks_that_differ(problem, 0, np.zeros(1))
+    assert stay[2:].all()
+    return stay[POSE].tolist()
+
+
+@pytest.mark.parametrize(
+    ("late", "stay"),
+    [
+        ((0.0, 0.0, 0.0), [False, False, False]),
+        ((0.2, 0.2, 0.2), [False, False, False]),  # latency explains it as well
+        ((0.2, 0.2, 0.5), [False, False, True]),
+        ((0.0, 0.002, 0.0), [False, False, False]),
+    ],
+)
+def test_clocks_stay_late_only_where_nothing_else_explains_it(monkeypatch, late, stay):
+    assert stays(monkeypatch, late) == stay
+
+
+def test_commands_are_read_exactly_at_the_clocks_in_seconds():
+    offsets = np.full((5, 3), 2.0)  # of 10 ms each, as a `Point` has them
+    criterion = criterion_of(Stage("polish", 100), {}, offsets)
+    np.testing.assert_allclose(criterion.reference_offset, np.full((len(CLOCKS), 3), 0.02))
+
+
+# a search whose segments' starts are free: the losses it compares are those of its points
+
+OF_SPIN = ("inertia_zz", "moment_constant", "rotor_drag_coefficient")
+YAW = ROWS["rate_integral"].stop - 1
+OFF = 3.0
+"""Standard deviations by which the spin's integrator was off as the flight began."""
+
+
+def begun_elsewhere():
+    """Return a spin whose yaw integrator began far from where it is taken to begin, both free.
+
+    So far that what it does to the flight is no line.
+    """
+    fit = problem(OF_SPIN)
+    start_sd = start_sd_of_spin(np.array([0.0, 2.0]), PHYSICS, np.array([1e-4, 1e-4]))
+    start_sd = {row: 10.0 * sd for row, sd in start_sd.items()}
+    start = fit.segments.start
+    turned = start.rate_integral.z + OFF * start_sd[YAW]
+    there = replace(start, rate_integral=replace(start.rate_integral, z=turned))
+    flown = with_data(replace(fit, segments=replace(fit.segments, start=there)), truth(fit))
+    return replace(
+        fit,
+        segments=replace(
+            fit.segments,
+            measured=flown.segments.measured,
+            start_sd=jnp.asarray(np.stack([*start_sd.values()])),
+            free_rows=(*start_sd,),
+        ),
+    )
+
+
+@pytest.mark.parametrize("away", [0.05, 0.4])
+def test_a_search_ends_where_its_loss_is_least_from_the_start_that_it_found(away):
+    fit = begun_elsewhere()
+    rate = float(fit.schedule.log_rate)
+    *_, last = plan("gradient", fit.samples, rate, windows=False, robust=False, steps=60)
+    true = np.asarray(truth(fit).coefficients)
+    progress = run_stages(
+        fit,
+        (last,),
+        initial_progress(fit, true[None] + away),
+        free=Point(np.ones(len(OF_SPIN), bool), np.zeros((len(OFFSETS), 2), bool)),
+        undecided={},
+        on_progress=lambda _: None,
+    )
+    found = Point(progress.points.coefficients[0], progress.points.offsets[0])
+    criterion = criterion_of(last, progress.scales, np.asarray(found.offsets), progress.states)
+    sums = fit.sums(found, criterion, derivatives=False)
+    compared = sum(float(np.sum(n)) for n in sums.counts.values())
+    assert progress.states[-1] == pytest.approx([0.0, OFF], abs=0.01)
+    assert progress.losses[0] * compared == pytest.approx(0.5 * OFF**2, rel=0.01)  # its prior's
+    assert float(jnp.sum(sums.loss)) == pytest.approx(0.5 * OFF**2, rel=0.01)
+    assert np.asarray(found.coefficients) == pytest.approx(true, abs=1e-3)
+
+
+def test_an_initial_state_is_limited_and_kept_where_it_has_no_estimate():
+    fit = begun_elsewhere()
+    criterion = replace(
+        criterion_of(
+            plan("gradient", fit.samples, 200.0, windows=False, robust=False, steps=1)[-1],
+            {name: np.ones(2) for name in fit.segments.measured},
+            np.zeros((len(OFFSETS), 2)),
+        ),
+        states=np.zeros((3, 2)),
+    )
+    sums = fit.sums(truth(fit), criterion, derivatives=False)
+    before = np.array([[0.5, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    asked = replace(sums, states=np.array([[[np.nan, 1e9], [1.0, -2.0], [0.0, 0.0]]]))
+    expected = [[0.5, MAX_STATE_SD], [1.0, -2.0], [0.0, 0.0]]
+    np.testing.assert_array_equal(estimated_states(asked, 0, before), expected)
+    assert estimated_states(asked, 0, None) is None
+    assert need_relinearising(before, np.zeros((3, 2)))
+    assert not need_relinearising(before, before + 0.1)
+    assert not need_relinearising(None, None)

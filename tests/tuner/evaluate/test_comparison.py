@@ -1,10 +1,16 @@
+"""Flights of a model beside recordings: errors, laps, limits, and where they part."""
+
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
 from sim_jax.state import AIRBORNE, Limits
-from tuner.config import TrajectorySettings
+from tuner.config import TrajectorySettings, resolve_settings
+from tuner.core.shipped import find_config
 from tuner.evaluate.comparison import (
     Comparison,
     FlightErrors,
@@ -13,11 +19,16 @@ from tuner.evaluate.comparison import (
     rmse_of,
     wrap_degrees,
 )
+from tuner.evaluate.validation import flights_not_followed
+from tuner.findings.findings import Code, remedy, sentence
+from tuner.objective.segments import noise_of
 from tuner.objective.trajectory import with_named_reference
+from tuner.options import Options
 from tuner.recordings.flight import Series
-from tuner.search.job_flights import Recording
+from tuner.recordings.loader import load_flight
+from tuner.search.job_flights import Recording, read_recordings
 from tuner.search.problem import limits_of
-from tuner.vehicle import ControllerFile, with_values
+from tuner.vehicle import COEFFICIENTS, ControllerFile, read_vehicle, with_values
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
@@ -144,3 +155,96 @@ def test_a_named_trajectory_stands_in_for_a_reference(flight):
     assert named.yaw_rate_setpoint is None
     spin = with_named_reference(bare, TrajectorySettings(name="yaw_spin", yaw_rate=1.5))
     assert spin.yaw_rate_setpoint == 1.5
+
+
+# the recordings that ship with the project, flown with the truth that they were made with
+
+FLIGHTS = Path(__file__).parents[3] / "reference_flights"
+NAMES = sorted(path.stem for path in FLIGHTS.glob("*.bag"))
+
+
+@pytest.fixture(scope="module")
+def met():
+    truth = yaml.safe_load((FLIGHTS / "truth.yaml").read_text())
+    vehicle = with_values(read_vehicle(find_config("vehicles", "hovergames", Path())), truth)
+    shipped = ControllerFile()
+    controller = shipped.replace(mixer=shipped.mixer.replace(saturation_feedback=False))
+    flights = [load_flight(FLIGHTS / f"{name}.bag") for name in NAMES]
+    return noise_of(flights), Comparison([Recording(flight) for flight in flights], controller).fly(
+        vehicle
+    )
+
+
+def beside(noise, errors):
+    """Return the root mean square of what noise does not explain."""
+    return np.sqrt(np.maximum(np.mean(errors**2, axis=0) - noise**2, 0.0))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_flight_is_met_beside_its_measurement_noise(met, name):
+    noise, flown = met
+    errors = flown[name]
+    assert errors.crash_time is None
+    assert beside(noise["position"], errors.position.error).max() < 2e-3
+    assert beside(np.degrees(noise["attitude"]), errors.attitude.error).max() < 0.05
+
+
+# a fast lemniscate that a slightly weaker vehicle does not fly, and where it parts
+
+
+@pytest.fixture(scope="module")
+def weaker():
+    """The settings, the recordings, and what flies them with so much of the true thrust."""
+    names = ("lemniscate_4mps", "circle_3mps", "diagonal_3mps")
+    paths = [str(FLIGHTS / f"{name}.bag") for name in names]
+    settings = resolve_settings(Options(paths, config=str(FLIGHTS / "tune.yaml")))
+    recordings = read_recordings(settings, holdout=())[0]
+    truth = yaml.safe_load((FLIGHTS / "truth.yaml").read_text())
+    known = {name: value for name, value in truth.items() if name in COEFFICIENTS}
+    comparison = Comparison(recordings, settings.controller)
+
+    def fly(share):
+        lift = share * known["motor_constant"]
+        return comparison.fly(with_values(settings.vehicle, {**known, "motor_constant": lift}))
+
+    return SimpleNamespace(settings=settings, recordings=recordings), fly
+
+
+def test_a_loop_beyond_its_limit_is_named_with_the_time(weaker):
+    job, fly = weaker
+    (finding,) = flights_not_followed(job, fly(0.92))
+    assert (finding.code, finding.subject) == (Code.FLIGHT_NOT_FLOWN, "lemniscate_4mps")
+    assert 9.0 < finding.numbers["seconds"] < 15.0
+    assert finding.numbers["beyond"] > 0.4
+    assert finding.numbers["beyond_recorded"] < 0.1
+    assert "beyond that limit" in sentence(finding)
+    assert "max_feedback_acceleration" in remedy(finding)
+
+
+@pytest.mark.parametrize("share", [1.0, 1.08])
+def test_flights_that_are_all_flown_are_not(weaker, share):
+    job, fly = weaker
+    assert flights_not_followed(job, fly(share)) == ()
+
+
+def test_a_flight_that_is_odd_for_another_reason_says_nothing_of_the_limit(weaker):
+    job, _ = weaker
+    met = {
+        recording.flight.name: errors([[0.01, 0.0, 0.0]] * 90, [[0.0] * 3] * 90)
+        for recording in job.recordings
+    }
+    assert flights_not_followed(job, met) == ()
+    met["circle_3mps"] = errors([[0.01, 0, 0]] * 45 + [[0.5, 0, 0]] * 45, [[0.0] * 3] * 90)
+    (finding,) = flights_not_followed(job, met)
+    assert finding.subject == "circle_3mps"
+    assert finding.numbers["seconds"] == met["circle_3mps"].position.time[45]
+    assert "beyond" not in finding.numbers
+    assert "max_feedback" not in remedy(finding)
+
+
+def test_one_flight_has_no_peers(weaker):
+    job, _ = weaker
+    alone = SimpleNamespace(settings=job.settings, recordings=job.recordings[:1])
+    name = job.recordings[0].flight.name
+    far = {name: errors([[np.sqrt(0.5), 0, 0]] * 90, [[0.0] * 3] * 90)}
+    assert flights_not_followed(alone, far) == ()
