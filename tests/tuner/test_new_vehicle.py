@@ -89,6 +89,13 @@ def test_the_folder_of_the_first_file_is_made(tmp_path):
     assert read_vehicle(out).mass < 0.1
 
 
+def test_no_file_that_is_there_is_replaced(tmp_path, capsys):
+    (tmp_path / "quad.job.yaml").write_text("mine")
+    assert main(["new-vehicle", *QUAD, "--out", str(tmp_path / "quad.yaml")]) == 2
+    assert "quad.job.yaml: is there already" in capsys.readouterr().err
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+
+
 @pytest.mark.parametrize("out", [".", "/"])
 def test_a_folder_is_no_file(out, capsys):
     assert main(["new-vehicle", "--like", "crazyflie", "--out", out]) == 2

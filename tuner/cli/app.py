@@ -9,6 +9,7 @@ import shlex
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from io import TextIOWrapper
 from pathlib import Path
 from typing import NoReturn
@@ -162,9 +163,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
     TYPED_WORDS.set(shlex.join(["tune", *given]))
-    for name in ("stdout", "stderr"):  # closed, as by a daemon: the next file would take its place
-        if getattr(sys, name) is None:
-            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 (as long as the process)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:  # closed, as by a daemon: the next file would take its place
+            setattr(sys, name, Path(os.devnull).open(mode))  # noqa: SIM115 (as long as the process)
     for stream in (sys.stdout, sys.stderr):  # a terminal of another encoding lacks letters
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -221,5 +222,6 @@ def _help(arguments: Sequence[str]) -> str:
 
 
 def _print_error(line: str, status: int) -> int:
-    sys.stderr.write(printable(f"tune: {' '.join(line.split())}") + "\n")
+    with suppress(OSError):  # the status tells it where nothing can be written
+        print(printable(f"tune: {' '.join(line.split())}"), file=sys.stderr, flush=True)
     return status

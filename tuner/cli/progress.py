@@ -70,7 +70,7 @@ STAGE_PHRASES = {
 @contextmanager
 def progress_on_terminal(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
     """Yield a listener that shows a run on the terminal, or nothing; each message if verbose."""
-    from tuner.cli.results import WIDTH, estimates_table, folds_table
+    from tuner.cli.results import estimates_table, folds_table, line_width
     from tuner.findings.findings import shorten_finding
     from tuner.search.listener import SILENT, Listener
 
@@ -78,6 +78,7 @@ def progress_on_terminal(*, quiet: bool, verbose: bool = False) -> Iterator[List
         yield SILENT
         return
     screen = console()
+    width = line_width(screen) - 2
     search = _LiveLine(screen) if screen.is_terminal else _StageLines(screen)
 
     def show_estimates(estimates: Sequence[PointEstimate]) -> None:
@@ -90,7 +91,7 @@ def progress_on_terminal(*, quiet: bool, verbose: bool = False) -> Iterator[List
 
     shown = Listener(
         on_iteration=lambda iteration, _: search.show(iteration),
-        on_doubt=lambda finding: search.line(f"! {shorten_finding(finding, WIDTH - 2)}"),
+        on_doubt=lambda finding: search.line(f"! {shorten_finding(finding, width)}"),
         on_stop=search.line,
     )
     if verbose:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 #: Columns that a table may take, if need be beyond the terminal's, so that no number is cut.
 CONSOLE_WIDTH = 140
+#: Columns of a pipe or a file: no line is cut or wrapped.
+PIPE_WIDTH = 100_000
 
 
 class _Screen(Console):
@@ -48,9 +50,13 @@ class _Screen(Console):
 def console(width: int = CONSOLE_WIDTH) -> Console:
     """Return a console of at least so many columns, so that no number is cut."""
     fitting = _Screen(highlight=False, markup=False)
-    if fitting.width >= width:
-        return fitting
-    return _Screen(highlight=False, markup=False, width=width)
+    columns = max(fitting.width, width) if fitting.is_terminal else PIPE_WIDTH
+    return _Screen(highlight=False, markup=False, width=columns)
+
+
+def line_width(screen: Console) -> int:
+    """Return how many letters a line of a finished job may have."""
+    return WIDTH if screen.is_terminal else PIPE_WIDTH
 
 
 STYLE_OF_LOOK = {
@@ -157,7 +163,7 @@ def _cells(row: Row, comparison: Comparison) -> list[Cell | str]:
 
 
 WIDTH, LINES = 100, 30
-"""A finished job prints at most so many lines of each, without --verbose."""
+"""A finished job prints at most so many lines of each on a terminal, without --verbose."""
 MOST_FLIGHTS, MOST_WARNINGS, LEAST_COEFFICIENTS = 4, 6, 6
 DEFAULT_ORIGIN = "default"
 
@@ -166,6 +172,8 @@ def print_run(
     folder: Path, result: RunResult, *, seconds: float | None = None, verbose: bool = False
 ) -> None:
     """Print the outcome of a run, in no more than `LINES` lines unless verbose.
+
+    Lines are cut on a terminal alone.
 
     Parameters
     ----------
@@ -182,14 +190,16 @@ def print_run(
     if verbose:
         _print_sections(contents, lambda key: key != "provenance")
     screen = console(WIDTH)
-    for line in _summary(contents, result, seconds):
+    for line in _summary(contents, result, seconds, line_width(screen)):
         if isinstance(line, Table):
             screen.print(rich_table(line))
         else:
             screen.print(line, soft_wrap=True)
 
 
-def _summary(contents: Contents, result: RunResult, seconds: float | None) -> list[Text | Table]:
+def _summary(
+    contents: Contents, result: RunResult, seconds: float | None, width: int
+) -> list[Text | Table]:
     """Return the lines and tables of a finished job."""
     from tuner.report.outcome import flights_table, next_step, outcome
 
@@ -197,22 +207,25 @@ def _summary(contents: Contents, result: RunResult, seconds: float | None) -> li
     found = outcome(result, contents.bench, exports)
     lines: list[Text | Table] = [
         Text(
-            shorten(f"{found.usability.capitalize()}. {found.what}", WIDTH),
+            shorten(f"{found.usability.capitalize()}. {found.what}", width),
             f"bold {STYLE_OF_LOOK[found.look]}",
         ),
-        *(Text(line) for line in _origins(result)),
+        *(Text(line) for line in _origins(result, width)),
     ]
     if found.checks:
         lines.append(flights_table(found.checks[:MOST_FLIGHTS]))
-    lines += _warnings(result)
-    end = [Text(line) for line in (*_unlisted(result), *_print_files(folder, exports, seconds))]
+    lines += _warnings(result, width)
+    end = [
+        Text(line)
+        for line in (*_unlisted(result, width), *_print_files(folder, exports, seconds, width))
+    ]
     words, command = next_step(result, found, folder, exports)
     end.append(Text(f"Next: {words} {command}"))
     taken = sum(1 + len(line.rows) if isinstance(line, Table) else 1 for line in (*lines, *end))
     return [*lines, *_coefficients(result, max(LINES - taken - 1, LEAST_COEFFICIENTS)), *end]
 
 
-def _origins(result: RunResult) -> list[str]:
+def _origins(result: RunResult, width: int) -> list[str]:
     """Return from where the settings come, in a line."""
     origin = result.settings.get("origin")
     by_place: dict[str, list[str]] = {}
@@ -224,16 +237,16 @@ def _origins(result: RunResult) -> list[str]:
         ).append(name)
     given = [f"{', '.join(n)} by {p}" for p, n in by_place.items() if p != DEFAULT_ORIGIN]
     parts = [*given, "all else by default" if given else "all by default"]
-    return [shorten(f"Settings: {'; '.join(parts)}.", WIDTH)] if by_place else []
+    return [shorten(f"Settings: {'; '.join(parts)}.", width)] if by_place else []
 
 
-def _warnings(result: RunResult) -> list[Text]:
+def _warnings(result: RunResult, width: int) -> list[Text]:
     from tuner.findings.findings import merge_alike, shorten_finding
     from tuner.report.outcome import sort_by_weight
 
     found = merge_alike(sort_by_weight(result.findings))
     lines = [
-        Text(f"! {shorten_finding(one, WIDTH - 2)}", "yellow") for one in found[:MOST_WARNINGS]
+        Text(f"! {shorten_finding(one, width - 2)}", "yellow") for one in found[:MOST_WARNINGS]
     ]
     if len(found) > MOST_WARNINGS:
         more = f"! {len(found) - MOST_WARNINGS} more warnings are in the report."
@@ -270,7 +283,7 @@ def _coefficients(result: RunResult, room: int) -> list[Text | Table]:
     return lines if rows else []
 
 
-def _unlisted(result: RunResult) -> list[str]:
+def _unlisted(result: RunResult, width: int) -> list[str]:
     """Return a line on fixed coefficients and one on the terms."""
     from tuner.report.result_texts import nearly_kept
 
@@ -279,22 +292,24 @@ def _unlisted(result: RunResult) -> list[str]:
         for name, row in result.coefficients.items()
         if not row.fitted
     ]
-    lines = [f"Fixed: {listed_within(fixed, WIDTH - 8)}."] if fixed else []
+    lines = [f"Fixed: {listed_within(fixed, width - 8)}."] if fixed else []
     if rows := result.selection:
         kept = [row.group for row in rows if row.kept]
         nearly = [row.group for row in rows if nearly_kept(row)]
         text = f"Terms: {', '.join(kept) if kept else 'none'} of {len(rows)} kept"
         text += f"; nearly: {', '.join(nearly)}" if nearly else ""
-        lines.append(shorten(f"{text}.", WIDTH))
+        lines.append(shorten(f"{text}.", width))
     return lines
 
 
-def _print_files(folder: Path, exports: Sequence[ExportRecord], seconds: float | None) -> list[str]:
+def _print_files(
+    folder: Path, exports: Sequence[ExportRecord], seconds: float | None, width: int
+) -> list[str]:
     files = [one.file for one in exports if one.file]
     refused = [f"{one.format} was refused" for one in exports if one.refused]
     took = "" if seconds is None else f" in {seconds:.0f} s"
     parts = [part for part in (", ".join(files), "; ".join(refused)) if part]
-    lines = [shorten(f"Exported: {'; '.join(parts)}.", WIDTH)] if parts else []
+    lines = [shorten(f"Exported: {'; '.join(parts)}.", width)] if parts else []
     return [*lines, f"Written to {shlex.quote(str(folder))}{took}: report.html, best_fit.yaml."]
 
 

@@ -12,9 +12,9 @@ import hashlib
 import itertools
 import os
 import re
+import secrets
 import stat
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -107,12 +107,13 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     with _refusals(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
-        os.close(handle)
-        unfinished = Path(name)
+        unfinished = path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
+        mode = path.stat().st_mode & 0o777 if path.is_file() else None
+        unfinished.touch(0o666 if mode is None else 0o600, exist_ok=False)  # less the user's umask
         try:
             yield unfinished
-            unfinished.chmod(path.stat().st_mode & 0o777 if path.is_file() else 0o644)
+            if mode is not None:
+                unfinished.chmod(mode)
             unfinished.replace(path)
         finally:
             unfinished.unlink(missing_ok=True)

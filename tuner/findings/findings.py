@@ -161,8 +161,8 @@ class Code(Worded):
     LOGS_DIFFER = (
         "logs_differ",  # names: the parameters
         (
-            "Parameters differ between the logs, or change in one: {coefficients}; those that the "
-            "first log begins with are simulated."
+            "Parameters differ between the logs, or change in one: {coefficients}; those with "
+            "which the first log's vehicle was armed are simulated."
         ),
         "Fit logs one by one, each flown with one set of parameters.",
     )
@@ -608,8 +608,11 @@ def merge_alike(findings: Iterable[Finding]) -> list[Finding]:
 def shorten_finding(finding: Finding, width: int) -> str:
     """Return subject, sentence and remedy of a finding in so many characters.
 
-    The sentence is cut to no less than `MIN_TEXT_LETTERS` letters, then the remedy.
+    A longer sentence is cut to no less than `MIN_TEXT_LETTERS` letters, then the remedy is.
     """
+    whole = f"{finding.subject}: {sentence(finding)} {remedy(finding)}".rstrip()
+    if len(whole) <= width:
+        return whole
     first, *others = finding.subject.split(", ")
     subject = shorten(f"{first} and {len(others)} more" if others else first, 30)
     what, to_do = CLAUSE_END.split(sentence(finding))[0].removesuffix("."), remedy(finding)

@@ -296,7 +296,7 @@ def inlet_reports(
         for need in ("command", "rotor_speed"):
             columns = measured.get(need)
             if need in needs and columns is not None and len(columns) < 4:
-                lacking = [str(i) for i in range(4) if i not in columns]
+                lacking = [str(i + 1) for i in range(4) if i not in columns]
                 missing.append(f"{need} of rotors {', '.join(lacking)}")
         if name == "attitude" and not any(
             len(measured.get(d, ())) in (1, 4) for d in _ROTOR_INPUTS

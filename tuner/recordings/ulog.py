@@ -188,19 +188,29 @@ def parameters_of(path: Path) -> dict[str, float]:
     return {}
 
 
-def changed_parameters(path: Path) -> set[str]:
-    """Return the parameters that are set to more than one value in a PX4 log."""
-    values: dict[bytes, set[bytes]] = {}
-    for buffer, places in _blocks(path):
-        content = np.frombuffer(buffer, dtype=np.uint8)
-        kind = content[np.array(places[:-1], dtype=np.int64) + 2]
-        for at in np.flatnonzero(kind == ord("P")).tolist():
-            key, value = (
-                buffer[places[at] + 4 : places[at + 1] - 4],
-                buffer[places[at + 1] - 4 : places[at + 1]],
-            )
-            values.setdefault(key.partition(b" ")[2], set()).add(value)
-    return {name.decode(errors="replace") for name, of in values.items() if len(of) > 1}
+def parameters_in_flight(path: Path) -> tuple[dict[str, float], set[str]]:
+    """Return a PX4 log's parameters when its vehicle is armed, and those that change afterwards.
+
+    A log that does not hold ``actuator_armed`` gives the parameters that it begins with. Both are
+    empty for any other file.
+    """
+    values = parameters_of(path)
+    later: set[str] = set()
+    heads = (buffer[at + 2] for buffer, places in _blocks(path) for at in places[:-1])
+    if not values or sum(kind == ord("P") for kind in heads) <= len(values):
+        return values, later
+    with contextlib.suppress(RecordingError):  # which its reader names
+        log, _ = _parse(path, ["actuator_armed"])
+        armed = [of.data["timestamp"][of.data["armed"] != 0] for of in log.data_list
+                 if {"timestamp", "armed"} <= of.data.keys()]  # fmt: skip
+        start = min((int(times[0]) for times in armed if len(times)), default=0)
+        for time, name, value in log.changed_parameters:
+            if isinstance(value, int | float) and values.get(name) != value:
+                if time < start:
+                    values[name] = float(value)
+                else:
+                    later.add(name)
+    return values, later
 
 
 def _has(formats: Formats, kind: str, path: list[str]) -> bool:

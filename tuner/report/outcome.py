@@ -161,14 +161,15 @@ def outcome(
 
 
 def sort_by_weight(findings: Sequence[Finding]) -> list[Finding]:
-    """Return failures and warnings: causes of failure first, then causes, then doubts."""
+    """Return failures and warnings: causes of failure, causes, flights left out, doubts, others."""
     found = [finding for finding in findings if finding.level != "info"]
     refuted = any(finding.code is Code.FLIGHTS_REFUTE for finding in found)
 
     def weight(finding: Finding) -> tuple[bool, ...]:
-        kinds = (finding.code not in codes for codes in (CAUSE_CODES, DOUBT_CODES))
+        is_cause, is_doubt = (finding.code in codes for codes in (CAUSE_CODES, DOUBT_CODES))
         cause = refuted and finding.code in WRONG_VEHICLE_CODES
-        return not cause, finding.level != "failure", *kinds
+        left_out = finding.code is Code.LEFT_OUT
+        return not cause, finding.level != "failure", not is_cause, not left_out, not is_doubt
 
     return sorted(found, key=weight)
 
@@ -191,7 +192,8 @@ def next_step(
     """
     name = shlex.quote(str(folder))
     unusable = found.usability is Usability.UNUSABLE
-    doubted = [f for f in sort_by_weight(result.findings) if unusable or f.code in CONFLICT_CODES]
+    named = set(Code) - {Code.LEFT_OUT} if unusable else CONFLICT_CODES
+    doubted = [finding for finding in sort_by_weight(result.findings) if finding.code in named]
     remedies = [words for finding in doubted if (words := remedy(finding))]
     if unusable or remedies:
         return remedies[0] if remedies else "Look at its flights.", f"tune report {name} --open"

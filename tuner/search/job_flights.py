@@ -39,7 +39,7 @@ from tuner.recordings.defects import has_stale_attitude
 from tuner.recordings.flight import Flight
 from tuner.recordings.loader import InertialFlight, load_flights, read_inertial
 from tuner.recordings.notes import NoteCode, note_in_words
-from tuner.recordings.ulog import changed_parameters, parameters_of
+from tuner.recordings.ulog import parameters_in_flight
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle.controller import PARAMETER_OF, with_parameters
 
@@ -77,14 +77,14 @@ class Recording:
 
 def with_logged_parameters(settings: Settings) -> tuple[Settings, tuple[Finding, ...]]:
     """Return settings with the rate loop of the parameters in PX4 logs, and findings on changes."""
-    logs = {path: parameters for path in settings.flights if (parameters := parameters_of(path))}
+    logs = {path: of for path in settings.flights if (of := parameters_in_flight(path))[0]}
     if not logs:
         return settings, ()
-    first, *others = logs.values()
+    (first, _), *others = logs.values()
     controller, changes = with_parameters(settings.controller, first)
     logged = [name for name in PARAMETER_OF.values() if name in first]
-    unlike = {name for name in logged if any(other.get(name) != first[name] for other in others)}
-    unlike.update(*(changed_parameters(path).intersection(logged) for path in logs))
+    unlike = {name for name in logged if any(other.get(name) != first[name] for other, _ in others)}
+    unlike.update(*(later.intersection(logged) for _, later in logs.values()))
     findings = []
     if changes:
         named = not settings.origin.get("controller", "default").startswith("default")

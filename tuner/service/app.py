@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import logging
 from collections.abc import AsyncIterator, Callable
@@ -18,6 +19,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from tuner.core.errors import InputError
 from tuner.core.runtime import installed
@@ -143,6 +145,34 @@ SHUTDOWN_S = 5
 """Answers under way get so long when the server ends."""
 
 
+HEAD_S = 10.0
+"""The line and the headers of a request get so long, from the connection or their first byte on."""
+
+
+class Connection(H11Protocol):
+    """A connection that is closed if the head of a request has not come in time."""
+
+    _closing: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for a request."""
+        super().connection_made(transport)
+        self._wait_for_head()
+
+    def data_received(self, data: bytes) -> None:
+        """Take in bytes, and wait for the rest of a head that they may begin."""
+        super().data_received(data)
+        self._wait_for_head()
+
+    def _wait_for_head(self) -> None:
+        lacks_head = self.cycle is None or self.cycle.response_complete
+        if lacks_head and self._closing is None:
+            self._closing = self.loop.call_later(HEAD_S, self.transport.close)
+        elif not lacks_head and self._closing is not None:
+            self._closing.cancel()
+            self._closing = None
+
+
 class _Server(uvicorn.Server):
     """A server that lets answers which follow a job end once it is told to stop."""
 
@@ -219,7 +249,7 @@ def _serve(service: Service, *, host: str, port: int, say: Callable[[str], None]
         create_app(service),
         host=host,
         port=port,
-        http="h11",  # whose headers are bounded
+        http=Connection,  # whose headers are bounded, too
         log_level="warning",
         access_log=False,
         server_header=False,

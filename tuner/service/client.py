@@ -372,6 +372,9 @@ class JobRefusedError(InputError):
 
 
 def _job_path(job: str) -> str:
+    server, page, name = job.partition("/jobs/")
+    if page:
+        raise InputError(job, "is the address of a job", f"give {name} and --server {server}")
     return f"/jobs/{quote(job, safe='')}"
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from sim_jax.constants import GRAVITY
 from tuner.core.disk import check_file, write_text
+from tuner.core.errors import OutputError
 from tuner.core.runtime import PROGRAM, installed
 from tuner.core.shipped import configs_folder
 from tuner.core.yaml_section import commented, dump_yaml
@@ -185,11 +186,14 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
     Raises
     ------
     OutputError
-        A file cannot be written.
+        A file cannot be written, or is there already.
     """
     check_file(out)
     job = out.with_name(f"{out.stem}.job.yaml")
     check_file(job)
+    for path in (out, job):
+        if path.exists():
+            raise OutputError(path, "is there already", "remove it, or give another --out")
     template = read_vehicle(configs_folder() / "vehicles" / "hovergames_updated.yaml")
     if like is None:
         estimates = coefficients_of(airframe)

@@ -84,10 +84,8 @@ def test_another_vehicle_than_the_one_that_flew_is_named_before_the_search(capsy
     with progress_on_terminal(quiet=False) as listener:
         listener.on_doubt(Finding(Code.MASS_NOT_GIVEN, "warning", "quad", {"mass": 2.0}))
     (line,) = lines_of(capsys)
-    assert (
-        line
-        == "! quad: Its 2 kg are the shipped file's. Give what it weighs at take-off with --mass."
-    )
+    assert line.startswith("! quad: Its 2 kg are the shipped file's")
+    assert line.endswith("Give what it weighs at take-off with --mass.")
 
 
 def test_quiet_shows_nothing(capsys):

@@ -10,13 +10,16 @@ from tests.tuner.report import making
 from tests.tuner.report.conftest import FREE, ROLLING
 from tuner.cli.results import LINES, WIDTH, print_run
 from tuner.evaluate.records import AxesRmse
-from tuner.findings.findings import Code, Finding
+from tuner.findings.findings import Code, Finding, one_line
 from tuner.result import read_run
 from tuner.vehicle import COEFFICIENTS
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("FORCE_COLOR", "1")  # which older releases of rich know alone
+    monkeypatch.setenv("TERM", "dumb")
     making.write_run(tmp_path, FREE, ROLLING)
     return tmp_path
 
@@ -58,6 +61,20 @@ def test_many_warnings_and_coefficients_still_fit(folder, capsys):
     assert len(lines) <= LINES
     assert [line for line in lines if len(line) > WIDTH and str(folder) not in line] == []
     assert sum(line.startswith("! ") for line in lines) == 7
+
+
+def test_a_pipe_gets_whole_lines(folder, capsys, monkeypatch):
+    monkeypatch.setenv("TTY_COMPATIBLE", "0")
+    monkeypatch.setenv("FORCE_COLOR", "")
+    result, name = read_run(folder).result, "a_flight_with_a_long_name_" * 12
+    finding = Finding(Code.SETPOINTS_SCALED, "warning", name, {"gain": 0.2, "correlation": 0.9},
+                      ("roll", ""))  # fmt: skip
+    flights = (result.flights[1].model_copy(update={"name": name}),)
+    update = {"findings": (finding,), "flights": flights}
+    lines = lines_of(folder, result.model_copy(update=update), capsys)
+    assert "! " + one_line(finding).removeprefix("warning: ") in lines
+    assert any(line.startswith(f"{name}, held out") for line in lines)
+    assert not any("…" in line for line in lines)
 
 
 def test_verbose_adds_what_the_page_says(folder, capsys):

@@ -84,11 +84,19 @@ def test_ctrl_c_is_one_line_and_status_130(failing, capsys):
     assert capsys.readouterr().err == "tune: interrupted\n"
 
 
-@pytest.mark.parametrize(("arguments", "status"), [("--version", 0), ("simulat", 2)])
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [
+        ("--version >&- 2>&-", 0),
+        ("simulat >&- 2>&-", 2),
+        ("simulat 2</dev/null", 2),  # which takes nothing
+        ("new-vehicle --mass 1 --out q.yaml <&-", 2),
+    ],
+)
 def test_closed_streams_are_no_fault(arguments, status):
     """As of what a daemon starts."""
     program = "from tuner.cli.app import program; program()"
-    script = f"'{sys.executable}' -c '{program}' {arguments} >&- 2>&-"
+    script = f"'{sys.executable}' -c '{program}' {arguments}"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run(["sh", "-c", script], cwd=ROOT, env=environment, check=False)
     assert done.returncode == status

@@ -60,6 +60,7 @@ def test_paths_count_from_the_job_file_and_bare_names_are_shipped_files(tmp_path
     ("text", "expected"),
     [
         ("vehicel: x.yaml", "unknown key 'vehicel'; did you mean 'vehicle'?"),
+        ("priors: {mass: 2}", "unknown key 'priors'; known are channels, "),
         ("vehicle: hovergame", "did you mean 'hovergames'?"),
         ("free: [motor_constan]", "unknown coefficient 'motor_constan'; did you mean"),
         ("mass: 2243", "mass is 2243; it should be at most 500"),

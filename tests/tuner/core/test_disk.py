@@ -220,3 +220,12 @@ def test_a_named_folder_is_of_one_run_at_a_time(tmp_path):
             result_folder(folder).__enter__()
     with result_folder(folder):  # let go of
         assert not list(folder.iterdir())
+
+
+def test_a_new_file_has_the_rights_that_the_user_gives_files(tmp_path):
+    before = os.umask(0o077)
+    try:
+        write_text(tmp_path / "mine", "mine")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o600

@@ -68,7 +68,7 @@ def test_inlets_and_coefficients(circle: Inspection) -> None:
     assert lacking["reference"] == ()
     assert lacking["body_rate"] == ()
     assert lacking["actuator"] == ()
-    assert lacking["rotor_speed"] == ("rotor_speed of rotors 1, 2, 3",)
+    assert lacking["rotor_speed"] == ("rotor_speed of rotors 2, 3, 4",)
     informed = {finding.coefficient: finding.how for finding in circle.coefficients}
     assert set(informed) <= set(COEFFICIENTS)
     assert informed["mass"] == "no"
@@ -89,7 +89,7 @@ def test_json_and_table_agree(circle: Inspection) -> None:
     stream = io.StringIO()
     Console(file=stream, width=160).print(render([circle]))
     text = stream.getvalue()
-    for words in ("/optitrack/pose", "lacks rotor_speed of rotors 1, 2, 3", "2.84", "weigh it"):
+    for words in ("/optitrack/pose", "lacks rotor_speed of rotors 2, 3, 4", "2.84", "weigh it"):
         assert words in text
 
 

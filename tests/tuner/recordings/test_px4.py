@@ -87,13 +87,30 @@ def test_logs_that_differ_are_named(messages, tmp_path: Path) -> None:
     assert differ.names == ("MC_ROLLRATE_P",)
 
 
-def test_parameters_that_change_in_a_log_are_named(messages, tmp_path: Path) -> None:
-    path = log(messages, tmp_path / "log.ulg", PARAMETERS)
-    key = b"float MC_ROLLRATE_P"
-    record = struct.pack("<HBB", len(key) + 5, ord("P"), len(key)) + key + struct.pack("<f", 0.3)
-    path.write_bytes(path.read_bytes() + record)
-    _, (_, differ) = with_logged_parameters(resolve_settings(Options([str(path)])))
-    assert (differ.code, differ.names) == (Code.LOGS_DIFFER, ("MC_ROLLRATE_P",))
+def test_parameters_are_those_at_arming_and_later_changes_are_named(messages, tmp_path) -> None:
+    def record(kind: str, content: bytes) -> bytes:
+        return struct.pack("<HB", len(content), ord(kind)) + content
+
+    def changed(name: bytes, value: float) -> bytes:
+        key = b"float " + name
+        return record("P", struct.pack("<B", len(key)) + key + struct.pack("<f", value))
+
+    def armed(seconds: int, value: int) -> bytes:
+        return record("D", struct.pack("<HQB", 99, seconds * 1_000_000, value))
+
+    text = log(messages, tmp_path / "log.ulg", PARAMETERS).read_bytes()
+    data = text.index(record("A", struct.pack("<BH", 0, 0) + next(iter(messages)).encode()))
+    kind = record("F", b"actuator_armed:uint64_t timestamp;bool armed;")
+    before = armed(1, 0) + changed(b"MC_ROLLRATE_P", 0.25) + armed(2, 1)
+    before = record("A", struct.pack("<BH", 0, 99) + b"actuator_armed") + before
+    path, kinds = tmp_path / "tuned.ulg", text[:16] + kind + text[16:data]
+    path.write_bytes(kinds + before + text[data:] + changed(b"MC_ROLLRATE_I", 0.5))
+    settings, (_, differ) = with_logged_parameters(resolve_settings(Options([str(path)])))
+    assert (settings.controller.rate.roll.p, settings.controller.rate.roll.i) == (0.25, 0.2)
+    assert (differ.code, differ.names) == (Code.LOGS_DIFFER, ("MC_ROLLRATE_I",))
+    path.write_bytes(text + changed(b"MC_ROLLRATE_P", 0.25))  # does not tell when it was armed
+    settings, (_, differ) = with_logged_parameters(resolve_settings(Options([str(path)])))
+    assert (settings.controller.rate.roll.p, differ.names) == (0.15, ("MC_ROLLRATE_P",))
 
 
 def test_parameters_that_no_controller_has_change_nothing(messages, tmp_path: Path) -> None:

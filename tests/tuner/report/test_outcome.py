@@ -162,8 +162,9 @@ def test_what_doubts_the_numbers_comes_before_what_does_not():
     numbers = {"rate_gain_yaw": 0.5, "rate_gain_yaw_error": 0.1}
     cause = Finding(Code.TERM_SHOWS, "warning", "rate_gain", numbers, ("rate_gain_yaw",))
     failure = Finding(Code.NOT_FINITE, "failure", "e")
-    said = warnings_of((info, gap, doubt, other, cause, failure))
-    assert [warning.link for warning in said] == ["e", "d", "rate_gain", "c", "a"]
+    left = Finding(Code.LEFT_OUT, "warning", "f", names=("nothing flies in it", "cut it"))
+    said = warnings_of((info, gap, left, doubt, other, cause, failure))
+    assert [warning.link for warning in said] == ["e", "d", "rate_gain", "f", "c", "a"]
     refuted = Finding(Code.FLIGHTS_REFUTE, "failure", "e")
     said = warnings_of((gap, doubt, other, cause, refuted))
     assert [warning.link for warning in said] == ["d", "e", "rate_gain", "c", "a"]

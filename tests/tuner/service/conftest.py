@@ -20,7 +20,7 @@ import uvicorn
 from tests.tuner.service import serving
 from tests.tuner.service.serving import FAKE_WORKER
 from tuner.service import dispatcher, recordings
-from tuner.service.app import create_app
+from tuner.service.app import Connection, create_app
 from tuner.service.service import Service
 from tuner.service.settings import Limits, ServiceSettings
 
@@ -92,8 +92,9 @@ class _Server(uvicorn.Server):
 def listening(service: Service) -> Iterator[httpx.Client]:
     """Serve from a thread, and yield a client of it."""
     config = uvicorn.Config(
-        create_app(service), host="127.0.0.1", port=0, log_level="warning", server_header=False
-    )
+        create_app(service), host="127.0.0.1", port=0, http=Connection, log_level="warning",
+        server_header=False,
+    )  # fmt: skip
     server = _Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()

@@ -68,6 +68,11 @@ def test_a_job_is_submitted_listed_watched_fetched_and_cancelled(client, table, 
     assert "was cancelled" in capsys.readouterr().err
 
 
+def test_the_address_of_a_job_is_no_id(capsys):
+    assert main(["fetch", "http://lab:8000/jobs/3f2a91c05d7e4b68"]) == 2
+    assert "give 3f2a91c05d7e4b68 and --server http://lab:8000\n" in capsys.readouterr().err
+
+
 @pytest.mark.usefixtures("server")
 @pytest.mark.parametrize(
     ("wish", "status", "error"),
