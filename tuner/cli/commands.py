@@ -57,7 +57,7 @@ def inspect(
         for path in paths:
             sys.stdout.write(suggested_map(path))
         return
-    from tuner.job.recording_verdict import in_words, verdict_of
+    from tuner.job.recording_verdict import in_words, verdict_of, with_verdict
     from tuner.recordings.inspection import as_json, inspect_recordings
 
     inspections, errors = inspect_recordings(
@@ -66,6 +66,7 @@ def inspect(
     verdicts = {
         seen.path: verdict_of(seen, **vars(reading), vehicle=vehicle) for seen in inspections
     }
+    inspections = tuple(with_verdict(seen, verdicts[seen.path]) for seen in inspections)
     if json:
         print(as_json(inspections, errors, {path: asdict(of) for path, of in verdicts.items()}))
     else:

@@ -124,6 +124,17 @@ def _computed_verdict(path: Path, settings: Settings) -> Verdict:
     return Verdict(str(path), True, tuple(inlets), why, hidden, gains)
 
 
+def with_verdict(inspection: Inspection, verdict: Verdict) -> Inspection:
+    """Return an inspection that counts on no coefficient above the chosen inlets."""
+    coefficients = (
+        replace(of, how="no", why=f"acts above the inlet {' and '.join(verdict.inlets)}")
+        if of.coefficient in verdict.not_shown
+        else of
+        for of in inspection.coefficients
+    )
+    return replace(inspection, coefficients=tuple(coefficients))
+
+
 def in_words(verdict: Verdict) -> list[str]:
     """Return a verdict as lines: the decision, its reasons, and advice on logging."""
     if not verdict.fits:

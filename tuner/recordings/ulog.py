@@ -262,14 +262,25 @@ def _count_messages(path: Path) -> tuple[dict[int, tuple[str, int]], dict[int, s
     return counted, kinds, path.stat().st_size - reached
 
 
+class _Definitions(io.BufferedReader):
+    """A log that is read up to its data: pyulog goes round for ever where it has none."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        found = super().read(size)
+        if size is not None and 0 < len(found) < size:
+            raise EOFError("it ends before its data")
+        return found
+
+
 def _parse(path: Path, names: list[str], *, header_only: bool = False) -> tuple[Any, str]:
     """Parse a log with pyulog, which prints what it finds wrong."""
     from pyulog import ULog  # noqa: PLC0415 (slow to import)
 
     printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(printed):
-            log = ULog(str(path), names, parse_header_only=header_only)
+        with contextlib.redirect_stdout(printed), _Definitions(io.FileIO(path)) as definitions:
+            source = definitions if header_only else str(path)
+            log = ULog(source, names, parse_header_only=header_only)
         return log, printed.getvalue()
     except Exception as err:  # pyulog's own and whatever a hostile log makes of it
         what = f"is no readable PX4 log ({short_reason(err)})"

@@ -173,6 +173,12 @@ def test_log_whose_formats_multiply(tmp_path: Path) -> None:
     assert "is absurd" in refused(path)
 
 
+def test_log_that_ends_in_its_definitions(tmp_path: Path) -> None:
+    path = tmp_path / "cut.ulg"
+    path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + b"\xff\xffX" + b"a" * 9)
+    assert "it ends before its data" in refused(path)
+
+
 def test_metadata_that_multiplies(tmp_path: Path) -> None:
     folder = making.to_ros2(making.CIRCLE, tmp_path / "b", making.StoragePlugin.MCAP, until=0.5)
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
