@@ -202,6 +202,8 @@ def rollout(
 
     numbers = jnp.arange(stretches * length).reshape(stretches, length)
     state, log = lax.scan(rematerialised(stretch), first, numbers)
-    log = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:samples], log)
+    log = jax.tree.map(
+        lambda leaf: leaf.reshape(len(leaf) * length, *leaf.shape[2:])[:samples], log
+    )
     flown = state.crash_time <= samples / schedule.log_rate  # the last stretch may be longer
     return Rollout(log, jnp.where(flown, state.crash_time, jnp.inf))

@@ -78,6 +78,10 @@ def test_vmap_of_one_alone_gives_the_same(batch: Rollout) -> None:
         np.testing.assert_allclose(jnp.moveaxis(got, 0, -1)[..., 0, :], want, rtol=1e-9, atol=1e-9)
 
 
+def test_a_batch_of_none_is_empty() -> None:
+    assert compiled(jnp.zeros(0)).log.motion.position.x.shape == (SAMPLES, 0)
+
+
 def test_a_crashed_vehicle_stays_where_it_crashed(batch: Rollout) -> None:
     crash = float(batch.crash_time[3])
     at = round(crash * DELAYED.log_rate)

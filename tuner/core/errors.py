@@ -58,5 +58,5 @@ class EngineError(InputError):
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return ``did you mean 'x'?`` for the nearest known word, or the list of known words."""
     names = sorted(known)
-    close = difflib.get_close_matches(str(word), names, n=1)
+    close = difflib.get_close_matches(str(word), names, n=1, cutoff=0.55)
     return f"did you mean '{close[0]}'?" if close else f"known are {', '.join(names)}"
