@@ -80,22 +80,28 @@ def tune(
         with span("import"):
             from tuner.cli.progress import progress_on_terminal
             from tuner.cli.results import print_run
-            from tuner.core.runtime import configure
-
-            configure()
             from tuner.config import resolve_settings
-            from tuner.job.run import run
-            from tuner.search.job_flights import read_inertial_flights
+            from tuner.recordings.loader import read_beside
 
-        with span("reading"):
-            bare, left_out = read_inertial_flights(resolve_settings(options))
+        settings = resolve_settings(options)
+        job = settings.job
+        with read_beside(settings.flights, topics=job.topics, namespace=job.namespace):
+            with span("import"):
+                from tuner.core.runtime import configure
+
+                configure()
+                from tuner.job.run import run
+                from tuner.search.job_flights import read_inertial_flights
+
+            with span("reading"):
+                bare, left_out = read_inertial_flights(settings)
         told = progress_on_terminal(quiet=quiet, verbose=verbose)
         if bare:
             from tuner.job.without_pose import fit_without_pose
 
             with told as listener:
                 measured = fit_without_pose(
-                    resolve_settings(options),
+                    settings,
                     bare,
                     left_out=left_out,
                     out=options.out,

@@ -115,6 +115,17 @@ def test_concurrent_runs_agree(bag: Path) -> None:
     assert not names[0].startswith(".")
 
 
+def test_another_process_reads_while_a_command_imports(bag: Path) -> None:
+    code = (  # the imports of `tune` before jax
+        "import sys; import tuner.cli.progress, tuner.cli.results, tuner.config; "
+        "from tuner.recordings import loader; path = loader.Path(sys.argv[1])\n"
+        "with loader.read_beside([path.with_name('missing.bag'), path]): pass\n"
+        "loader.read_content = None; print(loader.load_flight(path).name)"
+    )
+    run = [sys.executable, "-c", code, str(bag)]
+    assert subprocess.run(run, capture_output=True, text=True, check=True).stdout == "flight\n"
+
+
 def test_folder_digest_sees_names_and_contents(tmp_path: Path) -> None:
     folder = making.to_ros2(making.CIRCLE, tmp_path / "a", making.StoragePlugin.MCAP, until=1.0)
     before = digest(folder)
