@@ -167,8 +167,9 @@ def write(
         columns[fed] = np.where(kept[:, None], columns[fed], np.nan)
         time = np.arange(len(kept))[:, None] / RATE
         table = np.hstack([time, *columns.values()])
-        rows = [",".join("" if np.isnan(cell) else f"{cell:.7g}" for cell in row) for row in table]
         head = "t,px,py,pz,vx,vy,vz,qw,qx,qy,qz,wx,wy,wz,m1,m2,m3,m4"
+        line = ",".join(["%.7g"] * table.shape[1])
+        rows = [(line % tuple(row)).replace("nan", "") for row in table.tolist()]
         written.append(folder / f"{name}.csv")
         write_text(written[-1], "\n".join([head, *rows]) + "\n")
     return written

@@ -61,6 +61,7 @@ def batch() -> Rollout:
 
 def test_the_batch_holds_a_crash_and_flights(batch: Rollout) -> None:
     assert batch.crashed.tolist() == [False, False, False, True]
+    assert np.isinf(batch.crash_time).tolist() == [True, True, True, False]
     assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(batch.log))
 
 

@@ -50,12 +50,6 @@ def flown(craft: Vehicle, inlet: ActuatorInlet, around: Environment = STILL_AIR)
 fly = eqx.filter_jit(flown)
 
 
-def test_a_neutral_coefficient_changes_no_bit_of_a_flight() -> None:
-    inlet = wobble(vehicle(), SAMPLES + 2)
-    neutral = with_effects(vehicle(), {"fuselage_drag": 0.0})
-    assert apart(fly(neutral, inlet).log, fly(vehicle(), inlet).log) == 0.0
-
-
 def test_an_absent_coefficient_and_no_environment_cost_no_operation(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -109,22 +103,6 @@ def test_work_of_fuselage_drag_is_the_energy_that_is_lost() -> None:
     lost = jnp.cumsum(0.5 * (power[1:] + power[:-1])) * SCHEDULE.step
     assert np.all(np.diff(np.asarray(energy)) < 0.0)
     np.testing.assert_allclose(energy[0] - energy[1:], lost, rtol=1e-4, atol=1e-6)
-
-
-def test_derivative_by_fuselage_drag_is_the_finite_difference() -> None:
-    inlet = wobble(vehicle(), SAMPLES + 2)
-
-    @jax.jit
-    def motion_of(value: Array) -> Array:
-        craft = with_effects(vehicle(), {"fuselage_drag": value})
-        return jnp.stack(jax.tree.leaves(flown(craft, inlet).log.motion))
-
-    for value in (0.0, 0.04):
-        at = jnp.asarray(value)
-        slope = jax.jvp(motion_of, (at,), (jnp.ones(()),))[1]
-        wanted = (motion_of(at + 1e-6) - motion_of(at - 1e-6)) / 2e-6
-        np.testing.assert_allclose(slope, wanted, rtol=1e-5, atol=1e-7)
-        assert float(jnp.max(jnp.abs(slope))) > 0.1
 
 
 def test_a_vehicle_carried_by_the_wind_flies_as_in_still_air() -> None:

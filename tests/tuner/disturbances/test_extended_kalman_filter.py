@@ -119,6 +119,7 @@ def test_commands_that_once_took_longer_change_nothing() -> None:
     np.testing.assert_allclose(long.loss, short.loss, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("folder")
 def test_innovations_are_those_of_a_filter_in_matrices() -> None:
     schedule, inputs, expected = hovering()

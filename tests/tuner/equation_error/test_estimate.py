@@ -339,6 +339,7 @@ def commanded(request, racer, tmp_path_factory):
     return given, with_accelerations(given)
 
 
+@pytest.mark.slow
 def test_commands_alone_tell_inertia_by_the_lags_that_they_need(racer, commanded):
     """The rotors turn faster than the new vehicle's are believed to, and are known by nothing."""
     _, (job, (finding,)) = commanded

@@ -38,12 +38,6 @@ def assert_same(got: Flight, expected: Flight, *, without: tuple[str, ...] = ())
     assert got.initial.attitude == pytest.approx(expected.initial.attitude, abs=1e-6)
 
 
-@pytest.mark.parametrize("storage", StoragePlugin, ids=lambda storage: storage.name)
-def test_ros2_holds_the_same_flight(storage: StoragePlugin, tmp_path: Path) -> None:
-    bag = making.FLIGHTS / "yaw_spin_3rps.bag"
-    assert_same(load_flight(making.to_ros2(bag, tmp_path / "spin", storage)), load_flight(bag))
-
-
 @pytest.mark.parametrize(
     ("storage", "mode"),
     [

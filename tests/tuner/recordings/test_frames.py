@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,7 +23,7 @@ from tuner.evaluate.closed_loop import simulate
 from tuner.findings.findings import Code, one_line
 from tuner.options import Options
 from tuner.recordings.consistency import contradiction, contradiction_in, correct_frames
-from tuner.recordings.flight import Series
+from tuner.recordings.flight import Flight, Series
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
@@ -95,9 +97,15 @@ def test_inspection_says_so_in_one_line(reversed_circle: Path) -> None:
     assert inspection.coefficients == ()
 
 
+@cache
+def flights_of(path: Path) -> list[Flight]:
+    """Return what is read of a recording, once for all tests."""
+    return load_flights(path, cache=False)
+
+
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: f"{path.parent.name}-{path.name}")
 def test_no_flight_that_flew_is_left_out(path: Path) -> None:
-    for flight in load_flights(path, cache=False):
+    for flight in flights_of(path):
         assert contradiction_in(flight.notes) is None
 
 
@@ -199,7 +207,8 @@ def test_a_velocity_in_other_axes_is_turned_into_the_worlds(axes: str, wind: flo
     assert correct_frames(signals, {})[1] == ()
 
 
-def flown_at_random(seed: int) -> dict[str, Series]:
+@cache
+def flown_at_random(seed: int) -> Mapping[str, Series]:
     """Return a random flight with drag and noise, and all signals that frames are judged by."""
     random = np.random.default_rng(seed)
     rates, phases = random.uniform(0.5, 2.0, (2, 3, 3)) * [[[1.0]], [[3.0]]]
@@ -226,7 +235,7 @@ def flown_at_random(seed: int) -> dict[str, Series]:
         "acceleration": attitude.inv().apply(felt) + 0.3 * random.normal(size=felt.shape),
         "rate_setpoint": turning + 0.1 * random.normal(size=turning.shape),
     }
-    return {name: Series(TIME, values) for name, values in signals.items()}
+    return MappingProxyType({name: Series(TIME, rows) for name, rows in signals.items()})
 
 
 RECORDED: dict[str, Callable[[np.ndarray, Rotation], np.ndarray]] = {
@@ -307,8 +316,7 @@ def test_markers_of_another_heading_are_turned(heading: float, said: int, seed: 
 @pytest.mark.parametrize("path", sorted((REAL / "nanobench").glob("*.csv")), ids=lambda p: p.stem)
 def test_markers_of_another_heading_show_in_real_flights(path: Path, heading: float) -> None:
     """Their attitude is noisy: its change alone is as much noise as motion."""
-    flight = load_flights(path, cache=False)[0]
-    signals = dict(flight.series)
+    signals = dict(flights_of(path)[0].series)
     right = signals["attitude"]
     turned = Series(right.time, of_markers(right.values, heading))
     fixed, notes = correct_frames({**signals, "attitude": turned}, {})

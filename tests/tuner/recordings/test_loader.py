@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.flight import Series
+from tuner.recordings.flight import Flight, Series
 from tuner.recordings.interpolation import GAP_S, with_gaps_filled
 from tuner.recordings.loader import gap_notes, load_flight
 from tuner.recordings.topics import load_topic_map
@@ -23,6 +23,11 @@ MISSIONS = {
     "lemniscate_4mps": 36.0,
     "yaw_spin_3rps": 16.0,
 }
+
+
+@pytest.fixture(scope="module")
+def circle() -> Flight:
+    return load_flight(FLIGHTS / "circle_3mps.bag")
 
 
 @pytest.mark.parametrize("name", MISSIONS)
@@ -40,27 +45,26 @@ def test_every_shipped_bag_loads(name: str) -> None:
     assert len(flight.sha256) == 64
 
 
-def test_reference_sample_k_sits_on_tick_k() -> None:
+def test_reference_sample_k_sits_on_tick_k(circle: Flight) -> None:
     """The publisher's circle has a closed form, so that one tick too late is seen."""
-    flight = load_flight(FLIGHTS / "circle_3mps.bag")
     phase, windup, expected = 0.0, 0.0, []
-    for _ in range(len(flight.time)):
+    for _ in range(len(circle.time)):
         before = windup
         phase += 0.01 * windup * 2.1
         windup = min(1.0, windup + 0.001)
         expected.append([2 * np.cos(0.7 * phase), 2 * np.sin(0.7 * phase), before])
-    position = flight.signals["reference_position"]
+    position = circle.signals["reference_position"]
     assert np.abs(position[:, :2] - np.array(expected)[:, :2]).max() < 1e-5
 
 
-def test_a_slower_clock_reads_the_reference_on_its_ticks_too() -> None:
-    full = load_flight(FLIGHTS / "circle_3mps.bag").signals["reference_position"]
+def test_a_slower_clock_reads_the_reference_on_its_ticks_too(circle: Flight) -> None:
+    full = circle.signals["reference_position"]
     half = load_flight(FLIGHTS / "circle_3mps.bag", rate=50.0).signals["reference_position"]
     assert np.array_equal(half, full[::2])
 
 
-def test_initial_state_is_the_hover_before_the_mission() -> None:
-    start = load_flight(FLIGHTS / "circle_3mps.bag").initial
+def test_initial_state_is_the_hover_before_the_mission(circle: Flight) -> None:
+    start = circle.initial
     assert start.position == pytest.approx([2.0, 0.0, 1.1177], abs=5e-4)
     assert np.abs(start.velocity).max() < 0.01
     assert start.attitude == pytest.approx([1, 0, 0, 0], abs=3e-4)
@@ -70,24 +74,21 @@ def test_initial_state_is_the_hover_before_the_mission() -> None:
     assert start.command == pytest.approx([0.547] * 4, abs=1e-3)
 
 
-def test_tachometer_artefacts_are_dropped_and_counted() -> None:
-    flight = load_flight(FLIGHTS / "circle_3mps.bag")
-    note = next(note for note in flight.notes if "rotor_speed" in note.names)
+def test_tachometer_artefacts_are_dropped_and_counted(circle: Flight) -> None:
+    note = next(note for note in circle.notes if "rotor_speed" in note.names)
     assert note.topic == "/mavros/rpm"
     assert 5 <= note.count <= 40
-    speed = flight.series["rotor_speed"].values[:, 0]
+    speed = circle.series["rotor_speed"].values[:, 0]
     assert np.abs(np.diff(speed)).max() < 100
 
 
-def test_motion_capture_is_preferred_to_the_estimate() -> None:
-    flight = load_flight(FLIGHTS / "circle_3mps.bag")
-    assert len(flight.series["position"].time) > 3700  # 100 Hz, not the estimate's 50 Hz
+def test_motion_capture_is_preferred_to_the_estimate(circle: Flight) -> None:
+    assert len(circle.series["position"].time) > 3700  # 100 Hz, not the estimate's 50 Hz
 
 
-def test_headerless_topic_falls_back_to_recording_time_with_a_note() -> None:
-    flight = load_flight(FLIGHTS / "circle_3mps.bag")
-    assert any(note.topic == "/trajectory_publisher/lap_completed" for note in flight.notes)
-    assert flight.series["lap"].values[:, 0].tolist() == [1, 2, 3, 4, 5, 6, 7]
+def test_headerless_topic_falls_back_to_recording_time_with_a_note(circle: Flight) -> None:
+    assert any(note.topic == "/trajectory_publisher/lap_completed" for note in circle.notes)
+    assert circle.series["lap"].values[:, 0].tolist() == [1, 2, 3, 4, 5, 6, 7]
 
 
 def test_missing_pose_names_the_namespace() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import os
 import random
@@ -35,15 +36,12 @@ STARTING = multiprocessing.get_context("forkserver")
 STARTING.set_forkserver_preload([serving.__name__])
 
 
-HELD: list[socket.socket] = []
-
-
 def free_port() -> int:
     """Return a port that stays bound, so that no other process gets it; a server may listen."""
     held = socket.socket()
     held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     held.bind(("127.0.0.1", 0))
-    HELD.append(held)
+    atexit.register(held.close)
     return int(held.getsockname()[1])
 
 
