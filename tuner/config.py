@@ -455,7 +455,7 @@ def find_job_file(flights: Iterable[Path]) -> Path | None:
     ConfigError
         The flights lie in several folders with a job file each.
     """
-    folders = {flight.resolve().parent: flight.parent for flight in flights}
+    folders = {flight.parent.resolve(): flight.parent for flight in flights}
     files = [shown / JOB_FILE for shown in folders.values() if (shown / JOB_FILE).is_file()]
     if len(files) > 1:
         raise ConfigError(

@@ -251,7 +251,7 @@ class Code(Worded):
     )
     START_ON_BOUND = (
         "start_on_bound",  # bound, start
-        "The initial value {bound:g} lies on a bound; the search starts at {start:.3g}.",
+        "The initial value {bound:g} is not inside its bounds; the search starts at {start:.3g}.",
         "",
     )
     NOT_FINITE = (

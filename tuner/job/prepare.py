@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -104,7 +104,7 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
         *_excitation(job),
         *_unused_settings(job),
         *_bounds(job),
-        *_starts_on_bounds(job),
+        *starts_on_bounds(job),
     )
 
 
@@ -360,11 +360,14 @@ def _bounds(job: Job) -> Iterator[Finding]:
             yield Finding(Code.IMPLAUSIBLE_BOUNDS, "warning", parameter.name, numbers)
 
 
-def _starts_on_bounds(job: Job) -> Iterator[Finding]:
+def starts_on_bounds(job: Job) -> Iterator[Finding]:
+    """Yield a finding on each initial value on a bound, and a warning of one beyond it."""
     for parameter in job.space.parameters:
         if parameter.moved is not None:
             numbers = {"bound": parameter.moved, "start": parameter.initial}
-            yield Finding(Code.START_ON_BOUND, "info", parameter.name, numbers)
+            is_on_bound = parameter.lower <= parameter.moved <= parameter.upper
+            level: Literal["info", "warning"] = "info" if is_on_bound else "warning"
+            yield Finding(Code.START_ON_BOUND, level, parameter.name, numbers)
 
 
 def information_at_start(job: Job) -> Array:

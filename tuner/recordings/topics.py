@@ -259,4 +259,8 @@ def read_sidecar(recording: Path) -> Sidecar:
         It is no valid side-car.
     """
     path = sidecar_path(recording)
-    return read_model(Sidecar, path) if path.is_file() else Sidecar()
+    try:
+        return read_model(Sidecar, path) if path.is_file() else Sidecar()
+    except ConfigError as error:
+        what = f"{error.what} (it is read as the side-car of {recording.name})"
+        raise ConfigError(error.where, what, error.remedy) from None

@@ -372,8 +372,8 @@ class JobRefusedError(InputError):
 
 
 def _job_path(job: str) -> str:
-    server, page, name = job.partition("/jobs/")
-    if page:
+    server, _, name = job.partition("/jobs/")
+    if name:
         raise InputError(job, "is the address of a job", f"give {name} and --server {server}")
     return f"/jobs/{quote(job, safe='')}"
 
@@ -518,7 +518,7 @@ def watch(
         settled = time.monotonic() - still_since >= settle
         if new and settled and new != refused:
             try:
-                say(_submit(client, folder, new))
+                say(_submit(client, folder, new, say))
                 refused = {}
             except InputError as error:
                 if once:
@@ -552,11 +552,25 @@ def _new_recordings(folder: Path) -> dict[Path, Marks]:
     return found
 
 
-def _submit(client: Client, folder: Path, new: Mapping[Path, Marks]) -> str:
-    """Submit one job of recordings, note it, and return a line about it."""
+def _submit(
+    client: Client, folder: Path, new: Mapping[Path, Marks], say: Callable[[str], None]
+) -> str:
+    """Submit one job of recordings, note it, and return a line about it.
+
+    Those that the server cannot read are named and left out, unless there are no others.
+    """
+    arrived = new
+    for path in arrived:
+        try:
+            client.upload(path)
+        except InputError as error:
+            if error.where not in (path.name, str(path)) or len(new) == 1:
+                raise
+            say(f"tune: {error}")
+            new = {other: marks for other, marks in new.items() if other != path}
     key = hashlib.sha256(repr([(str(path.absolute()), *new[path]) for path in new]).encode())
     job = client.submit(FitOptions([str(path) for path in new]), key=key.hexdigest())
     before = Submitted.read_if_any(folder) or Submitted()
-    done = {path.name: (*marks, job) for path, marks in new.items()}
+    done = {path.name: (*marks, job if path in new else "") for path, marks in arrived.items()}
     Submitted(recordings=before.recordings | done).write(folder)
     return f"{', '.join(path.name for path in new)}: job {job}"

@@ -197,6 +197,13 @@ def test_two_job_files_are_refused(lab):
         find_job_file([lab / "a.bag", lab / "more" / "d.bag"])
 
 
+def test_the_job_file_stands_beside_links_to_recordings(lab, tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "e.bag").touch()
+    (lab / "e.bag").symlink_to(tmp_path / "disk" / "e.bag")
+    assert find_job_file([lab / "a.bag", lab / "e.bag"]) == lab / "tune.yaml"
+
+
 def test_a_recording_named_twice_is_one_flight(lab):
     assert len(find_flights([f"{lab}/a.bag", f"{lab}/../{lab.name}/a.bag", f"{lab}/a*"])) == 1
 

@@ -13,7 +13,7 @@ from tuner.config import JobFile, Search, resolve_settings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.evaluate.validation import flights_worse
 from tuner.findings.findings import Code, Finding
-from tuner.job.prepare import merged_by_flight
+from tuner.job.prepare import merged_by_flight, starts_on_bounds
 from tuner.objective.inlets import INLETS, also_free_by, bypassed_by
 from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.space import space_of
@@ -52,6 +52,15 @@ def test_windows_without_what_is_fed_in_are_left_out(flight):
         [gap], pieces, inlets=["actuator"], schedule=Schedule(), lag=0.02, noise={}
     )
     assert segments.count == len(begins)
+
+
+def test_a_start_outside_given_bounds_is_warned_of():
+    parameters = [
+        SimpleNamespace(name="motor_constant", moved=moved, initial=1e-5, lower=1e-6, upper=2e-5)
+        for moved in (1e-6, 3e-5)
+    ]
+    found = starts_on_bounds(SimpleNamespace(space=SimpleNamespace(parameters=parameters)))
+    assert [finding.level for finding in found] == ["info", "warning"]
 
 
 def test_a_flight_without_any_command_is_refused_in_one_line(flight):

@@ -104,6 +104,9 @@ def test_what_the_guide_shows_is_valid(tmp_path: Path) -> None:
     assert "command" in lab.signals
     (tmp_path / "flight.yaml").write_text(sidecar)
     assert read_sidecar(tmp_path / "flight.bag").start == 12.5
+    (tmp_path / "flight.yaml").write_text("mass: 2.2\n")
+    with pytest.raises(ConfigError, match=r"'mass' \(it is read as the side-car of flight.bag\)"):
+        read_sidecar(tmp_path / "flight.bag")
     for topic_map in (one for kind in FORMATS for one in shipped_maps(kind)):
         assert f"`{topic_map.name}`" in guide
     for signal in SIGNALS:

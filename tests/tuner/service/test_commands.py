@@ -201,6 +201,22 @@ def test_a_folder_s_new_recordings_become_one_job_once(client, table, tmp_path, 
     assert jobs == 2
 
 
+@pytest.mark.usefixtures("server")
+def test_a_file_that_is_no_recording_keeps_no_folder_from_being_fitted(table, tmp_path, capsys):
+    (tmp_path / "a.csv").touch()
+    (tmp_path / "b.csv").write_bytes(table.read_bytes())
+    arguments = ["watch-folder", str(tmp_path), "--settle", "0.1", "--once"]
+    assert main(arguments) == 0
+    refused, submitted = capsys.readouterr().out.splitlines()
+    assert refused == "tune: a.csv: is empty; check the recording"
+    assert submitted.startswith("b.csv: job ")
+    assert main(arguments) == 0
+    assert capsys.readouterr().out == ""
+    (tmp_path / "b.csv").unlink()
+    (tmp_path / client_module.Submitted.FILE).unlink()
+    assert main(arguments) == 2
+
+
 def test_a_recording_that_still_grows_is_waited_for(tmp_path, table):
     (tmp_path / "a.csv").write_bytes(b"time")
     first = client_module._new_recordings(tmp_path)
