@@ -52,7 +52,8 @@ class Argument:
     def of(leaf: Any, *, lanes: bool, moves: bool = False) -> Argument:
         """Return how an array is given: the lanes along its last axis, or shared by all."""
         shape = np.shape(leaf)[:-1] if lanes else np.shape(leaf)
-        return Argument(shape, np.result_type(leaf), lanes, moves)
+        dtype = leaf.dtype if hasattr(leaf, "dtype") else np.result_type(leaf)
+        return Argument(shape, dtype, lanes, moves)
 
 
 class _Frame(NamedTuple):

@@ -69,7 +69,8 @@ class FromPython:
         option_of = {IN_JOB_FILE.get(name, name): name for name in types}
         for name in given:
             if name not in option_of:
-                raise ConfigError(name, "is no option", did_you_mean(name, option_of))
+                known = [IN_JOB_FILE[name]] if name in IN_JOB_FILE else option_of
+                raise ConfigError(name, "is no option", did_you_mean(name, known))
         words = {option_of[name]: plain(value) for name, value in given.items()}
         if isinstance(words.get("flights"), str):
             words["flights"] = [words["flights"]]
@@ -262,6 +263,8 @@ def taking(options: type | None = None) -> Callable[[F], F]:
 
         @wraps(function)
         def checked(*given: Any, **named: Any) -> Any:
+            import numpy as np  # noqa: PLC0415 (what asks for help alone does not need it)
+
             known = signature.bind(*given, **named).arguments
             # without that of the result, whose import takes its time
             types = {p.name: p.annotation for p in own if p.annotation is not p.empty}
@@ -269,7 +272,9 @@ def taking(options: type | None = None) -> Callable[[F], F]:
             for name, hint in get_type_hints(hinted, inspect.unwrap(function).__globals__).items():
                 if name in known:
                     check_type(name, plain(known[name]), hint)
-            return function(*given, **named)
+            usual: dict[str, Any] = dict.fromkeys(("divide", "over", "invalid"), "warn")
+            with np.errstate(under="ignore", **usual):  # whatever its caller has set
+                return function(*given, **named)
 
         more = [
             inspect.Parameter(

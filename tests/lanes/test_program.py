@@ -8,6 +8,7 @@ import logging
 import os
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 
 import jax
@@ -411,3 +412,8 @@ def test_where_jax_computes_in_single_precision_a_kernel_does_too():
     )
     environment = {**os.environ, "JAX_ENABLE_X64": "false"}
     subprocess.run([sys.executable, "-c", script], env=environment, check=True)
+
+
+def test_an_array_is_laid_out_without_a_warning():
+    with warnings.catch_warnings(action="error"):
+        assert Argument.of(jnp.zeros(3, jnp.float32), lanes=True).dtype == jnp.float32

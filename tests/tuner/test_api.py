@@ -17,6 +17,7 @@ from tuner.cli.commands import simulate as simulate_command
 from tuner.cli.tune import tune as tune_command
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
+from tuner.options import taking
 from tuner.vehicle import ControllerFile, with_values
 
 UPDATED = configs_folder() / "vehicles" / "hovergames_updated.yaml"
@@ -152,6 +153,7 @@ def test_wrong_input_is_the_same_one_line(tmp_path):
         (api.sensitivity, {"controller": 3}, "controller: is of type int; give"),
         (api.simulate, {"trajectory": "circle", "speed": [3.0]}, r"options: speed is \[3.0\]"),
         (api.simulate, {"trajectory": "circle", "sped": 3.0}, "did you mean 'speed'"),
+        (api.fit, {"fit": ["mass"]}, "fit: is no option; known are free"),
         (api.compare, {"vehicles": {"a": 3}}, "vehicle: is of type int; give"),
         (api.export, {"run": "x", "format": "sdf", "draws": 1.5}, "it should be a whole number"),
         (api.export, {"run": "x", "format": 3}, "format: is of type int; give text"),
@@ -188,3 +190,12 @@ def test_a_fit_keeps_algebra_on_one_thread_and_gives_the_others_back(bag, monkey
             tuner.fit([bag])
         assert blas_threads() == before
     assert during == [{1}]
+
+
+def test_what_a_caller_makes_of_small_numbers_changes_nothing():
+    @taking()
+    def decayed(seconds: float) -> float:
+        return float(np.exp(np.float64(-seconds)))
+
+    with np.errstate(all="raise"):
+        assert decayed(1e4) == 0.0

@@ -243,12 +243,11 @@ def _run(
     """Simulate all segments with given gains; without any, filter them."""
 
     def table(leaf: Any) -> Argument:
-        shape = np.shape(leaf)[1:-1]
-        return Argument(("ticks", *shape), np.result_type(leaf), lanes=True)
+        return replace(Argument.of(leaf, lanes=True), shape=("ticks", *np.shape(leaf)[1:-1]))
 
     def apart(leaf: Any) -> Argument:
         shape = ("ticks", *np.shape(leaf)[2:])
-        return Argument(shape, np.result_type(leaf), lanes=True, apart=True)
+        return replace(Argument.of(leaf, lanes=True), shape=shape, apart=True)
 
     inputs, assumed, moves = given.inputs, given.assumed, tangents is not None
     arguments = _Given(

@@ -146,7 +146,8 @@ def in_words(verdict: Verdict) -> list[str]:
         lines = [f"can be fitted, through the inlet {listed(tuple(inlets))}"]
     lines += [f"  {why}" for why in verdict.why]
     if verdict.not_shown:
-        lines.append(f"  It cannot show {listed(verdict.not_shown)}, which act above there.")
+        act = "acts" if len(verdict.not_shown) == 1 else "act"
+        lines.append(f"  It cannot show {listed(verdict.not_shown)}, which {act} above there.")
     if verdict.gains:
         lines.append(f"  The log's own parameters are simulated: {'; '.join(verdict.gains)}.")
     return [*lines, *_logger_in_words(verdict)]

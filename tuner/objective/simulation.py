@@ -222,8 +222,8 @@ def laid_out(segments: Segments) -> Any:
     """Return the layout of each leaf of the simulated part of segments."""
 
     def each(leaf: Any, name: str | None = None) -> Argument:
-        shape = np.shape(leaf)[:-1]
-        return Argument((name, *shape[1:]) if name else shape, np.result_type(leaf), lanes=True)
+        made = Argument.of(leaf, lanes=True)
+        return replace(made, shape=(name, *made.shape[1:])) if name else made
 
     volts = jax.tree.map(partial(each, name="volts"), segments.log_voltage)
     pushes = jax.tree.map(partial(each, name="pushes"), segments.disturbance)
@@ -243,10 +243,11 @@ def _tables(inlet: Inlet) -> Inlet:
     names: dict[int, str] = {}
 
     def of(leaf: Any) -> Argument:
-        shape = np.shape(leaf)[:-1]
-        if shape:
-            shape = (names.setdefault(shape[0], f"rows {len(names)}"), *shape[1:])
-        return Argument(shape, np.result_type(leaf), lanes=True)
+        made = Argument.of(leaf, lanes=True)
+        if not made.shape:
+            return made
+        name = names.setdefault(int(made.shape[0]), f"rows {len(names)}")
+        return replace(made, shape=(name, *made.shape[1:]))
 
     tables: Inlet = jax.tree.map(of, inlet)
     return tables
