@@ -33,12 +33,12 @@ from tuner.config import resolve_settings
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
-from tuner.objective.criterion import Point, picked
+from tuner.objective.criterion import picked
 from tuner.objective.normal_equations import Objective
 from tuner.objective.space import Space
 from tuner.options import Options
 from tuner.search.continuation import run_stages
-from tuner.search.estimation import free_offsets
+from tuner.search.estimation import free_parameters
 from tuner.search.job_flights import read_recordings
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import Fitted, criterion_of, initial_progress
@@ -233,7 +233,7 @@ def fitted(objective: Objective) -> Fitted:
         objective,
         stages,
         initial_progress(objective, begin[None]),
-        free=Point(np.ones(len(space), bool), free_offsets(reference_job())),
+        free=free_parameters(reference_job()),
         undecided={},
         on_progress=lambda _: None,
     )

@@ -52,7 +52,7 @@ def inspect(
 
     paths = find_flights(flights)
     if suggest:
-        from tuner.recordings.inspector import suggested_map
+        from tuner.recordings.inspection_rules import suggested_map
 
         for path in paths:
             sys.stdout.write(suggested_map(path))
@@ -70,11 +70,10 @@ def inspect(
     if json:
         print(as_json(inspections, errors, {path: asdict(of) for path, of in verdicts.items()}))
     else:
-        from tuner.cli.results import console
-        from tuner.recordings.inspection import render
+        from tuner.cli.results import console, inspections_drawn
 
         words = {path: in_words(verdict) for path, verdict in verdicts.items()}
-        console().print(render(inspections, words))
+        console().print(inspections_drawn(inspections, words))
     if errors:
         for error in errors[:-1]:
             sys.stderr.write(printable(f"tune: {error}") + "\n")

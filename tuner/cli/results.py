@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console, ConsoleOptions, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType
 from rich.segment import Segment
 from rich.table import Table as DrawnTable
 from rich.text import Text
 
 from tuner.core.phrases import listed_within, printable, shorten
 from tuner.evaluate.records import RMSE_UNITS
+from tuner.recordings.notes import damage_sentence, note_in_words
 from tuner.report.section import Cell, Table
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from tuner.exporters.export import Exported
     from tuner.job.bench import BenchResult
     from tuner.job.sensitivity import SensitivityResult
+    from tuner.recordings.inspection import Inspection, MissionReport
     from tuner.report.contents import Contents
     from tuner.result import ExportRecord, RunResult
     from tuner.search.listener import PointEstimate
@@ -384,3 +386,162 @@ def folds_table(folds: Sequence[Refit]) -> object:
     columns = ("left out", *(f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()))
     title = "RMSE of each flight with the fit to the others"
     return rich_table(Table(columns, rows, words=("left out",), fold=title))
+
+
+INFORMED_STYLES = {"yes": "green", "weakly": "yellow", "no": "red"}
+"""Whether a recording shows a coefficient -> style of the terminal."""
+
+
+def inspections_drawn(
+    inspections: Iterable[Inspection], verdicts: Mapping[str, Sequence[str]] | None = None
+) -> RenderableType:
+    """Return inspections of recordings for rich to print.
+
+    Parameters
+    ----------
+    verdicts
+        Path -> lines that say whether and how it can be fitted, printed first.
+    """
+    verdicts = verdicts or {}
+    return Group(
+        *(
+            part
+            for each in inspections
+            for part in _drawn_inspection(each, verdicts.get(each.path, ()))
+        )
+    )
+
+
+def _drawn_inspection(inspection: Inspection, verdict: Sequence[str]) -> list[RenderableType]:
+    size = f"{inspection.size / 1e6:.1f} MB"
+    about = [inspection.format, size, f"{inspection.duration:.1f} s"]
+    about += [inspection.started.replace("+00:00", " UTC")] if inspection.started else []
+    about += [f"topic map {inspection.topic_map}"] if inspection.topic_map else []
+    parts: list[RenderableType] = [Text(), Text(inspection.path, "bold"), Text(" · ".join(about))]
+    colour = "red" if verdict and verdict[0].startswith("cannot") else "green"
+    parts += [Text(line, colour if not line.startswith(" ") else "") for line in verdict]
+    if inspection.problem and not verdict:
+        parts.append(Text(inspection.problem, "red"))
+    parts += [Text(f"warning: {damage_sentence(damage)}", "yellow") for damage in inspection.damage]
+    parts.append(_topics_drawn(inspection))
+    if inspection.missions:
+        parts.append(_missions_drawn(inspection))
+    if inspection.clock or inspection.battery:
+        parts.append(_clock_and_battery(inspection))
+    parts.append(_inlets_drawn(inspection))
+    if inspection.coefficients:
+        parts.append(_informed_drawn(inspection))
+    for note in inspection.notes:
+        colour = "yellow" if note.kind == "warning" else "dim"
+        topic = f"{note.topic}: " if note.topic else ""
+        parts.append(Text(f"{note.kind}: {topic}{note_in_words(note)}", colour))
+    return parts
+
+
+def _number(value: float | None, form: str, scale: float = 1.0) -> str:
+    return "" if value is None else format(value * scale, form)
+
+
+def _titled_table(
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[tuple[str, Sequence[str | Text]]],
+    left: Sequence[str],
+) -> DrawnTable:
+    """Return a table of rows (style, cells); columns not in `left` are right-aligned."""
+    table = DrawnTable(title=title, title_justify="left", title_style="bold", box=None)
+    for name in columns:
+        table.add_column(name, justify="left" if name in left else "right", no_wrap=name == "topic")
+    for style, cells in rows:
+        table.add_row(*cells, style=style)
+    return table
+
+
+def _topics_drawn(inspection: Inspection) -> DrawnTable:
+    names = ("topic", "type", "messages", "Hz", "gap s", "jitter ms", "delay ms", "used for")
+    rows = (
+        (
+            "" if topic.signals else "dim",
+            (
+                topic.name or "(table)",
+                topic.type,
+                str(topic.count),
+                _number(topic.rate, ".1f"),
+                _number(topic.longest_gap, ".3f"),
+                _number(topic.jitter, ".2f", 1e3),
+                _number(topic.delay, ".2f", 1e3) if topic.delay and abs(topic.delay) < 3600 else "",
+                ", ".join(topic.signals),
+            ),
+        )
+        for topic in inspection.topics
+    )
+    return _titled_table("topics", names, rows, ("topic", "type", "used for"))
+
+
+def _missions_drawn(inspection: Inspection) -> DrawnTable:
+    numbers = ("laps", "mean m/s", "top m/s", "tilt °", "turn rad/s", "height m", "pose known")
+    rows = (
+        (
+            "",
+            (
+                f"{mission.start:.2f}",
+                f"{mission.duration:.2f}",
+                mission.begins_with,
+                "" if mission.laps is None else str(mission.laps),
+                f"{mission.mean_speed:.2f}",
+                f"{mission.top_speed:.2f}",
+                f"{mission.largest_tilt:.1f}",
+                _number(mission.top_turn_rate, ".2f"),
+                f"{mission.height[0]:.2f}–{mission.height[1]:.2f}",
+                f"{100 * mission.known:.1f} %",
+                _remark(mission),
+            ),
+        )
+        for mission in inspection.missions
+    )
+    columns = ("start s", "s", "begins with", *numbers, "remark")
+    return _titled_table("missions", columns, rows, ("begins with", "remark"))
+
+
+def _remark(mission: MissionReport) -> str:
+    spin = mission.yaw_rate_setpoint
+    if spin is None:
+        return "" if mission.fitted else "others show more: not fitted"
+    return f"yaw spin at {spin:g} rad/s" + (", held level" if mission.level_held else "")
+
+
+def _clock_and_battery(inspection: Inspection) -> Text:
+    remarks = []
+    if "spread" in inspection.clock:
+        remarks.append(
+            f"the reference's stamps are late by up to {1e3 * inspection.clock['spread']:.2f} ms"
+        )
+    if inspection.clock.get("drift"):
+        remarks.append(f"its clock drifts by {1e6 * inspection.clock['drift']:+.0f} ppm")
+    offset = inspection.clock.get("pose_offset")
+    if offset is not None:
+        remarks.append(f"the pose's stamps are {1e3 * offset:+.1f} ms late against the gyro's")
+    text = f"clock: {', '.join(remarks)}" if remarks else ""
+    if inspection.battery:
+        first, last = inspection.battery
+        text += f"{'   ' if text else ''}battery: {first:.2f} V to {last:.2f} V"
+    return Text(text)
+
+
+def _inlets_drawn(inspection: Inspection) -> DrawnTable:
+    rows = []
+    for inlet in inspection.inlets:
+        usable = not inlet.missing and inspection.problem is None
+        lacks = f"lacks {', '.join(inlet.missing)}" if inlet.missing else "no mission"
+        rows.append(("" if usable else "dim", (inlet.name, "yes" if usable else lacks)))
+    columns = ("inlet", "can be fed from this recording")
+    return _titled_table("inlets", columns, rows, columns)
+
+
+def _informed_drawn(inspection: Inspection) -> DrawnTable:
+    rows = (
+        ("", (found.coefficient, Text(found.how, INFORMED_STYLES[found.how]), found.why))
+        for found in inspection.coefficients
+    )
+    columns = ("coefficient", "", "because")
+    return _titled_table("could inform", columns, rows, columns)

@@ -138,22 +138,6 @@ def rotor_radius(vehicle: VehicleFile) -> float:
     return math.sqrt(sum(squares) / len(squares))
 
 
-def scaled_of(name: str, value: float) -> float:
-    """Return the scaled coordinate of a coefficient's value."""
-    return math.log(value) if COEFFICIENTS[name].scale == "log" else value
-
-
-def value_of(name: str, scaled: float) -> float:
-    """Return a coefficient's value, in its unit."""
-    return math.exp(scaled) if COEFFICIENTS[name].scale == "log" else scaled
-
-
-def error_of(name: str, scaled: float, deviation: float) -> float:
-    """Return the standard error of a value, in its unit, from that of its scaled coordinate."""
-    log = COEFFICIENTS[name].scale == "log"
-    return deviation * math.exp(scaled) if log else deviation
-
-
 CONFLICT_SE = 3.0
 """Standard errors apart beyond which two measurements of one number contradict each other."""
 MIN_INFORMATION_SHARE = 1e-11
@@ -437,8 +421,9 @@ def numbers_in_words(experiment: ExperimentRecord) -> list[str]:
     ):
         if len(row) == 1:
             ((name, power),) = row.items()
-            value, error = value_of(name, scaled / power), error_of(name, scaled / power, deviation)
-            phrases.append(f"{name} {value:.5g} ± {error:.2g} {COEFFICIENTS[name].unit}".rstrip())
+            row_of, own = COEFFICIENTS[name], scaled / power
+            value, error = row_of.value_at(own), row_of.error_at(own, deviation)
+            phrases.append(f"{name} {value:.5g} ± {error:.2g} {row_of.unit}".rstrip())
         elif all(factor == 1.0 for factor in row.values()):
             value = math.exp(scaled)
             phrases.append(f"{' · '.join(row)} {value:.5g} ± {value * deviation:.2g}")

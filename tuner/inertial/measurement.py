@@ -18,12 +18,12 @@ import numpy as np
 from tuner.core.errors import RecordingError
 from tuner.core.phrases import clause
 from tuner.findings.findings import remedy, sentence
-from tuner.ground.measurement import Curve, Measurement, Remark, scaled_of
+from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.inertial.fit import NUMBER_NAMES, OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
 from tuner.objective.rotor_signals import order_findings
 from tuner.recordings.loader import InertialFlight
-from tuner.vehicle import VehicleFile
+from tuner.vehicle import COEFFICIENTS, VehicleFile
 
 POWERS: tuple[Mapping[str, float], ...] = (
     {"time_constant_up": 1.0},
@@ -113,7 +113,7 @@ def _measurement(
     name: str, response: Response, used: Sequence[str], vehicle: VehicleFile
 ) -> Measurement:
     lags, gains = response.lags, response.gains
-    curve = 2.0 * scaled_of("input_scaling", vehicle.motor.input_scaling)
+    curve = 2.0 * COEFFICIENTS["input_scaling"].scaled(vehicle.motor.input_scaling)
     values = {
         "up": math.log(lags.up),
         "down": math.log(lags.down),

@@ -23,9 +23,6 @@ from tuner.ground.measurement import (
     Measurement,
     bench_record,
     combine,
-    error_of,
-    scaled_of,
-    value_of,
 )
 from tuner.ground.plan import BenchFile, YawSpin, read_bench
 from tuner.report import render
@@ -196,7 +193,7 @@ def known_of(vehicle: VehicleFile) -> dict[str, float]:
     neutral = {n: row.neutral for n, row in COEFFICIENTS.items() if row.neutral is not None}
     values = neutral | values_of(vehicle)
     return {
-        name: scaled_of(name, v)
+        name: COEFFICIENTS[name].scaled(v)
         for name, v in values.items()
         if v > 0 or COEFFICIENTS[name].scale == "linear"
     }
@@ -213,7 +210,7 @@ def vehicle_of(path: Path, start: VehicleFile, combination: Combination) -> Vehi
         They are impossible.
     """
     values = {
-        name: value_of(name, float(scaled))
+        name: COEFFICIENTS[name].value_at(float(scaled))
         for name, scaled in zip(combination.names, combination.scaled, strict=True)
     }
     values |= {n: max(v, 0.0) for n, v in values.items() if COEFFICIENTS[n].unit == "s"}
@@ -238,8 +235,8 @@ def _coefficients(
     places = {name: place for place, name in enumerate(combination.names)}
     coefficients = {}
     for name, value in best.items():
-        neutral = COEFFICIENTS[name].neutral
-        before = initial.get(name, value if neutral is None else neutral)
+        row = COEFFICIENTS[name]
+        before = initial.get(name, value if row.neutral is None else row.neutral)
         if name not in places:
             coefficients[name] = CoefficientResult.judged(
                 name, before, value, Verdict.FIXED, NOT_FITTED
@@ -258,8 +255,8 @@ def _coefficients(
             value,
             verdict,
             reason,
-            std_error=error_of(name, scaled, deviation) if determined else None,
-            ci95=(value_of(name, ends[0]), value_of(name, ends[1])) if determined else None,
+            std_error=row.error_at(scaled, deviation) if determined else None,
+            ci95=(row.value_at(ends[0]), row.value_at(ends[1])) if determined else None,
             identifiable=reason.identifiable,
         )
     return coefficients

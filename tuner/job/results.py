@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from sim_jax.inlet import ReferenceInlet
+from tuner.config import Settings
 from tuner.core.disk import write_text
 from tuner.core.files import csv_text
 from tuner.core.numerics import Z95
@@ -68,7 +69,7 @@ from tuner.uncertainty.verdict import (
     judge_after_holding,
     judge_by_error,
 )
-from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, write_vehicle
+from tuner.vehicle import COEFFICIENTS, ControllerFile, VehicleFile, initial_values, write_vehicle
 from tuner.vehicle.vehicle import scaled_to_size
 
 METRICS_FILE = "metrics.csv"
@@ -99,12 +100,7 @@ def result_of(
         versions=versions(),
         settings={
             "command": command,
-            "vehicle": settings.vehicle.model_dump(mode="json"),
-            "controller": controller_flown(job, fitted).model_dump(mode="json"),
-            "job": settings.job.model_dump(mode="json"),
-            "origin": dict(settings.origin),
-            "noise": dict(fitted.noise),
-            "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
+            **settings_record(settings, controller_flown(job, fitted), fitted),
             "offsets": {
                 flight.name: dict(zip(OFFSETS, offsets.tolist(), strict=True))
                 for flight, offsets in zip(job.fitted, table.T, strict=True)
@@ -132,6 +128,20 @@ def result_of(
         effective=effective,
         next_log=next_log,
     )
+
+
+def settings_record(
+    settings: Settings, controller: ControllerFile, fitted: Fitted
+) -> dict[str, JsonValue]:
+    """Return the files of a fit, their origin, and the weights of its residuals, for JSON."""
+    return {
+        "vehicle": settings.vehicle.model_dump(mode="json"),
+        "controller": controller.model_dump(mode="json"),
+        "job": settings.job.model_dump(mode="json"),
+        "origin": dict(settings.origin),
+        "noise": dict(fitted.noise),
+        "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
+    }
 
 
 def _loss_at_start(job: Job, fitted: Fitted) -> float:

@@ -16,7 +16,7 @@ from tuner.design.proposals import Proposals
 from tuner.design.ranking import Arena
 from tuner.evaluate.validation import comparison_of
 from tuner.findings.findings import Code, Finding
-from tuner.job.results import write_next_flight
+from tuner.job.results import settings_record, write_next_flight
 from tuner.objective.normal_equations import Objective, misfit, root_mean_squares, sums_at
 from tuner.options import ExaminationOptions
 from tuner.report import render
@@ -139,14 +139,7 @@ def examine_vehicle(
             command=command,
             vehicle=settings.vehicle.name,
             versions=versions(),
-            settings={
-                "vehicle": settings.vehicle.model_dump(mode="json"),
-                "controller": settings.controller.model_dump(mode="json"),
-                "job": settings.job.model_dump(mode="json"),
-                "origin": dict(settings.origin),
-                "noise": dict(fitted.noise),
-                "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
-            },
+            settings=settings_record(settings, settings.controller, fitted),
             findings=list(fitted.findings),
             flights=[
                 Recording(name=f.name, path=str(f.path), sha256=f.sha256, duration=f.duration)

@@ -13,7 +13,7 @@ from tuner.config import Settings
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.evaluate.validation import MAX_RMSE_INCREASE
 from tuner.findings.findings import Code, Finding, Level
-from tuner.ground.measurement import Combination, Measurement, combine, value_of
+from tuner.ground.measurement import Combination, Measurement, combine
 from tuner.inertial.measurement import measure_inertial, widen_to_agree
 from tuner.inertial.signals import RateErrors, rate_errors, stretches_of
 from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, write_measurements
@@ -21,7 +21,7 @@ from tuner.recordings.loader import InertialFlight
 from tuner.result import place_for
 from tuner.search.job_flights import left_out_finding
 from tuner.search.listener import SILENT, Listener
-from tuner.vehicle import VehicleFile, values_of, with_values
+from tuner.vehicle import COEFFICIENTS, VehicleFile, values_of, with_values
 
 OVER_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
 """Coefficients that a flight without a pose determines over the mass."""
@@ -170,7 +170,7 @@ def _resized(vehicle: VehicleFile, combination: Combination) -> VehicleFile:
     """
     before = values_of(vehicle)
     changes = [
-        value_of(name, float(scaled)) / before[name]
+        COEFFICIENTS[name].value_at(float(scaled)) / before[name]
         for name, scaled in zip(combination.names, combination.scaled, strict=True)
         if name in ("inertia_xx", "inertia_yy")
     ]

@@ -21,7 +21,7 @@ from tuner.recordings.interpolation import (
     body_rate_of,
     correlation,
     middle_clock,
-    on_clock,
+    resample,
     rms,
     smooth,
 )
@@ -249,8 +249,10 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
     clock = middle_clock(series)
     if len(clock) < 3 * MAX_POSE_OFFSET_S * RATE_HZ:
         return None
-    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)), AVERAGING_WINDOW_S)
-    gyro = smooth(on_clock(series, "body_rate", clock), AVERAGING_WINDOW_S)
+    turning = smooth(
+        body_rate_of(resample("attitude", series["attitude"], clock)), AVERAGING_WINDOW_S
+    )
+    gyro = smooth(resample("body_rate", series["body_rate"], clock), AVERAGING_WINDOW_S)
     return None if rms(gyro) < MIN_TURN_RATE else lag_between(turning, gyro)
 
 

@@ -28,7 +28,7 @@ from tuner.recordings.interpolation import (
     correlation,
     derivative,
     middle_clock,
-    on_clock,
+    resample,
     rms,
     rotate,
     runs,
@@ -214,7 +214,9 @@ def correct_frames(
     clock = middle_clock(series) if {"position", "attitude"} <= set(series) else np.empty(0)
     if len(clock) < 200:
         return fixed, ()
-    flown = {n: on_clock(series, n, clock) for n in ("position", "attitude", *PAIRS) if n in series}
+    flown = {
+        n: resample(n, series[n], clock) for n in ("position", "attitude", *PAIRS) if n in series
+    }
     for signal in ("attitude", *PAIRS):
         if signal not in flown or (signal == "rate_setpoint" and "body_rate" not in flown):
             continue
@@ -223,9 +225,11 @@ def correct_frames(
         reading, doubts = judge(signal, flown)
         if reading is not None:
             measured = series[signal]
-            values = reading.read(measured.values, on_clock(fixed, "attitude", measured.time))
+            values = reading.read(
+                measured.values, resample("attitude", fixed["attitude"], measured.time)
+            )
             fixed[signal] = replace(measured, values=values).complete()
-            flown[signal] = on_clock(fixed, signal, clock)
+            flown[signal] = resample(signal, fixed[signal], clock)
             notes.append(
                 NoteCode.FRAME_TURNED.note(
                     signal, reading.name, topic=topic, count=len(measured.time)
@@ -494,7 +498,7 @@ def contradiction(series: Mapping[str, Series], missions: Sequence[Mission]) -> 
     if not {"position", "attitude"} <= set(parts):
         return None
 
-    flown = {name: on_clock(parts, name, middle_clock(parts)) for name in parts}
+    flown = {name: resample(name, of, middle_clock(parts)) for name, of in parts.items()}
     for other, signal, clear in _OPPOSED:
         if signal in flown:
             change, recorded = PAIRS[signal].compared[-1](flown)

@@ -131,11 +131,6 @@ def middle_clock(series: Mapping[str, Series]) -> Array:
     return np.arange(start + spare, end - spare, 1 / RATE_HZ)
 
 
-def on_clock(series: Mapping[str, Series], name: str, clock: Array) -> Array:
-    """Return a signal on a clock, (n, k)."""
-    return resample(name, series[name], clock)
-
-
 def smooth(values: Array, seconds: float = 0.05) -> Array:
     """Return the moving average of (n, k) values; NaN where the window is incomplete."""
     width = max(1, round(seconds * RATE_HZ) | 1)

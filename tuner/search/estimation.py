@@ -8,14 +8,13 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tuner.core.disk import whole_file
 from tuner.core.errors import InputError
@@ -260,7 +259,7 @@ def _attempt(
     stages = stages_of(job, job.objective, method)
     if job.windows is not None:  # windows replace the stages of short horizons
         stages = tuple(stage for stage in stages if stage.horizon == job.objective.samples)
-    free = Point(np.ones(len(job.space), bool), free_offsets(job))
+    free = free_parameters(job)
     start, spent = initial_progress(job.objective, starts), 0.0
     progress = start
     if resume:
@@ -346,10 +345,11 @@ def stages_of(job: Job, objective: Objective, method: str = "gradient") -> tuple
     )
 
 
-def free_offsets(job: Job) -> NDArray[np.bool_]:
-    """Return (offsets, N) which offsets of which flight are fitted.
+def free_parameters(job: Job, *, held: Collection[str] = ()) -> Point:
+    """Return which coefficients (K,), and which offsets (offsets, N) of which flight, are fitted.
 
-    Inputs below the reference have the flight controller's stamps, which are then the simulation's.
+    All coefficients of the job but those ``held``. Inputs below the reference have the flight
+    controller's stamps, which are then the simulation's.
     """
     free = np.ones((len(job.objective.of_flight), len(job.fitted)), bool)
     clock_given = [r.time_offset is not None for r in job.recordings if not r.holdout]
@@ -358,7 +358,7 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     free[CLOCKS.index("flight_controller"), fed] = False
     if job.objective.segments.windowed and job.objective.segments.start_sd is None:
         free[: len(OFFSETS)] = False  # a recorded start has the recording's clock and bias
-    return free
+    return Point(np.array([name not in held for name in job.space.names], bool), free)
 
 
 def starting_vectors(job: Job) -> Array:

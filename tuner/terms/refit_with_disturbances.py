@@ -19,7 +19,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.information import with_start_values
 from tuner.objective.space import Space
-from tuner.search.estimation import LAST_POLISH, free_offsets, polished
+from tuner.search.estimation import LAST_POLISH, free_parameters, polished
 from tuner.search.findings import UNMATCHED_CODES, outlying_flights, unmatched_findings
 from tuner.search.listener import Reporter
 from tuner.search.problem import Job
@@ -143,11 +143,10 @@ def with_disturbances(
         on_message(FILTER_LOST)
         return None
     job = seen.selected.job
-    offsets = free_offsets(job)
     again = polished(
         job,
         there,
-        free=Point(np.zeros(len(job.space), bool), offsets),
+        free=free_parameters(job, held=job.space.names),
         title="clocks",
         on_progress=partial(reporter.on_progress, job),
         stages=LAST_POLISH,
@@ -175,7 +174,7 @@ def with_disturbances(
             fitted = polished(
                 job,
                 again,
-                free=Point(np.ones(len(job.space), bool), offsets),
+                free=free_parameters(job),
                 title="simulated",
                 on_progress=partial(reporter.on_progress, job),
             )
@@ -261,7 +260,7 @@ def _fit_innovations(
     predictor = predictor.laid(full.objective, point, job.fitted)
     names, count = full.objective.space.names, len(full.fitted)
     moves = np.isin(names, full.fitted) & ~np.isin(names, list(fitted.held.values()))
-    offsets = free_offsets(job)
+    offsets = free_parameters(job).offsets
     enter = offsets & (np.arange(len(offsets)) != FLIGHT_CONTROLLER)[:, None]
     seen = ~hidden_by_setpoints(names, full.objective.model)
     free = np.concatenate([moves & seen, enter.ravel()])

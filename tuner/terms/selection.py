@@ -36,7 +36,7 @@ from tuner.search.estimation import (
     FIRST_POLISH,
     LAST_POLISH,
     ROUGH_TOLERANCE,
-    free_offsets,
+    free_parameters,
     polished,
     search,
 )
@@ -254,7 +254,7 @@ class Selection:
                 offsets_of(state.fitted, objective, reset=idle),
             ),
         )
-        offsets = free_offsets(self.job)
+        offsets = free_parameters(self.job).offsets
         moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
         free_ones = Point(
             np.ones(len(vector), bool),

@@ -26,7 +26,7 @@ from tuner.core.phrases import listed
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal_equations import Objective, normal_equations
 from tuner.search.continuation import RIDGE
-from tuner.search.estimation import BOTH_POLISHES, LAST_POLISH, free_offsets, polished
+from tuner.search.estimation import BOTH_POLISHES, LAST_POLISH, free_parameters, polished
 from tuner.search.listener import Reporter
 from tuner.search.optimisers import advance, initial_step
 from tuner.search.problem import Job
@@ -209,7 +209,7 @@ def hold(
     if not is_held.any():
         return fitted
     clock = time.perf_counter()
-    free = Point(~is_held, free_offsets(job))
+    free = free_parameters(job, held=names)
     point = _point_after_holding(
         fitted, np.where(is_held, space.initial, fitted.point.coefficients), free
     )

@@ -18,9 +18,8 @@ from tuner.core.files import csv_text
 from tuner.engine import Report, current
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.evaluate.validation import best_values, comparison_of
-from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import Objective
-from tuner.search.estimation import free_offsets, polished
+from tuner.search.estimation import free_parameters, polished
 from tuner.search.listener import Iteration
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
@@ -75,11 +74,10 @@ def refits(
 
 def _refit(task: tuple[Callable[[], tuple[Job, Fitted]], Draw], report: Report) -> Refit:
     (job, fitted), draw = task[0](), task[1]
-    held = set(fitted.held.values())
     end = polished(
         job,
         replace(fitted, objective=_counted(fitted.objective, draw.counts)),
-        free=Point(np.array([name not in held for name in job.space.names]), free_offsets(job)),
+        free=free_parameters(job, held=fitted.held.values()),
         title=draw.title,
         on_progress=lambda progress: report(progress.iterations[-1].model_dump()),
     )

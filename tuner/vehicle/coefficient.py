@@ -52,8 +52,26 @@ class NotCarried:
     built_in: float | None = None
 
 
+class Scaled:
+    """What has a scaled coordinate: the logarithm of its value, or the value itself."""
+
+    scale: Scale
+
+    def scaled(self, value: float) -> float:
+        """Return the scaled coordinate of a value."""
+        return math.log(value) if self.scale == "log" else value
+
+    def value_at(self, scaled: float) -> float:
+        """Return the value at a scaled coordinate."""
+        return math.exp(scaled) if self.scale == "log" else scaled
+
+    def error_at(self, scaled: float, deviation: float) -> float:
+        """Return the standard error of a value from that of its scaled coordinate."""
+        return deviation * math.exp(scaled) if self.scale == "log" else deviation
+
+
 @dataclass(frozen=True)
-class Coefficient:
+class Coefficient(Scaled):
     """A number that a fit can move: one row of the registry.
 
     Attributes
@@ -117,7 +135,7 @@ class Coefficient:
     exported_as
         Export target -> its place there, or why it has none.
     informed_by
-        The rule of `tuner.recordings.inspector` that decides whether a recording can show it.
+        The rule of `tuner.recordings.inspection_rules` on whether a recording can show it.
     plausible
         Values outside this range are reported as improbable.
     fallback
@@ -182,7 +200,7 @@ class Coefficient:
 
 
 @dataclass(frozen=True)
-class Parameter:
+class Parameter(Scaled):
     """One coordinate of the search: a coefficient, or several that are tied to it.
 
     Attributes
@@ -212,14 +230,10 @@ class Parameter:
     initial: float
     lower: float
     upper: float
-    scale: Literal["log", "linear"]
+    scale: Scale
     prior_mean: float
     prior_sd: float
     prior_given: bool
     unit_step: float
     usual: float = 0.0
     moved: float | None = None
-
-    def scaled(self, value: float) -> float:
-        """Return the scaled coordinate of a value."""
-        return math.log(value) if self.scale == "log" else value

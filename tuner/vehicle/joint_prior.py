@@ -53,20 +53,21 @@ class JointPrior:
         count = len(parameters)
         design, offset = np.zeros((len(self.names), count)), -self.mean.copy()
         for place, name in enumerate(self.names):
-            log = COEFFICIENTS[name].scale == "log"
+            row = COEFFICIENTS[name]
             for index, parameter in enumerate(parameters):
                 if name not in parameter.ratios:
                     continue
-                if parameter.scale != COEFFICIENTS[name].scale:
+                if parameter.scale != row.scale:
                     remedy = "leave its scale out of the job file"
                     raise ConfigError(name, "was measured on the ground in another scale", remedy)
-                design[place, index] = 1.0 if log else parameter.ratios[name]
-                offset[place] += math.log(parameter.ratios[name]) if log else 0.0
+                log, ratio = row.scale == "log", parameter.ratios[name]
+                design[place, index] = 1.0 if log else ratio
+                offset[place] += math.log(ratio) if log else 0.0
                 break
             else:
-                value = fixed.get(name, COEFFICIENTS[name].neutral or 0.0)
-                known = not log or value > 0
-                offset[place] += (math.log(value) if log else value) if known else self.mean[place]
+                value = fixed.get(name, row.neutral or 0.0)
+                known = row.scale == "linear" or value > 0
+                offset[place] += row.scaled(value) if known else self.mean[place]
         unit = unit_diagonal(self.information)
         values, vectors = symmetric_eigen(self.information * np.outer(unit, unit))
         values = np.where(values > MIN_INFORMATION_SHARE * values.max(), values, 0.0)

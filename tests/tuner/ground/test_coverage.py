@@ -11,11 +11,11 @@ from tests.tuner.ground import rigs
 from tuner.core.errors import RecordingError
 from tuner.core.shipped import configs_folder
 from tuner.ground.hovers import measure_hover_weights, measure_propeller, measure_yaw_spin
-from tuner.ground.measurement import combine, scaled_of
+from tuner.ground.measurement import combine
 from tuner.ground.plan import Experiment
 from tuner.ground.rigs import measure_bifilar, measure_rpm_curve, measure_stand
 from tuner.ground.step_response import measure_step_response
-from tuner.vehicle import read_vehicle, with_values
+from tuner.vehicle import COEFFICIENTS, read_vehicle, with_values
 
 TRUTH = rigs.TRUTH
 LEVER, ARM = 1.4231, 0.37
@@ -93,7 +93,7 @@ RIGS = (swing, thrust, torque, curve, steps, hover, spin, table)
 def deviations(measurement):
     """Return by how many standard errors each number is off."""
     expected = [
-        sum(factor * scaled_of(name, TRUTH[name]) for name, factor in row.items())
+        sum(factor * COEFFICIENTS[name].scaled(TRUTH[name]) for name, factor in row.items())
         for row in measurement.rows
     ]
     return (measurement.value - expected) / np.sqrt(np.diag(measurement.covariance))
@@ -159,7 +159,7 @@ def test_a_speed_that_reacts_before_its_commands_stamp_leaves_the_time_constants
 def test_a_wrong_lever_ratio_conflicts_with_the_hovers():
     random = np.random.default_rng(3)
     wrong = thrust(random, lever=1.0)
-    known = {name: scaled_of(name, value) for name, value in TRUTH.items() if name in KNOWN}
+    known = {name: COEFFICIENTS[name].scaled(TRUTH[name]) for name in TRUTH if name in KNOWN}
     together = combine([wrong, hover(random)], known)
     assert together.p_value < 1e-6
     assert {conflict.experiment for conflict in together.conflicts} == {"thrust", "hover"}

@@ -34,7 +34,7 @@ from tuner.objective.setpoints import match_setpoints, setpoint_findings
 from tuner.objective.simulation import beginning_of, recorded_of
 from tuner.options import Options
 from tuner.recordings.flight import Series
-from tuner.recordings.inspector import inlet_reports
+from tuner.recordings.inspection_rules import inlet_reports
 from tuner.search.job_flights import choose_inlet, inlet_for
 from tuner.search.problem import job_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile

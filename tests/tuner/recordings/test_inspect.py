@@ -14,10 +14,11 @@ import pytest
 from rich.console import Console
 
 from tests.tuner.recordings import making
+from tuner.cli.results import inspections_drawn
 from tuner.job.recording_verdict import verdict_of
 from tuner.recordings.cache import cache_root
-from tuner.recordings.inspection import Inspection, as_json, inspect_recordings, render
-from tuner.recordings.inspector import inlet_reports
+from tuner.recordings.inspection import Inspection, as_json, inspect_recordings
+from tuner.recordings.inspection_rules import inlet_reports
 from tuner.vehicle import COEFFICIENTS
 
 
@@ -87,7 +88,7 @@ def test_json_and_table_agree(circle: Inspection) -> None:
     (recording,) = content["recordings"]
     assert recording["missions"][0]["laps"] == 7
     stream = io.StringIO()
-    Console(file=stream, width=160).print(render([circle]))
+    Console(file=stream, width=160).print(inspections_drawn([circle]))
     text = stream.getvalue()
     for words in ("/optitrack/pose", "lacks rotor_speed of rotors 2, 3, 4", "2.84", "weigh it"):
         assert words in text
@@ -101,7 +102,7 @@ def test_without_a_pose_topics_are_still_listed(short: Path, tmp_path: Path) -> 
     assert len(inspection.topics) == 11
     assert all(inlet.missing for inlet in inspection.inlets)
     assert inspect_one_recording(path, namespace="uav1").problem is None
-    Console(file=io.StringIO()).print(render([inspection]))
+    Console(file=io.StringIO()).print(inspections_drawn([inspection]))
 
 
 def test_one_broken_file_does_not_hide_the_others(tmp_path: Path) -> None:

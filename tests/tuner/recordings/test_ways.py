@@ -22,7 +22,7 @@ from tuner.options import Options
 from tuner.recordings.consistency import _axis_doubts
 from tuner.recordings.content import ReadOptions, read_content
 from tuner.recordings.flight import Flight, Series
-from tuner.recordings.inspector import suggested_map
+from tuner.recordings.inspection_rules import suggested_map
 from tuner.recordings.interpolation import rotate
 from tuner.recordings.loader import load_flight, read_inertial
 from tuner.recordings.matlab import MAGIC

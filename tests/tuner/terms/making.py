@@ -28,7 +28,7 @@ from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.objective.simulation import SETPOINTS, fly
 from tuner.objective.space import space_of
 from tuner.recordings.flight import InitialState
-from tuner.search.estimation import free_offsets, polished
+from tuner.search.estimation import free_parameters, polished
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 
@@ -118,6 +118,6 @@ def hovering(tilt: tuple[float, float], heading: float = 0.4) -> InitialState:
 
 
 def _fit(job: Job, fitted: Fitted) -> Fitted:
-    free = Point(np.ones(len(job.space), bool), free_offsets(job))
+    free = free_parameters(job)
     end = polished(job, fitted, free=free, title="base", on_progress=lambda _: None)
     return replace(end, outcomes=())

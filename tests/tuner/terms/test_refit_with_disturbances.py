@@ -197,7 +197,8 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     )
     predictor.without_gains = predictor
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
-    job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
+    space = SimpleNamespace(names=("inertia_xx",))
+    job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=space))
     row = SimpleNamespace(group="fuselage_drag", kept=True)
     begin = Selected(job, fitted(2.0 * COLOURED_RATIO), (cast(Any, row),))
     model_errors = ModelErrors((Law("force_z", "airspeed_across", 0.2),), None)
@@ -230,7 +231,7 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
     monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, own, **__: (there, own))
     monkeypatch.setattr(disturbances.LinearisedInnovations, "of", seen)
-    monkeypatch.setattr(disturbances, "free_offsets", lambda _: np.zeros((0, 0), bool))
+    monkeypatch.setattr(disturbances, "free_parameters", lambda *_, **__: None)
     monkeypatch.setattr(disturbances, "polished", polish)
     monkeypatch.setattr(disturbances, "alternatives_of", lambda *given: read.append(given[2:]))
     monkeypatch.setattr(

@@ -1,4 +1,4 @@
-"""Inspect a recording, whether or not it holds a flight, and suggest a topic map for it.
+"""The inspection of a recording, whether or not it holds a flight, and a topic map for it.
 
 The inlets it can be fed into and the coefficients it can show follow from rules of thumb on its
 signals and their excitation; the report of a fit has the identified ones. A suggested topic map has
