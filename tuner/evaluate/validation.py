@@ -213,15 +213,13 @@ def flights_worse(
         crashed = best[flight].crash_time
         if crashed is not None:
             if initial[flight].crash_time is None:
-                numbers = {"seconds": crashed}
-                findings.append(Finding(Code.FLIGHT_CRASHES, "warning", flight, numbers))
+                findings.append(Code.FLIGHT_CRASHES.warning(flight, seconds=crashed))
             continue
         for what, unit in UNITS.items():
             before, after = (initial[flight].rmse.norm(what), best[flight].rmse.norm(what))
             if after > (1.0 + MAX_RMSE_INCREASE) * before:
-                numbers = {"before": before, "after": after}
                 findings.append(
-                    Finding(Code.FLIGHT_WORSE, "warning", flight, numbers, (what, unit))
+                    Code.FLIGHT_WORSE.warning(flight, what, unit, before=before, after=after)
                 )
     return tuple(findings)
 
@@ -275,7 +273,7 @@ def flights_not_followed(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[
         ]
         if shares[0] > shares[1] + MIN_SHARE_AT_LIMIT:
             numbers |= {"beyond": shares[0], "beyond_recorded": shares[1]}
-        findings.append(Finding(Code.FLIGHT_NOT_FLOWN, "warning", name, numbers))
+        findings.append(Code.FLIGHT_NOT_FLOWN.warning(name, **numbers))
     return tuple(findings)
 
 
@@ -312,11 +310,14 @@ def predicted_worse_than_held(job: Job, validation: Validation) -> tuple[Finding
             next(one for one in validation.predicted[name][kind] if one.seconds == seconds)
             for kind in ("best", "holding")
         )
-        numbers = {"soonest": min(worse), "seconds": seconds}
-        for quantity in worse[seconds]:
-            numbers |= {
-                quantity: getattr(best, quantity),
-                f"{quantity}_held": getattr(held, quantity),
-            }
-        findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, worse[seconds]))
+        errors = {
+            f"{quantity}{suffix}": getattr(of, quantity)
+            for quantity in worse[seconds]
+            for suffix, of in (("", best), ("_held", held))
+        }
+        findings.append(
+            Code.HOLDING_BETTER.warning(
+                name, *worse[seconds], soonest=min(worse), seconds=seconds, **errors
+            )
+        )
     return tuple(findings)

@@ -548,6 +548,18 @@ class Code(Worded):
         "Check its geometry (levers, arms, wires), its units and its calibration.",
     )
 
+    def at(self, level: Level, subject: str, /, *names: str, **numbers: float) -> Finding:
+        """Return a finding of this code, with its names and numbers."""
+        return Finding(self, level, subject, numbers, names)
+
+    def warning(self, subject: str, /, *names: str, **numbers: float) -> Finding:
+        """Return a finding that does not stop a run."""
+        return self.at("warning", subject, *names, **numbers)
+
+    def info(self, subject: str, /, *names: str, **numbers: float) -> Finding:
+        """Return a finding that explains."""
+        return self.at("info", subject, *names, **numbers)
+
 
 @dataclass(frozen=True)
 class Finding:

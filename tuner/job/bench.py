@@ -309,12 +309,8 @@ def _weight(name: str, measurement: Measurement, combination: Combination) -> fl
 def conflicts_of(combination: Combination) -> tuple[Finding, ...]:
     """Return the experiments that the others contradict."""
     return tuple(
-        Finding(
-            Code.BENCH_CONFLICT,
-            "warning",
-            conflict.experiment,
-            {"deviation": conflict.deviation},
-            conflict.names,
+        Code.BENCH_CONFLICT.warning(
+            conflict.experiment, *conflict.names, deviation=conflict.deviation
         )
         for conflict in combination.conflicts
     )

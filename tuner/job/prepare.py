@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -126,24 +126,28 @@ def _recordings(job: Job) -> Iterator[Finding]:
     for flight in job.flights:
         for note in flight.notes:
             if note.kind == "warning":
-                numbers = {**note.numbers, "count": note.count}
-                names = (note.code.value, note.topic, *note.names)
-                yield Finding(Code.RECORDING, "warning", flight.name, numbers, names)
+                yield Code.RECORDING.warning(
+                    flight.name,
+                    note.code.value,
+                    note.topic,
+                    *note.names,
+                    **note.numbers,
+                    count=note.count,
+                )
         for damage in flight.damage:
             numbers = {
                 name: value
                 for name, value in vars(damage).items()
                 if isinstance(value, int | float)
             }
-            names = (damage.cause.value, damage.subject)
-            yield Finding(Code.SALVAGED, "warning", flight.name, numbers, names)
+            yield Code.SALVAGED.warning(flight.name, damage.cause.value, damage.subject, **numbers)
         rotors = () if flight.has("rotor_speed") else ("rotor_speed", "command")
         missing = [name for name in ("body_rate", *rotors) if not flight.has(name)]
         if missing:
-            yield Finding(Code.MISSING_SIGNALS, "warning", flight.name, names=tuple(missing))
+            yield Code.MISSING_SIGNALS.warning(flight.name, *missing)
         gap = float(np.max(np.diff(flight.series["position"].time), initial=0.0))
         if gap > MIN_POSE_GAP_S:
-            yield Finding(Code.POSE_GAP, "warning", flight.name, {"seconds": gap})
+            yield Code.POSE_GAP.warning(flight.name, seconds=gap)
 
 
 def _sparse_inputs(job: Job) -> Iterator[Finding]:
@@ -155,8 +159,9 @@ def _sparse_inputs(job: Job) -> Iterator[Finding]:
         signal, *_ = INLETS[inlet].needs
         rate = INLETS[inlet].update_rate(job.objective.schedule)
         if rate is not None and is_sparse([flight], signal, rate):
-            numbers = {"recorded": round(flight.series[signal].rate), "needed": float(rate)}
-            yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
+            yield Code.SPARSE_INPUT.warning(
+                flight.name, signal, recorded=round(flight.series[signal].rate), needed=float(rate)
+            )
 
 
 def _recorded_twice(job: Job) -> Iterator[Finding]:
@@ -165,7 +170,7 @@ def _recorded_twice(job: Job) -> Iterator[Finding]:
     for flight in job.flights:
         poses = flight.series["position"].values.tobytes()
         if (other := first.setdefault(poses, flight.name)) != flight.name:
-            yield Finding(Code.SAME_RECORDING, "warning", flight.name, names=(other,))
+            yield Code.SAME_RECORDING.warning(flight.name, other)
 
 
 def _default_mass(job: Job) -> Iterator[Finding]:
@@ -175,9 +180,9 @@ def _default_mass(job: Job) -> Iterator[Finding]:
         return
     mass = {"mass": settings.vehicle.mass}
     if _is_default(settings.origin, "vehicle"):
-        yield Finding(Code.VEHICLE_NOT_GIVEN, "warning", settings.vehicle.name, mass)
+        yield Code.VEHICLE_NOT_GIVEN.warning(settings.vehicle.name, **mass)
     else:
-        yield Finding(Code.MASS_NOT_GIVEN, "warning", settings.vehicle.name, mass)
+        yield Code.MASS_NOT_GIVEN.warning(settings.vehicle.name, **mass)
 
 
 def _wrong_vehicle(job: Job) -> Iterator[Finding]:
@@ -191,12 +196,13 @@ def _wrong_vehicle(job: Job) -> Iterator[Finding]:
     lift = float(np.median(lifts))
     numbers = {"lift": lift, "weight": weight, "mass": vehicle.mass}
     if not weight / MAX_LIFT_RATIO < lift < MAX_LIFT_RATIO * weight:
-        yield Finding(Code.WRONG_VEHICLE, "warning", vehicle.name, numbers)
+        yield Code.WRONG_VEHICLE.warning(vehicle.name, **numbers)
     elif "input_scaling" not in bypassed_by(job.inlets, job.fitted):
         idle, full = (_lift_of(np.full((1, ROTORS), u), vehicle, "command") for u in (0.0, 1.0))
         if idle > MAX_IDLE_LIFT * weight or full < weight:
-            numbers = {"idle": idle, "full": full, "weight": weight, "mass": vehicle.mass}
-            yield Finding(Code.CANNOT_HOVER, "warning", vehicle.name, numbers)
+            yield Code.CANNOT_HOVER.warning(
+                vehicle.name, idle=idle, full=full, weight=weight, mass=vehicle.mass
+            )
 
 
 def _commands_as_dshot(job: Job) -> Iterator[Finding]:
@@ -204,7 +210,7 @@ def _commands_as_dshot(job: Job) -> Iterator[Finding]:
     for flight in job.flights:
         if lifts := dshot_lift(flight, job.settings.vehicle):
             numbers = dict(zip(("pulses", "dshot"), lifts, strict=True))
-            yield Finding(Code.DSHOT_OR_PULSES, "warning", flight.name, numbers)
+            yield Code.DSHOT_OR_PULSES.warning(flight.name, **numbers)
 
 
 def _lift(flight: Flight, vehicle: VehicleFile) -> float:
@@ -242,7 +248,7 @@ def _lift_changes(job: Job) -> Iterator[Finding]:
     if split is not None:
         odd, more = split
         names = (source,) if source == "rotor_speed" else (source, "battery")
-        yield Finding(Code.LIFTS_OTHERWISE, "warning", ", ".join(odd), {"more": more}, names)
+        yield Code.LIFTS_OTHERWISE.warning(", ".join(odd), *names, more=more)
 
 
 def _split_by_lift(lifts: Mapping[str, float]) -> tuple[list[str], float] | None:
@@ -308,7 +314,7 @@ def _excitation(job: Job) -> Iterator[Finding]:
     spread = {axis: max(_spread(flight, axis) for flight in job.fitted) for axis in MIN_SPREADS}
     still = tuple(axis for axis, least in MIN_SPREADS.items() if spread[axis] < least)
     if still:
-        yield Finding(Code.STILL_AXES, "warning", "excitation", names=still)
+        yield Code.STILL_AXES.warning("excitation", *still)
     rate = max(
         (
             float(np.nanmax(np.abs(flight.signals["body_rate"][:, 2])))
@@ -319,7 +325,7 @@ def _excitation(job: Job) -> Iterator[Finding]:
     )
     turns = {"inertia_zz", "moment_constant"} & set(job.space.free)
     if rate < MIN_YAW_RATE and turns:
-        yield Finding(Code.NO_YAW, "warning", "excitation", {"rate": rate})
+        yield Code.NO_YAW.warning("excitation", rate=rate)
 
 
 def _spread(flight: Flight, axis: str) -> float:
@@ -344,30 +350,33 @@ def _unused_settings(job: Job) -> Iterator[Finding]:
         and (job_file.terms == "none" or not COEFFICIENTS[name].is_optional)
     ]
     if unused:
-        yield Finding(Code.SETTINGS_UNUSED, "warning", ", ".join(unused))
+        yield Code.SETTINGS_UNUSED.warning(", ".join(unused))
 
 
 def _bounds(job: Job) -> Iterator[Finding]:
     for parameter in job.space.parameters:
         low, high = COEFFICIENTS[parameter.name].plausible or (-np.inf, np.inf)
         if parameter.upper < low or parameter.lower > high:
-            numbers = {
-                "lower": parameter.lower,
-                "upper": parameter.upper,
-                "plausible_lower": low,
-                "plausible_upper": high,
-            }
-            yield Finding(Code.IMPLAUSIBLE_BOUNDS, "warning", parameter.name, numbers)
+            yield Code.IMPLAUSIBLE_BOUNDS.warning(
+                parameter.name,
+                lower=parameter.lower,
+                upper=parameter.upper,
+                plausible_lower=low,
+                plausible_upper=high,
+            )
 
 
 def starts_on_bounds(job: Job) -> Iterator[Finding]:
     """Yield a finding on each initial value on a bound, and a warning of one beyond it."""
     for parameter in job.space.parameters:
         if parameter.moved is not None:
-            numbers = {"bound": parameter.moved, "start": parameter.initial}
             is_on_bound = parameter.lower <= parameter.moved <= parameter.upper
-            level: Literal["info", "warning"] = "info" if is_on_bound else "warning"
-            yield Finding(Code.START_ON_BOUND, level, parameter.name, numbers)
+            yield Code.START_ON_BOUND.at(
+                "info" if is_on_bound else "warning",
+                parameter.name,
+                bound=parameter.moved,
+                start=parameter.initial,
+            )
 
 
 def information_at_start(job: Job) -> Array:
@@ -387,20 +396,20 @@ def check_information(job: Job) -> Iterator[Finding]:
     """Yield findings on the recordings' information about coefficients at the search's start."""
     at_start = information_at_start(job)
     if not np.isfinite(at_start).all():
-        yield Finding(Code.NOT_FINITE, "failure", "simulation")
+        yield Code.NOT_FINITE.at("failure", "simulation")
         return
     names = job.space.names
     dead = np.diag(at_start) * job.space.prior_sd**2 < MIN_INFORMATION_RATIO
     if dead.all():
-        yield Finding(Code.NOTHING_HAS_EFFECT, "failure", "coefficients")
+        yield Code.NOTHING_HAS_EFFECT.at("failure", "coefficients")
         return
     for index in np.flatnonzero(dead):
-        yield Finding(Code.NO_EFFECT, "warning", names[index])
+        yield Code.NO_EFFECT.warning(names[index])
     alive = np.flatnonzero(~dead)
     for direction in singular_directions(at_start[np.ix_(alive, alive)]):
         share = np.abs(direction) / np.abs(direction).max()
         members = tuple(names[alive[i]] for i in np.argsort(-share) if share[i] > MIN_COMPONENT)
-        yield Finding(Code.SINGULAR_DIRECTION, "warning", "coefficients", names=members)
+        yield Code.SINGULAR_DIRECTION.warning("coefficients", *members)
 
 
 def singular_directions(information: Array) -> list[Array]:
@@ -494,6 +503,6 @@ def _finding(regression: Estimate) -> Finding:
     numbers = {f"explained_{axis}": share for axis, share in zip("xyz", shares, strict=True)}
     numbers |= {f"gain_{axis}": regression.values.get(f"torque_gain_{axis}", 1.0) for axis in "xyz"}
     if regression.horizon is None:
-        return Finding(Code.TURNING_NOT_PREDICTED, "warning", "moments of inertia", numbers)
+        return Code.TURNING_NOT_PREDICTED.warning("moments of inertia", **numbers)
     numbers["seconds"] = regression.horizon
-    return Finding(Code.TURNING_REGRESSED, "warning", "moments of inertia", numbers)
+    return Code.TURNING_REGRESSED.warning("moments of inertia", **numbers)

@@ -54,7 +54,7 @@ def unfitted(job: Job) -> Fitted:
     findings = (
         *loop_findings(job, loop_of(best.objective), "info"),
         *(
-            Finding(Code.POORLY_MET, "warning", name, {"noise_multiple": multiple}, (channel,))
+            Code.POORLY_MET.warning(name, channel, noise_multiple=multiple)
             for name, of_channels in best.scales.items()
             for channel, multiple in [max(of_channels.items(), key=lambda item: item[1])]
             if multiple > UNMATCHED_RATIO

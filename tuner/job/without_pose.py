@@ -153,14 +153,15 @@ def _prediction_findings(
 
 
 def _prediction_finding(code: Code, flight: InertialFlight, errors: RateErrors) -> Finding:
-    numbers = {
-        "before": errors.initial,
-        "after": errors.fitted,
-        "hold": errors.hold,
-        "seconds": errors.seconds,
-    }
     level: Level = "warning" if code is Code.RATE_WORSE else "info"
-    return Finding(code, level, flight.name, numbers)
+    return code.at(
+        level,
+        flight.name,
+        before=errors.initial,
+        after=errors.fitted,
+        hold=errors.hold,
+        seconds=errors.seconds,
+    )
 
 
 def _resized(vehicle: VehicleFile, combination: Combination) -> VehicleFile:
@@ -196,16 +197,15 @@ def _open_findings(settings: Settings, names: Sequence[str]) -> tuple[Finding, .
     vehicle, scaled = settings.vehicle, tuple(name for name in OVER_MASS if name in names)
     mass = {"mass": values_of(vehicle)["mass"]}
     findings = [
-        Finding(Code.SCALES_WITH_MASS, "info", "mass", mass, scaled),
-        Finding(Code.NO_TACHOMETER, "info", "input_scaling"),
+        Code.SCALES_WITH_MASS.info("mass", *scaled, **mass),
+        Code.NO_TACHOMETER.info("input_scaling"),
     ]
     if settings.job.coefficients:
-        unused = ", ".join(settings.job.coefficients)
-        findings.append(Finding(Code.SETTINGS_UNUSED, "warning", unused))
+        findings.append(Code.SETTINGS_UNUSED.warning(", ".join(settings.job.coefficients)))
     if "moment_constant" in names:
-        findings.append(Finding(Code.YAW_OPEN, "info", "inertia_zz"))
+        findings.append(Code.YAW_OPEN.info("inertia_zz"))
     if settings.origin.get("vehicle", "").startswith("default"):
-        findings.insert(0, Finding(Code.VEHICLE_NOT_GIVEN, "warning", vehicle.name, mass))
+        findings.insert(0, Code.VEHICLE_NOT_GIVEN.warning(vehicle.name, **mass))
     elif not settings.weighed:
-        findings.insert(0, Finding(Code.MASS_NOT_GIVEN, "warning", vehicle.name, mass))
+        findings.insert(0, Code.MASS_NOT_GIVEN.warning(vehicle.name, **mass))
     return tuple(findings)

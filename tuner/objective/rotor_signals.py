@@ -300,13 +300,13 @@ def order_findings(
 ) -> tuple[Finding, ...]:
     """Return what is wrong with a flight's commands or speeds: stamps, order, or the spins."""
     if late := lateness(series, vehicle, source, span):
-        return (Finding(Code.STAMPED_LATE, "warning", name, {"seconds": late}, (source,)),)
+        return (Code.STAMPED_LATE.warning(name, source, seconds=late),)
     order = motor_order(series, vehicle, source, span)
     if order is None or order.is_right:
         return ()
     if order.fields != tuple(sorted(order.fields)):
-        return (Finding(Code.MOTOR_ORDER, "warning", name, names=order.fields),)
-    return (Finding(Code.SPINS_REVERSED, "warning", name),)
+        return (Code.MOTOR_ORDER.warning(name, *order.fields),)
+    return (Code.SPINS_REVERSED.warning(name),)
 
 
 def columns_of_rotors(vehicle: VehicleFile, notes: Sequence[Note]) -> list[int] | None:

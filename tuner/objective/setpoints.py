@@ -134,29 +134,35 @@ def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Findi
             name: round(axis.correlation, 2)
             for name, axis in zip(AXES[:2], match.axes[:2], strict=True)
         }
-        return (Finding(Code.SETPOINTS_FOREIGN, "warning", flight.name, correlations),)
+        return (Code.SETPOINTS_FOREIGN.warning(flight.name, **correlations),)
     findings, biases = list[Finding](), dict[str, float]()
     for name, axis in zip(AXES, match.axes, strict=True):
         if axis.spread < MIN_SPREAD or axis.correlation < MIN_CORRELATION:
             continue
         # the truth is between both regressions, as both sides have noise (Frisch 1934)
         if axis.gain > MAX_GAIN_RATIO or axis.gain < axis.correlation**2 / MAX_GAIN_RATIO:
-            numbers = {"gain": round(axis.gain, 2), "correlation": round(axis.correlation, 2)}
-            names = (name, _guess(axis.gain, controller))
-            findings.append(Finding(Code.SETPOINTS_SCALED, "warning", flight.name, numbers, names))
+            findings.append(
+                Code.SETPOINTS_SCALED.warning(
+                    flight.name,
+                    name,
+                    _guess(axis.gain, controller),
+                    gain=round(axis.gain, 2),
+                    correlation=round(axis.correlation, 2),
+                )
+            )
         elif abs(axis.bias) > MIN_REPORTED_BIAS:
             biases[name] = round(axis.bias, 3)
     if biases:
-        findings.append(Finding(Code.SETPOINTS_BIASED, "info", flight.name, biases))
+        findings.append(Code.SETPOINTS_BIASED.info(flight.name, **biases))
     if (
         match.delay > MIN_REPORTED_DELAY_S
         and max(axis.spread for axis in match.axes[:2]) > MIN_SPREAD
     ):
-        numbers = {"seconds": match.delay}
-        findings.append(Finding(Code.SETPOINTS_LATE, "info", flight.name, numbers))
+        findings.append(Code.SETPOINTS_LATE.info(flight.name, seconds=match.delay))
     if not match.heading_is_ours:
-        numbers = {"correlation": round(match.axes[2].correlation, 2)}
-        findings.append(Finding(Code.HEADING_FLOWN, "warning", flight.name, numbers))
+        findings.append(
+            Code.HEADING_FLOWN.warning(flight.name, correlation=round(match.axes[2].correlation, 2))
+        )
     return tuple(findings)
 
 

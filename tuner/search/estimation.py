@@ -222,14 +222,13 @@ def _doubt(job: Job, fitted: Fitted) -> Finding | None:
     """Return the finding that the end of least squares is doubtful, if it is."""
     losses = np.array([np.inf if end.loss is None else end.loss for end in fitted.outcomes])
     if len(losses) > 2 and (losses < (1.0 + SAME_MINIMUM_TOLERANCE) * losses.min()).sum() < 2:
-        return Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": len(losses)})
+        return Code.STARTS_DISAGREE.info("search", starts=len(losses))
     far_off = unmatched(fitted.scales)
     if (
         all(INLETS[inlet].closed_loop for inlet in job.inlets)
         and len(far_off) > len(job.fitted) / 2
     ):
-        numbers = {"far_off": len(far_off), "flights": len(job.fitted)}
-        return Finding(Code.FLIGHTS_FAR_OFF, "info", "search", numbers)
+        return Code.FLIGHTS_FAR_OFF.info("search", far_off=len(far_off), flights=len(job.fitted))
     return None
 
 

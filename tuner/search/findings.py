@@ -72,9 +72,9 @@ def with_end_findings(job: Job, fitted: Fitted) -> Fitted:
     findings += unmatched_findings(fitted.scales)
     offsets = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
     findings += [
-        Finding(Code.CLOCK_OFFSET, "info", flight.name, {"seconds": value}, (kind,))
+        Code.CLOCK_OFFSET.info(flight.name, kind, seconds=value)
         if kind in CLOCKS
-        else Finding(Code.GYRO_OFFSET, "info", flight.name, {"rate": value}, (kind,))
+        else Code.GYRO_OFFSET.info(flight.name, kind, rate=value)
         for flight, of_flight in zip(job.fitted, offsets.T.tolist(), strict=True)
         for kind, value in zip(OFFSETS, of_flight, strict=True)
         if value != 0.0
@@ -96,13 +96,14 @@ def unmatched_findings(scales: Scales, matched: Collection[str] = ()) -> tuple[F
     flights = {name: bad for name, bad in unmatched(scales).items() if name not in matched}
     typical = float(np.median([_size(channels) for channels in scales.values()]))
     alone = {name for name in flights if _size(scales[name]) > OUTLIER_RATIO * typical}
-    findings = [
-        Finding(Code.FLIGHT_UNMATCHED, "warning", name, flights[name]) for name in sorted(alone)
-    ]
+    findings = [Code.FLIGHT_UNMATCHED.warning(name, **flights[name]) for name in sorted(alone)]
     shared = len(set(flights) - alone)
     if shared:
-        numbers = {"unmatched": shared, "flights": len(scales), "noise_multiple": typical}
-        findings.append(Finding(Code.MODEL_UNMATCHED, "warning", "model", numbers))
+        findings.append(
+            Code.MODEL_UNMATCHED.warning(
+                "model", unmatched=shared, flights=len(scales), noise_multiple=typical
+            )
+        )
     return tuple(findings)
 
 
@@ -110,16 +111,17 @@ def loop_findings(job: Job, loop: Loop, level: Level) -> Iterator[Finding]:
     """Return the choices in which the recordings contradict the controller file."""
     controller = job.settings.controller
     if loop.saturation_feedback != float(controller.mixer.saturation_feedback):
-        numbers = {"feedback": loop.saturation_feedback}
-        yield Finding(Code.SATURATION_FEEDBACK, level, "saturation_feedback", numbers)
+        yield Code.SATURATION_FEEDBACK.at(
+            level, "saturation_feedback", feedback=loop.saturation_feedback
+        )
     if loop.sees_markers != float(controller.sensing.sees_markers):
-        yield Finding(Code.SEES_MARKERS, level, "sees_markers", {"seen": loop.sees_markers})
+        yield Code.SEES_MARKERS.at(level, "sees_markers", seen=loop.sees_markers)
 
 
 def late_input_findings(job: Job) -> tuple[Finding, ...]:
     """Return findings on fitted flights whose inputs are stamped later than their states."""
     return tuple(
-        Finding(Code.INPUT_LATE, "info", r.flight.name, {"seconds": r.input_late})
+        Code.INPUT_LATE.info(r.flight.name, seconds=r.input_late)
         for r in job.recordings
         if not r.holdout and abs(r.input_late) > MIN_REPORTED_LATENESS_S
     )
@@ -144,8 +146,7 @@ def turning_findings(job: Job, explained: Mapping[str, float]) -> tuple[Finding,
     share = float(np.median(of_fitted)) if of_fitted and turns else 1.0
     if share >= MIN_TURNING_EXPLAINED:
         return ()
-    numbers = {"explained": share}
-    return (Finding(Code.TURNING_UNEXPLAINED, "warning", "moments of inertia", numbers),)
+    return (Code.TURNING_UNEXPLAINED.warning("moments of inertia", explained=share),)
 
 
 def reference_voltage_findings(initial: VehicleFile, best: VehicleFile) -> tuple[Finding, ...]:
@@ -154,7 +155,7 @@ def reference_voltage_findings(initial: VehicleFile, best: VehicleFile) -> tuple
     if initial.battery.reference_voltage or not volts or not best.effects.get("battery_exponent"):
         return ()
     curve = "input_scaling, zero_position_armed"
-    return (Finding(Code.REFERENCE_VOLTAGE, "info", curve, {"volts": volts}),)
+    return (Code.REFERENCE_VOLTAGE.info(curve, volts=volts),)
 
 
 def _size(channels: Mapping[str, float]) -> float:

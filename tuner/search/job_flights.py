@@ -89,11 +89,9 @@ def with_logged_parameters(settings: Settings) -> tuple[Settings, tuple[Finding,
     if changes:
         named = not settings.origin.get("controller", "default").startswith("default")
         level: Literal["warning", "info"] = "warning" if named else "info"
-        findings.append(Finding(Code.LOGGED_GAINS, level, next(iter(logs)).stem, names=changes))
+        findings.append(Code.LOGGED_GAINS.at(level, next(iter(logs)).stem, *changes))
     if unlike:
-        findings.append(
-            Finding(Code.LOGS_DIFFER, "warning", "flights", names=tuple(sorted(unlike)))
-        )
+        findings.append(Code.LOGS_DIFFER.warning("flights", *sorted(unlike)))
     origin = {**settings.origin, "controller": f"{settings.origin.get('controller', '')}, the log"}
     changed = replace(settings, controller=controller, origin=origin) if changes else settings
     return changed, tuple(findings)
@@ -174,15 +172,21 @@ def _fitted_manoeuvres(flights: Sequence[Flight]) -> tuple[list[Flight], list[Fi
     for path in dict.fromkeys(f.path for f in flights if f.name not in chosen):
         of_path = [flight for flight in flights if flight.path == path]
         fitted = [str(n) for n, flight in enumerate(of_path, 1) if flight.name in chosen]
-        numbers = {"fitted": float(len(fitted)), "flights": float(len(of_path))}
-        names = (of_path[0].name, *fitted)
-        findings.append(Finding(Code.MANOEUVRES_CHOSEN, "info", of_path[0].name, numbers, names))
+        findings.append(
+            Code.MANOEUVRES_CHOSEN.info(
+                of_path[0].name,
+                of_path[0].name,
+                *fitted,
+                fitted=float(len(fitted)),
+                flights=float(len(of_path)),
+            )
+        )
     return [flight for flight in flights if flight.name in chosen], findings
 
 
 def left_out_finding(name: str, error: RecordingError) -> Finding:
     """Return the finding that a flight is left out, and why."""
-    return Finding(Code.LEFT_OUT, "warning", name, names=(error.what, error.remedy))
+    return Code.LEFT_OUT.warning(name, error.what, error.remedy)
 
 
 def with_known(
@@ -251,7 +255,7 @@ def _with_fitted_inlet(
         require_windows(flight, window_seconds(["attitude"], job.search.window), ("attitude",))
     except RecordingError:
         return recording
-    finding = Finding(Code.ATTITUDE_FOLLOWED, "info", flight.name, names=(recording.inlet,))
+    finding = Code.ATTITUDE_FOLLOWED.info(flight.name, recording.inlet)
     return replace(recording, inlet="attitude", finding=finding)
 
 
@@ -380,7 +384,7 @@ def choose_inlet(
         if any(note.code is NoteCode.PX4_REFERENCE for note in flight.notes):
             with suppress(RecordingError):
                 below, _ = choose_inlet(_without_reference(flight), "auto", vehicle, controller)
-                return below, Finding(Code.PX4_LOOPS, "info", flight.name, names=(below,))
+                return below, Code.PX4_LOOPS.info(flight.name, below)
         match = match_setpoints(flight, controller)
         if match is not None and not match.is_ours:
             (finding,) = setpoint_findings(flight, controller)
@@ -423,7 +427,7 @@ def _finding(
     order = motor_order(flight.series, vehicle, doubt.source, span)
     why = () if order is None or order.is_right else ("order",)
     level: Level = "warning" if inlet == "attitude" else "info"
-    return Finding(Code.INLET_CHOSEN, level, flight.name, numbers, (inlet, doubt.source, *why))
+    return Code.INLET_CHOSEN.at(level, flight.name, inlet, doubt.source, *why, **numbers)
 
 
 def inlet_for(flight: Flight, requested: str) -> InletName:

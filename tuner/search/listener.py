@@ -179,6 +179,6 @@ class Reporter:
             raise
         except Exception as error:
             logging.getLogger(__name__).error("%s failed", name, exc_info=error)
-            names = (type(error).__name__, " ".join(str(error).split())[:200])
-            self.add([Finding(Code.PART_FAILED, "warning", name, names=names)])
+            text = " ".join(str(error).split())[:200]
+            self.add([Code.PART_FAILED.warning(name, type(error).__name__, text)])
             return fallback

@@ -309,8 +309,15 @@ def cut_at_rotor_changes(
         else:
             x, y, _ = vehicle.rotors[change.rotor].position
             place = f"{'front' if x > 0.0 else 'rear'} {'left' if y > 0.0 else 'right'}"
-            numbers = {"seconds": change.seconds, "rotor": change.rotor + 1, "loss": change.loss}
-            findings.append(Finding(Code.ROTOR_CHANGED, "warning", flight.name, numbers, (place,)))
+            findings.append(
+                Code.ROTOR_CHANGED.warning(
+                    flight.name,
+                    place,
+                    seconds=change.seconds,
+                    rotor=change.rotor + 1,
+                    loss=change.loss,
+                )
+            )
             kept.append(replace(recording, flight=flight.until(change.seconds - WINDOW_S)))
     return tuple(kept), tuple(findings)
 

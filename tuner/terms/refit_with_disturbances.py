@@ -315,14 +315,14 @@ def _findings_with_disturbances(
     matched = [flight.name for flight, one in flights if one]
     others = [finding for finding in fitted.findings if finding.code not in UNMATCHED_CODES]
     gust, _, _, thrust, gust_seconds, thrust_seconds, _, wind = np.exp(predictor.strengths).tolist()
-    numbers = {
-        "wind": wind,
-        "gust": gust,
-        "gust_seconds": gust_seconds,
-        "thrust": thrust,
-        "thrust_seconds": thrust_seconds,
-    }
-    followed = Finding(Code.DISTURBANCES_FOLLOWED, "info", "flights", numbers)
+    followed = Code.DISTURBANCES_FOLLOWED.info(
+        "flights",
+        wind=wind,
+        gust=gust,
+        gust_seconds=gust_seconds,
+        thrust=thrust,
+        thrust_seconds=thrust_seconds,
+    )
     return (*others, *unmatched_findings(fitted.scales, matched), followed)
 
 

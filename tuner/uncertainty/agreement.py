@@ -81,9 +81,15 @@ def flights_disagree(fitted: Fitted, examination: Examination) -> tuple[Finding,
     reference = float(uncertainty.reference[split.number])
     if not sure or abs(split.difference) < MIN_DIFFERENCE * reference:
         return ()
-    numbers = {"difference": split.difference / reference, "error": error / reference}
     flights = ", ".join(uncertainty.flights[flight] for flight in split.flights)
-    return (Finding(Code.FLIGHTS_DISAGREE, "warning", flights, numbers, (names[split.number],)),)
+    return (
+        Code.FLIGHTS_DISAGREE.warning(
+            flights,
+            names[split.number],
+            difference=split.difference / reference,
+            error=error / reference,
+        ),
+    )
 
 
 def _splits(information: FisherInformation, searched: Sequence[int], flights: int) -> list[Split]:
@@ -203,5 +209,5 @@ def ground_conflicts(sources: Mapping[str, Sources], mass: float | None) -> tupl
         numbers = {"deviation": source.deviation, "ground": ground, "flights": flights}
         if mass is not None and row.mass_exponent == 1:
             numbers["mass"] = mass * ground / flights
-        findings.append(Finding(Code.GROUND_CONFLICT, "warning", name, numbers, (row.unit,)))
+        findings.append(Code.GROUND_CONFLICT.warning(name, row.unit, **numbers))
     return tuple(findings)

@@ -307,11 +307,10 @@ def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
     ]
     if not names:
         return ()
-    numbers = {"seconds": STEP_LAG_S}
-    return (Finding(Code.FINER_THAN_STEPS, "warning", ", ".join(names), numbers),)
+    return (Code.FINER_THAN_STEPS.warning(", ".join(names), seconds=STEP_LAG_S),)
 
 
-FLIGHTS_REFUTE = Finding(Code.FLIGHTS_REFUTE, "failure", "the fitted vehicle")
+FLIGHTS_REFUTE = Code.FLIGHTS_REFUTE.at("failure", "the fitted vehicle")
 
 
 def flights_refute(uncertainty: Uncertainty) -> tuple[Finding, ...]:
@@ -366,7 +365,7 @@ def term_findings(
             numbers |= {
                 f"{name}_error": estimate.std_error for name, estimate in identified.items()
             }
-            findings.append(Finding(Code.TERM_SHOWS, "warning", group, numbers, tuple(identified)))
+            findings.append(Code.TERM_SHOWS.warning(group, *identified, **numbers))
     return tuple(findings)
 
 

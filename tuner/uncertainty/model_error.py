@@ -348,13 +348,7 @@ def model_error_findings(
         and move**2 > MIN_REPORTED_SHIFT**2 * (estimate.std_error**2 - move**2)
     ]
     laws = [
-        Finding(
-            Code.LAW_LACKING,
-            "warning",
-            "model",
-            {"share": law.share},
-            (law.axis, law.feature, *moved),
-        )
+        Code.LAW_LACKING.warning("model", law.axis, law.feature, *moved, share=law.share)
         for law in model_errors.laws
         if moved and abs(law.share) > MIN_REPORTED_LAW_SHARE
     ]
@@ -364,8 +358,9 @@ def model_error_findings(
         if one.part != "late" or abs(one.value) > MIN_REPORTED_LATENCY_S
     ]
     if abs(model_errors.speed_lag) > MIN_REPORTED_SPEED_LAG_S:
-        numbers = {"seconds": model_errors.speed_lag}
-        laws.insert(0, Finding(Code.ROTOR_SPEEDS_LATE, "warning", "rotor speeds", numbers))
+        laws.insert(
+            0, Code.ROTOR_SPEEDS_LATE.warning("rotor speeds", seconds=model_errors.speed_lag)
+        )
     return (*_controller_findings(differing), *laws)
 
 
@@ -386,16 +381,15 @@ def _controller_findings(controller: Sequence[ControllerEstimate]) -> tuple[Find
     kinds = dict.fromkeys((one.flight, part) for part in PARTS for one in controller)
     alike = {kind: [one for one in controller if (one.flight, one.part) == kind] for kind in kinds}
     return tuple(
-        Finding(
-            Code.CONTROLLER_ANSWERS,
-            "warning",
+        Code.CONTROLLER_ANSWERS.warning(
             flight or CONTROLLER_FILE,
-            {
+            part,
+            *(one.axis for one in those),
+            **{
                 name: number
                 for one in those
                 for name, number in ((one.axis, one.value), (f"{one.axis}_error", one.sd))
             },
-            (part, *(one.axis for one in those)),
         )
         for (flight, part), those in alike.items()
         if those
