@@ -6,7 +6,7 @@ fitted starts and trims of windows have a name of their own.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -200,7 +200,7 @@ UNITS: Mapping[Pose, str] = {"position": "m", "attitude": "degrees"}
 
 def flights_worse(
     initial: Mapping[str, FlightErrors], best: Mapping[str, FlightErrors]
-) -> tuple[Finding, ...]:
+) -> Iterator[Finding]:
     """Return findings on flights with larger RMSE after the fit, or that crash.
 
     Parameters
@@ -208,20 +208,16 @@ def flights_worse(
     initial, best
         Flight -> errors of a simulation with the initial, and with the fitted coefficients.
     """
-    findings = []
     for flight in best:
         crashed = best[flight].crash_time
         if crashed is not None:
             if initial[flight].crash_time is None:
-                findings.append(Code.FLIGHT_CRASHES.warning(flight, seconds=crashed))
+                yield Code.FLIGHT_CRASHES.warning(flight, seconds=crashed)
             continue
         for what, unit in UNITS.items():
             before, after = (initial[flight].rmse.norm(what), best[flight].rmse.norm(what))
             if after > (1.0 + MAX_RMSE_INCREASE) * before:
-                findings.append(
-                    Code.FLIGHT_WORSE.warning(flight, what, unit, before=before, after=after)
-                )
-    return tuple(findings)
+                yield Code.FLIGHT_WORSE.warning(flight, what, unit, before=before, after=after)
 
 
 ODD_RATIO, ODD_RMSE_M = 5.0, 0.05
@@ -230,7 +226,7 @@ MIN_SHARE_AT_LIMIT = 0.05
 """The simulation must be at the limit of position control for so much longer, as a share."""
 
 
-def flights_not_followed(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[Finding, ...]:
+def flights_not_followed(job: Job, errors: Mapping[str, FlightErrors]) -> Iterator[Finding]:
     """Return findings on flights that the closed loop does not follow although it follows others.
 
     They have the time of departure, and the shares of time with position feedback above its limit,
@@ -252,7 +248,6 @@ def flights_not_followed(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[
         and errors[r.flight.name].crash_time is None
     }
     lengths = {name: errors[name].rmse.norm("position") for name in flown}
-    findings = []
     for name, flight in flown.items():
         others = [length for other, length in lengths.items() if other != name]
         typical = float(np.median(others)) if len(others) > 1 else np.inf
@@ -273,8 +268,7 @@ def flights_not_followed(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[
         ]
         if shares[0] > shares[1] + MIN_SHARE_AT_LIMIT:
             numbers |= {"beyond": shares[0], "beyond_recorded": shares[1]}
-        findings.append(Code.FLIGHT_NOT_FLOWN.warning(name, **numbers))
-    return tuple(findings)
+        yield Code.FLIGHT_NOT_FLOWN.warning(name, **numbers)
 
 
 def _beyond_limit(flight: Flight, control: PositionControl, time: Array, position: Array) -> float:
@@ -293,12 +287,11 @@ def _beyond_limit(flight: Flight, control: PositionControl, time: Array, positio
     return float(np.mean(np.linalg.norm(feedback, axis=1) > limit))
 
 
-def predicted_worse_than_held(job: Job, validation: Validation) -> tuple[Finding, ...]:
+def predicted_worse_than_held(job: Job, validation: Validation) -> Iterator[Finding]:
     """Return findings on flights that are predicted significantly worse than by a constant state.
 
     They are for the longest such time ahead.
     """
-    findings = []
     for recording in job.recordings:
         name = recording.flight.name
         ahead = validation.worse_than_holding.get(name, {})
@@ -315,9 +308,6 @@ def predicted_worse_than_held(job: Job, validation: Validation) -> tuple[Finding
             for quantity in worse[seconds]
             for suffix, of in (("", best), ("_held", held))
         }
-        findings.append(
-            Code.HOLDING_BETTER.warning(
-                name, *worse[seconds], soonest=min(worse), seconds=seconds, **errors
-            )
+        yield Code.HOLDING_BETTER.warning(
+            name, *worse[seconds], soonest=min(worse), seconds=seconds, **errors
         )
-    return tuple(findings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,7 +99,7 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
         vehicle.replace(name=f"{start.name}_bench"),
         measurements,
         combination,
-        findings=conflicts_of(combination),
+        findings=tuple(conflicts_of(combination)),
         settings={"command": command, "bench": plan.model_dump(mode="json")},
         source={"bench": path.name},
         header=f"From the ground measurements of {path.name}; the rest as in {start.name}.",
@@ -306,11 +306,7 @@ def _weight(name: str, measurement: Measurement, combination: Combination) -> fl
     return total
 
 
-def conflicts_of(combination: Combination) -> tuple[Finding, ...]:
+def conflicts_of(combination: Combination) -> Iterator[Finding]:
     """Return the experiments that the others contradict."""
-    return tuple(
-        Code.BENCH_CONFLICT.warning(
-            conflict.experiment, *conflict.names, deviation=conflict.deviation
-        )
-        for conflict in combination.conflicts
-    )
+    for one in combination.conflicts:
+        yield Code.BENCH_CONFLICT.warning(one.experiment, *one.names, deviation=one.deviation)

@@ -178,11 +178,9 @@ def _default_mass(job: Job) -> Iterator[Finding]:
     settings = job.settings
     if settings.weighed or "mass" in job.space.free:
         return
-    mass = {"mass": settings.vehicle.mass}
-    if _is_default(settings.origin, "vehicle"):
-        yield Code.VEHICLE_NOT_GIVEN.warning(settings.vehicle.name, **mass)
-    else:
-        yield Code.MASS_NOT_GIVEN.warning(settings.vehicle.name, **mass)
+    default = _is_default(settings.origin, "vehicle")
+    code = Code.VEHICLE_NOT_GIVEN if default else Code.MASS_NOT_GIVEN
+    yield code.warning(settings.vehicle.name, mass=settings.vehicle.mass)
 
 
 def _wrong_vehicle(job: Job) -> Iterator[Finding]:

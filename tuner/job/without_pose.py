@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,24 +132,22 @@ def _prediction_findings(
     vehicle: VehicleFile,
     *,
     held_out: bool = False,
-) -> tuple[Finding, ...]:
+) -> Iterator[Finding]:
     """Return findings on predictions of the body rate that are worse than holding, or than before.
 
     Of held-out flights the last prediction better than holding is reported in any case.
     """
-    findings = []
     for flight in flights:
         last: RateErrors | None = None
         for errors in rate_errors(stretches_of(flight.series, flight.flying), start, vehicle):
             if min(errors.fitted, errors.initial) > errors.hold:
-                findings.append(_prediction_finding(Code.RATE_NOT_PREDICTED, flight, errors))
+                yield _prediction_finding(Code.RATE_NOT_PREDICTED, flight, errors)
                 break
             last = errors
         if last is not None and last.fitted > (1.0 + MAX_RMSE_INCREASE) * last.initial:
-            findings.append(_prediction_finding(Code.RATE_WORSE, flight, last))
+            yield _prediction_finding(Code.RATE_WORSE, flight, last)
         elif last is not None and held_out:
-            findings.append(_prediction_finding(Code.RATE_PREDICTED, flight, last))
-    return tuple(findings)
+            yield _prediction_finding(Code.RATE_PREDICTED, flight, last)
 
 
 def _prediction_finding(code: Code, flight: InertialFlight, errors: RateErrors) -> Finding:
@@ -192,20 +190,17 @@ def _without_yaw(measurement: Measurement) -> Measurement:
     )
 
 
-def _open_findings(settings: Settings, names: Sequence[str]) -> tuple[Finding, ...]:
+def _open_findings(settings: Settings, names: Sequence[str]) -> Iterator[Finding]:
     """Return findings on coefficients that such flights do not determine."""
     vehicle, scaled = settings.vehicle, tuple(name for name in OVER_MASS if name in names)
     mass = {"mass": values_of(vehicle)["mass"]}
-    findings = [
-        Code.SCALES_WITH_MASS.info("mass", *scaled, **mass),
-        Code.NO_TACHOMETER.info("input_scaling"),
-    ]
-    if settings.job.coefficients:
-        findings.append(Code.SETTINGS_UNUSED.warning(", ".join(settings.job.coefficients)))
-    if "moment_constant" in names:
-        findings.append(Code.YAW_OPEN.info("inertia_zz"))
     if settings.origin.get("vehicle", "").startswith("default"):
-        findings.insert(0, Code.VEHICLE_NOT_GIVEN.warning(vehicle.name, **mass))
+        yield Code.VEHICLE_NOT_GIVEN.warning(vehicle.name, **mass)
     elif not settings.weighed:
-        findings.insert(0, Code.MASS_NOT_GIVEN.warning(vehicle.name, **mass))
-    return tuple(findings)
+        yield Code.MASS_NOT_GIVEN.warning(vehicle.name, **mass)
+    yield Code.SCALES_WITH_MASS.info("mass", *scaled, **mass)
+    yield Code.NO_TACHOMETER.info("input_scaling")
+    if settings.job.coefficients:
+        yield Code.SETTINGS_UNUSED.warning(", ".join(settings.job.coefficients))
+    if "moment_constant" in names:
+        yield Code.YAW_OPEN.info("inertia_zz")

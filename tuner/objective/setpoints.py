@@ -8,7 +8,7 @@ no correlation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -124,46 +124,43 @@ def match_setpoints(flight: Flight, controller: ControllerFile) -> SetpointMatch
     return max(matches, key=lambda match: match.axes[0].correlation + match.axes[1].correlation)
 
 
-def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Finding, ...]:
+def setpoint_findings(flight: Flight, controller: ControllerFile) -> Iterator[Finding]:
     """Return findings on another gain, delay, bias or heading of a flight's set-points."""
     match = match_setpoints(flight, controller)
     if match is None:
-        return ()
+        return
     if not match.is_ours:
         correlations = {
             name: round(axis.correlation, 2)
             for name, axis in zip(AXES[:2], match.axes[:2], strict=True)
         }
-        return (Code.SETPOINTS_FOREIGN.warning(flight.name, **correlations),)
-    findings, biases = list[Finding](), dict[str, float]()
+        yield Code.SETPOINTS_FOREIGN.warning(flight.name, **correlations)
+        return
+    biases: dict[str, float] = {}
     for name, axis in zip(AXES, match.axes, strict=True):
         if axis.spread < MIN_SPREAD or axis.correlation < MIN_CORRELATION:
             continue
         # the truth is between both regressions, as both sides have noise (Frisch 1934)
         if axis.gain > MAX_GAIN_RATIO or axis.gain < axis.correlation**2 / MAX_GAIN_RATIO:
-            findings.append(
-                Code.SETPOINTS_SCALED.warning(
-                    flight.name,
-                    name,
-                    _guess(axis.gain, controller),
-                    gain=round(axis.gain, 2),
-                    correlation=round(axis.correlation, 2),
-                )
+            yield Code.SETPOINTS_SCALED.warning(
+                flight.name,
+                name,
+                _guess(axis.gain, controller),
+                gain=round(axis.gain, 2),
+                correlation=round(axis.correlation, 2),
             )
         elif abs(axis.bias) > MIN_REPORTED_BIAS:
             biases[name] = round(axis.bias, 3)
     if biases:
-        findings.append(Code.SETPOINTS_BIASED.info(flight.name, **biases))
+        yield Code.SETPOINTS_BIASED.info(flight.name, **biases)
     if (
         match.delay > MIN_REPORTED_DELAY_S
         and max(axis.spread for axis in match.axes[:2]) > MIN_SPREAD
     ):
-        findings.append(Code.SETPOINTS_LATE.info(flight.name, seconds=match.delay))
+        yield Code.SETPOINTS_LATE.info(flight.name, seconds=match.delay)
     if not match.heading_is_ours:
-        findings.append(
-            Code.HEADING_FLOWN.warning(flight.name, correlation=round(match.axes[2].correlation, 2))
-        )
-    return tuple(findings)
+        heading = round(match.axes[2].correlation, 2)
+        yield Code.HEADING_FLOWN.warning(flight.name, correlation=heading)
 
 
 def _guess(gain: float, controller: ControllerFile) -> str:

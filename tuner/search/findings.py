@@ -82,7 +82,7 @@ def with_end_findings(job: Job, fitted: Fitted) -> Fitted:
     return replace(fitted, findings=tuple(findings))
 
 
-def unmatched_findings(scales: Scales, matched: Collection[str] = ()) -> tuple[Finding, ...]:
+def unmatched_findings(scales: Scales, matched: Collection[str] = ()) -> Iterator[Finding]:
     """Return the warnings of flights that are not matched, and of a model that misses several.
 
     Parameters
@@ -96,15 +96,13 @@ def unmatched_findings(scales: Scales, matched: Collection[str] = ()) -> tuple[F
     flights = {name: bad for name, bad in unmatched(scales).items() if name not in matched}
     typical = float(np.median([_size(channels) for channels in scales.values()]))
     alone = {name for name in flights if _size(scales[name]) > OUTLIER_RATIO * typical}
-    findings = [Code.FLIGHT_UNMATCHED.warning(name, **flights[name]) for name in sorted(alone)]
+    for name in sorted(alone):
+        yield Code.FLIGHT_UNMATCHED.warning(name, **flights[name])
     shared = len(set(flights) - alone)
     if shared:
-        findings.append(
-            Code.MODEL_UNMATCHED.warning(
-                "model", unmatched=shared, flights=len(scales), noise_multiple=typical
-            )
+        yield Code.MODEL_UNMATCHED.warning(
+            "model", unmatched=shared, flights=len(scales), noise_multiple=typical
         )
-    return tuple(findings)
 
 
 def loop_findings(job: Job, loop: Loop, level: Level) -> Iterator[Finding]:
@@ -118,16 +116,14 @@ def loop_findings(job: Job, loop: Loop, level: Level) -> Iterator[Finding]:
         yield Code.SEES_MARKERS.at(level, "sees_markers", seen=loop.sees_markers)
 
 
-def late_input_findings(job: Job) -> tuple[Finding, ...]:
+def late_input_findings(job: Job) -> Iterator[Finding]:
     """Return findings on fitted flights whose inputs are stamped later than their states."""
-    return tuple(
-        Code.INPUT_LATE.info(r.flight.name, seconds=r.input_late)
-        for r in job.recordings
-        if not r.holdout and abs(r.input_late) > MIN_REPORTED_LATENESS_S
-    )
+    for recording in job.recordings:
+        if not recording.holdout and abs(recording.input_late) > MIN_REPORTED_LATENESS_S:
+            yield Code.INPUT_LATE.info(recording.flight.name, seconds=recording.input_late)
 
 
-def turning_findings(job: Job, explained: Mapping[str, float]) -> tuple[Finding, ...]:
+def turning_findings(job: Job, explained: Mapping[str, float]) -> Iterator[Finding]:
     """Warn where recorded inputs explain too little of how fitted flights turn.
 
     Noise of the inputs, and the loop's response to disturbances, shrink the torque that a fit finds
@@ -143,19 +139,15 @@ def turning_findings(job: Job, explained: Mapping[str, float]) -> tuple[Finding,
     """
     of_fitted = [explained[flight.name] for flight in job.fitted if flight.name in explained]
     turns = any(name.startswith("inertia_") for name in job.space.names)
-    share = float(np.median(of_fitted)) if of_fitted and turns else 1.0
-    if share >= MIN_TURNING_EXPLAINED:
-        return ()
-    return (Code.TURNING_UNEXPLAINED.warning("moments of inertia", explained=share),)
+    if of_fitted and turns and (share := float(np.median(of_fitted))) < MIN_TURNING_EXPLAINED:
+        yield Code.TURNING_UNEXPLAINED.warning("moments of inertia", explained=share)
 
 
-def reference_voltage_findings(initial: VehicleFile, best: VehicleFile) -> tuple[Finding, ...]:
+def reference_voltage_findings(initial: VehicleFile, best: VehicleFile) -> Iterator[Finding]:
     """Return the finding on the reference voltage, where the vehicle file has none."""
     volts = best.battery.reference_voltage
-    if initial.battery.reference_voltage or not volts or not best.effects.get("battery_exponent"):
-        return ()
-    curve = "input_scaling, zero_position_armed"
-    return (Code.REFERENCE_VOLTAGE.info(curve, volts=volts),)
+    if volts and best.effects.get("battery_exponent") and not initial.battery.reference_voltage:
+        yield Code.REFERENCE_VOLTAGE.info("input_scaling, zero_position_armed", volts=volts)
 
 
 def _size(channels: Mapping[str, float]) -> float:

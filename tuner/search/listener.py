@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -150,10 +150,11 @@ class Reporter:
                 self._reported.append(finding)
                 self.on_message(one_line(finding))
 
-    def add(self, findings: Sequence[Finding]) -> None:
+    def add(self, findings: Iterable[Finding]) -> None:
         """Keep findings, and report them."""
-        self.report(findings)
-        self.findings = (*self.findings, *findings)
+        added = tuple(findings)
+        self.report(added)
+        self.findings += added
 
     def attempt(self, name: str, compute: Callable[[], T], fallback: T) -> T:
         """Return the result of a part, or a fallback and a finding where it fails.

@@ -8,7 +8,7 @@ gains show.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -191,13 +191,12 @@ def _error(space: Space, index: int, scaled: float, error: float) -> float:
     return float(error * value) if space.is_log[index] else float(error)
 
 
-def ground_conflicts(sources: Mapping[str, Sources], mass: float | None) -> tuple[Finding, ...]:
+def ground_conflicts(sources: Mapping[str, Sources], mass: float | None) -> Iterator[Finding]:
     """Return findings on coefficients where ground measurements and flights contradict each other.
 
     Where flights determine only a coefficient over the mass, with the mass at which they agree.
     ``mass`` is that of the fit in kg, None if it was fitted.
     """
-    findings = []
     for name, source in sources.items():
         if (
             source.flights is None
@@ -209,5 +208,4 @@ def ground_conflicts(sources: Mapping[str, Sources], mass: float | None) -> tupl
         numbers = {"deviation": source.deviation, "ground": ground, "flights": flights}
         if mass is not None and row.mass_exponent == 1:
             numbers["mass"] = mass * ground / flights
-        findings.append(Code.GROUND_CONFLICT.warning(name, row.unit, **numbers))
-    return tuple(findings)
+        yield Code.GROUND_CONFLICT.warning(name, row.unit, **numbers)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
@@ -298,25 +298,24 @@ STEP_LAG_S = 1e-4
 4 kHz, finds a lag 0.14 ms too short."""
 
 
-def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
+def finer_than_steps(uncertainty: Uncertainty) -> Iterator[Finding]:
     """Warn of lags with standard errors below the differences between physics steps."""
     names = [
         name
         for name, estimate in uncertainty.estimates.items()
         if COEFFICIENTS[name].unit == "s" and 0.0 < estimate.std_error < STEP_LAG_S
     ]
-    if not names:
-        return ()
-    return (Code.FINER_THAN_STEPS.warning(", ".join(names), seconds=STEP_LAG_S),)
+    if names:
+        yield Code.FINER_THAN_STEPS.warning(", ".join(names), seconds=STEP_LAG_S)
 
 
 FLIGHTS_REFUTE = Code.FLIGHTS_REFUTE.at("failure", "the fitted vehicle")
 
 
-def flights_refute(uncertainty: Uncertainty) -> tuple[Finding, ...]:
+def flights_refute(uncertainty: Uncertainty) -> Iterator[Finding]:
     """Return the finding that the flights refute the fitted vehicle, if they do."""
-    reasons = (estimate.reason.code for estimate in uncertainty.estimates.values())
-    return (FLIGHTS_REFUTE,) if ReasonCode.REFUTED in reasons else ()
+    if any(one.reason.code is ReasonCode.REFUTED for one in uncertainty.estimates.values()):
+        yield FLIGHTS_REFUTE
 
 
 REPORTED_TERMS = (
@@ -340,13 +339,12 @@ def term_findings(
     fitted: Fitted,
     uncertainty: Uncertainty,
     substitutes: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
-) -> tuple[Finding, ...]:
+) -> Iterator[Finding]:
     """Return the findings on reported terms that differ significantly from neutral.
 
     Each names those coefficients of its group that the flights identify. Where flights do not
     exclude others in its place (``substitutes``), their values are among its numbers.
     """
-    findings = []
     for group in REPORTED_TERMS:
         identified = {
             name: estimate
@@ -365,8 +363,7 @@ def term_findings(
             numbers |= {
                 f"{name}_error": estimate.std_error for name, estimate in identified.items()
             }
-            findings.append(Code.TERM_SHOWS.warning(group, *identified, **numbers))
-    return tuple(findings)
+            yield Code.TERM_SHOWS.warning(group, *identified, **numbers)
 
 
 SIMULATOR_STEP_S = 1.0 / 4000.0

@@ -8,7 +8,7 @@ flights, and the rate controller has the gains that recorded commands show
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -337,63 +337,50 @@ def with_other_readings(
 
 def model_error_findings(
     model_errors: ModelErrors | None, uncertainty: Uncertainty
-) -> tuple[Finding, ...]:
+) -> Iterator[Finding]:
     """Return the findings on model errors; on omitted laws only if these may move coefficients."""
     if model_errors is None:
-        return ()
+        return
+    yield from _controller_findings(
+        one
+        for one in model_errors.controller
+        if one.part != "late" or abs(one.value) > MIN_REPORTED_LATENCY_S
+    )
+    if abs(model_errors.speed_lag) > MIN_REPORTED_SPEED_LAG_S:
+        yield Code.ROTOR_SPEEDS_LATE.warning("rotor speeds", seconds=model_errors.speed_lag)
     moved = [
         name
         for name, estimate in uncertainty.estimates.items()
         if (move := estimate.parts.lack)
         and move**2 > MIN_REPORTED_SHIFT**2 * (estimate.std_error**2 - move**2)
     ]
-    laws = [
-        Code.LAW_LACKING.warning("model", law.axis, law.feature, *moved, share=law.share)
-        for law in model_errors.laws
-        if moved and abs(law.share) > MIN_REPORTED_LAW_SHARE
-    ]
-    differing = [
-        one
-        for one in model_errors.controller
-        if one.part != "late" or abs(one.value) > MIN_REPORTED_LATENCY_S
-    ]
-    if abs(model_errors.speed_lag) > MIN_REPORTED_SPEED_LAG_S:
-        laws.insert(
-            0, Code.ROTOR_SPEEDS_LATE.warning("rotor speeds", seconds=model_errors.speed_lag)
-        )
-    return (*_controller_findings(differing), *laws)
+    for law in model_errors.laws:
+        if moved and abs(law.share) > MIN_REPORTED_LAW_SHARE:
+            yield Code.LAW_LACKING.warning("model", law.axis, law.feature, *moved, share=law.share)
 
 
-def gains_far_off(fitted: Fitted, flights: Sequence[Flight]) -> tuple[Finding, ...]:
+def gains_far_off(fitted: Fitted, flights: Sequence[Flight]) -> Iterator[Finding]:
     """Return findings on gains far from the file's; arguments are those of `model_errors_of`."""
     model_errors = model_errors_of(fitted, flights)
     controller = () if model_errors is None else model_errors.controller
     return _controller_findings(
-        [
-            one
-            for one in controller
-            if one.part != "late" and not 1.0 / FAR_OFF_GAIN < one.value < FAR_OFF_GAIN
-        ]
+        one
+        for one in controller
+        if one.part != "late" and not 1.0 / FAR_OFF_GAIN < one.value < FAR_OFF_GAIN
     )
 
 
-def _controller_findings(controller: Sequence[ControllerEstimate]) -> tuple[Finding, ...]:
-    kinds = dict.fromkeys((one.flight, part) for part in PARTS for one in controller)
-    alike = {kind: [one for one in controller if (one.flight, one.part) == kind] for kind in kinds}
-    return tuple(
-        Code.CONTROLLER_ANSWERS.warning(
-            flight or CONTROLLER_FILE,
-            part,
-            *(one.axis for one in those),
-            **{
-                name: number
-                for one in those
-                for name, number in ((one.axis, one.value), (f"{one.axis}_error", one.sd))
-            },
+def _controller_findings(controller: Iterable[ControllerEstimate]) -> Iterator[Finding]:
+    alike: dict[tuple[str, str], list[ControllerEstimate]] = {}
+    for one in sorted(controller, key=lambda one: PARTS.index(one.part)):
+        alike.setdefault((one.flight, one.part), []).append(one)
+    for (flight, part), those in alike.items():
+        numbers: dict[str, float] = {}
+        for one in those:
+            numbers |= {one.axis: one.value, f"{one.axis}_error": one.sd}
+        yield Code.CONTROLLER_ANSWERS.warning(
+            flight or CONTROLLER_FILE, part, *(one.axis for one in those), **numbers
         )
-        for (flight, part), those in alike.items()
-        if those
-    )
 
 
 def _with_gain(gains: RateGains, estimate: ControllerEstimate) -> RateGains:

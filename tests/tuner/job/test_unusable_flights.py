@@ -176,7 +176,7 @@ def test_a_flight_that_a_fit_left_worse_is_named():
     (worse,) = flights_worse(before, after)
     assert (worse.code, worse.subject, worse.names[0]) == (Code.FLIGHT_WORSE, "f", "attitude")
     assert worse.numbers == {"before": pytest.approx(29.0), "after": pytest.approx(40.0)}
-    assert flights_worse(after, after) == ()
+    assert not list(flights_worse(after, after))
     crashed = {"f": errors([[0.1, 0, 0]] * 9, [[0, 0, 0]] * 9, crash_time=1.0)}
     (crash,) = flights_worse(before, crashed)
     assert (crash.code, crash.subject, crash.numbers) == (
@@ -184,7 +184,7 @@ def test_a_flight_that_a_fit_left_worse_is_named():
         "f",
         {"seconds": 1.0},
     )
-    assert flights_worse(crashed, crashed) == ()
+    assert not list(flights_worse(crashed, crashed))
 
 
 def test_what_no_loop_takes_out_is_free_where_inputs_are_fed_in(updated):
@@ -209,6 +209,6 @@ def test_inputs_that_hardly_explain_how_a_flight_turns_are_named():
     shares = {"a": 0.4, "b": 0.5, "c": 0.99, "held out": 0.1}
     (weak,) = turning_findings(turning, shares)
     assert (weak.code, weak.numbers["explained"]) == (Code.TURNING_UNEXPLAINED, 0.5)
-    assert turning_findings(turning, {"a": 0.97, "held out": 0.1}) == ()
-    assert turning_findings(turning, {}) == ()
-    assert turning_findings(job("motor_constant"), shares) == ()
+    assert not list(turning_findings(turning, {"a": 0.97, "held out": 0.1}))
+    assert not list(turning_findings(turning, {}))
+    assert not list(turning_findings(job("motor_constant"), shares))

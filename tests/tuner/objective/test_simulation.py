@@ -242,7 +242,7 @@ def test_the_controller_that_flew_is_recognised(flight):
         assert axis.gain == pytest.approx(1.0, abs=0.05)
         assert axis.correlation > 0.98
         assert abs(axis.bias) < 0.01
-    assert setpoint_findings(flight, OURS) == ()
+    assert not list(setpoint_findings(flight, OURS))
     assert choose_inlet(flight, "auto", None, OURS) == ("reference", None)
 
 
@@ -256,7 +256,7 @@ def test_a_flight_is_matched_within_a_blink(flight):
 
 def test_another_attitude_law_is_reported_before_the_search(flight):
     lee = OURS.replace(attitude=OURS.attitude.replace(law="rotation_matrix"))
-    findings = setpoint_findings(flight, lee)
+    findings = list(setpoint_findings(flight, lee))
     assert {finding.code for finding in findings} == {Code.SETPOINTS_SCALED}
     line = one_line(findings[0])
     assert "Roll rate set-points are 0.5 times the controller file's" in line

@@ -130,7 +130,7 @@ def test_a_lag_known_more_finely_than_physics_steps_is_warned_of():
     assert finding.subject == "time_constant_up"
     assert finding.numbers == {"seconds": 1e-4}
     estimates["time_constant_up"] = SimpleNamespace(std_error=2e-4)
-    assert finer_than_steps(SimpleNamespace(estimates=estimates)) == ()
+    assert not list(finer_than_steps(SimpleNamespace(estimates=estimates)))
 
 
 def test_a_curve_of_motors_says_at_which_voltage_it_holds(updated):
@@ -139,8 +139,8 @@ def test_a_curve_of_motors_says_at_which_voltage_it_holds(updated):
     )
     (finding,) = reference_voltage_findings(updated, best)
     assert "16.36 V" in sentence(finding)
-    assert reference_voltage_findings(best, best) == ()  # given
-    assert reference_voltage_findings(updated, best.replace(effects={})) == ()
+    assert not list(reference_voltage_findings(best, best))  # given
+    assert not list(reference_voltage_findings(updated, best.replace(effects={})))
 
 
 def test_time_left_falls_to_nothing():

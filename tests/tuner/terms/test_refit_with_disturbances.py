@@ -258,7 +258,7 @@ def test_a_flight_that_disturbances_explain_is_not_reported_as_unmatched(size: f
     names = ("spin", "odd", "sparse", "calm")
     scales = {name: {"position": 12.0} for name in names} | {"spin": {"position": size}}
     fit = replace(fitted(1.0), scales=scales)
-    fit = replace(fit, findings=unmatched_findings(scales))
+    fit = replace(fit, findings=tuple(unmatched_findings(scales)))
     assert len(fit.findings) == (1 if size == 20.0 else 2)
     predictor = SimpleNamespace(
         found=SimpleNamespace(white=white),

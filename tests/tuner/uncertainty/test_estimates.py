@@ -164,7 +164,7 @@ def test_a_term_that_another_may_replace_is_said_with_it_though_its_interval_hol
         SimpleNamespace(held={}),
         SimpleNamespace(estimates={"gyro_cutoff_factor": wide}),
     )
-    assert not term_findings(fitted, known)
+    assert not list(term_findings(fitted, known))
     other = {"gyro_filter": {"derivative_cutoff_factor": 1.5}}
     (found,) = term_findings(fitted, known, other)
     assert (found.subject, found.names) == ("gyro_filter", ("gyro_cutoff_factor",))
@@ -181,5 +181,5 @@ def test_terms_that_flights_do_not_identify_have_no_number_in_findings():
     (found,) = term_findings(fitted, SimpleNamespace(estimates=estimates))
     assert found.names == ("gyro_scale_x",)
     assert found.numbers == {"gyro_scale_x": 1.02, "gyro_scale_x_error": 0.001}
-    assert not term_findings(fitted, SimpleNamespace(estimates={"gyro_scale_z": unknown}))
-    assert not term_findings(fitted, SimpleNamespace(estimates={"tachometer_memory": known}))
+    assert not list(term_findings(fitted, SimpleNamespace(estimates={"gyro_scale_z": unknown})))
+    assert not list(term_findings(fitted, SimpleNamespace(estimates={"tachometer_memory": known})))

@@ -215,11 +215,11 @@ def test_intervals_include_the_shift_by_an_omitted_law():
         assert parts.lack == pytest.approx(parts.search, rel=0.25)
         alone = without.uncertainty.estimates[name].std_error
         assert estimate.std_error == pytest.approx(np.hypot(alone, parts.lack))
-    findings = model_error_findings(held.model_errors, held.uncertainty)
+    findings = list(model_error_findings(held.model_errors, held.uncertainty))
     assert findings
     assert all(finding.code is Code.LAW_LACKING for finding in findings)
     assert "rotor_drag_coefficient" in findings[0].names
-    assert model_error_findings(without.model_errors, without.uncertainty) == ()
+    assert not list(model_error_findings(without.model_errors, without.uncertainty))
 
 
 @pytest.mark.parametrize("sees", [False, True])
@@ -308,7 +308,8 @@ def test_lateness_within_a_period_of_the_loop_is_not_reported(speed_lag, said):
     model_errors = ModelErrors(
         (), None, (ControllerEstimate("roll", "late", speed_lag, 1e-4, True),)
     )
-    assert bool(model_error_findings(model_errors, SimpleNamespace(estimates={}))) is said
+    findings = list(model_error_findings(model_errors, SimpleNamespace(estimates={})))
+    assert bool(findings) is said
 
 
 def test_commands_that_were_recorded_between_two_ticks_are_those_that_hold():
@@ -335,7 +336,7 @@ def flown_with_p(factor):
 
 @pytest.mark.parametrize("factor", [1.06, 1.5])
 def test_a_gain_that_is_far_off_is_reported_beside_the_fit(factor):
-    said = gains_far_off(*flown_with_p(factor))
+    said = list(gains_far_off(*flown_with_p(factor)))
     if factor < 1.3:
         assert not said
         return
@@ -354,7 +355,7 @@ def test_one_flight_of_another_p_is_named_and_moves_no_gain_of_the_others():
     (fitted, flights), (_, others) = flown_with_p(1.0), flown_with_p(0.6)
     found = model_errors_of(fitted, [*flights[:2], others[2]])
     assert {(one.flight, one.part) for one in found.controller} == {(others[2].name, "P")}
-    said = model_error_findings(found, examine(fitted).uncertainty)
+    said = list(model_error_findings(found, examine(fitted).uncertainty))
     assert [one.subject for one in said] == [others[2].name]
     assert said[0].numbers["roll"] == pytest.approx(0.6, abs=0.05)
     gains = found.applied_to(fitted.objective).model.controller.rate.p
@@ -382,7 +383,7 @@ def test_intervals_include_the_shift_by_another_controller(factor):
         parts = examination.uncertainty.estimates[name].parts
         assert parts.lack == pytest.approx(parts.search, rel=0.25)
         assert parts.lack > parts.noise
-    said = model_error_findings(examination.model_errors, examination.uncertainty)
+    said = list(model_error_findings(examination.model_errors, examination.uncertainty))
     assert said[0].code is Code.CONTROLLER_ANSWERS
 
 

@@ -139,7 +139,7 @@ def test_flights_alone_are_what_they_would_have_given():
     assert motor.ground == pytest.approx(1.4e-5)
     assert motor.ground_error == pytest.approx(0.01 * 1.4e-5)
     assert motor.deviation == pytest.approx(0.01 / np.hypot(0.01, 0.01))
-    assert ground_conflicts(sources, 2.0) == ()
+    assert not list(ground_conflicts(sources, 2.0))
 
 
 def test_a_contradiction_is_a_finding():
