@@ -43,7 +43,6 @@ from tuner.evaluate.prediction import (
     errors_of,
     hold_state,
 )
-from tuner.evaluate.validation import controller_flown, vehicle_fitted
 from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.job.run import run
 from tuner.job.without_pose import fit_without_pose
@@ -56,6 +55,7 @@ from tuner.result import BEST_FIT_FILE
 from tuner.search.job_flights import read_inertial_flights, read_recordings
 from tuner.search.listener import Reporter
 from tuner.search.problem import job_of
+from tuner.search.progress import controller_flown, vehicle_fitted
 from tuner.terms.selection import search_with_terms, with_first_terms
 from tuner.uncertainty.identifiability import hold_undetermined
 from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle

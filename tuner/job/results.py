@@ -25,16 +25,7 @@ from tuner.design.ranking import (
     rank_next_flights,
 )
 from tuner.evaluate.records import RMSE_UNITS
-from tuner.evaluate.validation import (
-    Validation,
-    best_values,
-    conditions_of,
-    controller_flown,
-    impossible_inertia,
-    initial_of,
-    offsets_of,
-    vehicle_fitted,
-)
+from tuner.evaluate.validation import Validation
 from tuner.findings.findings import Finding
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS
@@ -55,7 +46,15 @@ from tuner.result import (
 )
 from tuner.search.job_flights import Recording
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted
+from tuner.search.progress import (
+    Fitted,
+    best_values,
+    conditions_of,
+    controller_flown,
+    impossible_inertia,
+    offsets_of,
+    vehicle_fitted,
+)
 from tuner.terms.candidates import Selected
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination
@@ -178,7 +177,7 @@ def _coefficients(
     coefficients = {}
     began = initial_values(job.user_settings.vehicle, job.user_settings.controller, job.space.free)
     errors = {} if job.accelerations is None else job.accelerations.errors
-    for name, value in initial_of(job).items():
+    for name, value in job.initial.items():
         initial, regressed = began.get(name, value), None
         if name in errors:
             bounded = scaled_to_size(COEFFICIENTS[name], job.space.size).limits(initial)

@@ -24,12 +24,10 @@ from tuner.design.ranking import propose_logs
 from tuner.evaluate.comparison import table_of
 from tuner.evaluate.validation import (
     Validation,
-    controller_flown,
     flights_not_followed,
     flights_worse,
     predicted_worse_than_held,
     validate,
-    vehicle_fitted,
 )
 from tuner.exporters.effective import Effective, find_effective
 from tuner.exporters.export import export_formats_of_job
@@ -46,7 +44,7 @@ from tuner.search.findings import reference_voltage_findings, turning_findings
 from tuner.search.job_flights import with_logged_parameters
 from tuner.search.listener import SILENT, Iteration, Listener, Reporter
 from tuner.search.problem import Job
-from tuner.search.progress import Progress
+from tuner.search.progress import Progress, controller_flown, vehicle_fitted
 from tuner.terms.candidates import Selected
 from tuner.terms.refit_with_disturbances import refit_and_examine
 from tuner.terms.selection import search_with_terms

@@ -40,7 +40,7 @@ from tuner.uncertainty.identifiability import profile_likelihood
 from tuner.uncertainty.model_error import alternatives_of
 from tuner.uncertainty.records import Knowledge, Profiles
 from tuner.uncertainty.sensitivity import global_sensitivity
-from tuner.vehicle import check_names, initial_values
+from tuner.vehicle import check_names
 
 
 def unfitted(job: Job) -> Fitted:
@@ -65,7 +65,7 @@ def unfitted(job: Job) -> Fitted:
 
 def _simulated(job: Job, objective: Objective) -> Fitted:
     """Return a problem at the job's vehicle as a fit, with noise scaled up to its residuals."""
-    start = initial_values(job.settings.vehicle, job.settings.controller, job.space.free)
+    start = job.initial
     vector = job.space.vector_of(start)
     points = initial_progress(objective, vector[None]).points
     unscaled = plain_criterion(objective, objective.samples)

@@ -27,7 +27,7 @@ from tuner.objective.segments import (
 from tuner.objective.space import Space, space_of
 from tuner.recordings.flight import Flight
 from tuner.search.job_flights import Recording
-from tuner.vehicle import condition_rows
+from tuner.vehicle import condition_rows, initial_values
 from tuner.vehicle.model import model_of, schedule_of
 
 #: Channels of a yaw spin that is not held level: nothing holds its position, so that a gust or a
@@ -94,6 +94,11 @@ class Job:
     def inlets(self) -> tuple[InletName, ...]:
         """Where each fitted flight enters the simulated loop."""
         return tuple(recording.inlet for recording in self.recordings if not recording.holdout)
+
+    @property
+    def initial(self) -> dict[str, float]:
+        """Every coefficient's initial value."""
+        return initial_values(self.settings.vehicle, self.settings.controller, self.space.free)
 
     def undecided(self, objective: Objective) -> dict[str, NDArray[np.bool_]]:
         """Return the choices of a `Loop` that matter to a problem -> informative flights (N,).

@@ -1,4 +1,4 @@
-"""Progress and result of a search, and the interface of an optimiser.
+"""Progress of a search, its result with the values it reports, and the interface of an optimiser.
 
 An optimiser runs one stage of the search: a function that yields an `Iterate` after each step, at
 least one, until the stage ends. `tuner.search.continuation.OPTIMISERS` names it.
@@ -18,12 +18,14 @@ from sim_jax.control.gains import Controller
 from sim_jax.numeric import Scalar
 from tuner.core.numerics import Array
 from tuner.findings.findings import Finding
-from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums, picked
+from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums, picked, units_of
 from tuner.objective.normal_equations import Objective
-from tuner.objective.segments import CLOCKS
+from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings.flight import Flight
-from tuner.search.listener import Iteration, Outcome
+from tuner.search.listener import Iteration, Outcome, PointEstimate
+from tuner.search.problem import Job
 from tuner.search.stages import Stage
+from tuner.vehicle import COEFFICIENTS, ControllerFile, VehicleFile, with_values
 
 HUBER = 4.0
 """Standard deviations beyond which a residual counts linearly, in the polish."""
@@ -324,6 +326,72 @@ class Fitted:
     def residuals_at_noise_level(self) -> bool:
         """Whether residuals hold no more than measurement noise, on any flight and channel."""
         return max(max(scale.values()) for scale in self.scales.values()) < COLOURED_RATIO
+
+
+def controller_flown(job: Job, fitted: Fitted) -> ControllerFile:
+    """Return the controller file with the choices of the loop that the search ended with."""
+    controller, loop = job.settings.controller, loop_of(fitted.objective)
+    return controller.replace(
+        mixer=controller.mixer.replace(saturation_feedback=loop.saturation_feedback > 0.5),
+        sensing=controller.sensing.replace(sees_markers=loop.sees_markers > 0.5),
+    )
+
+
+def vehicle_fitted(job: Job, fitted: Fitted) -> VehicleFile:
+    """Return the vehicle with the best coefficients, see `best_values`."""
+    return with_values(job.settings.vehicle, best_values(job, fitted))
+
+
+def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
+    """Return each free coefficient's reported value: fitted, or initial if it is held."""
+    initial, values = job.initial, job.space.numbers(fitted.point.coefficients)
+    tied = (p.ratios for p in job.space.parameters if p.name in fitted.held.values())
+    held = {*impossible_inertia(job, fitted), *(name for ratios in tied for name in ratios)}
+    return {name: initial[name] if name in held else v for name, v in values.items()}
+
+
+def point_estimates(job: Job, fitted: Fitted) -> tuple[PointEstimate, ...]:
+    """Return each free coefficient's initial and reported value."""
+    initial = job.initial
+    return tuple(
+        PointEstimate(
+            name=name, unit=COEFFICIENTS[name].unit, initial=initial[name], estimate=estimate
+        )
+        for name, estimate in best_values(job, fitted).items()
+    )
+
+
+def impossible_inertia(job: Job, fitted: Fitted) -> tuple[str, ...]:
+    """Return the fitted moments of inertia if no rigid body can have them."""
+    fit, initial = job.space.numbers(fitted.point.coefficients), job.initial
+    inertia = [name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia"]
+    moments = {name: fit.get(name, initial[name]) for name in inertia}
+    if 2 * max(moments.values()) <= sum(moments.values()):
+        return ()
+    return tuple(name for name in inertia if name in fit)
+
+
+def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
+    """Return flight -> s by which its pose stamps are late."""
+    pose = np.asarray(fitted.point.offsets)[CLOCKS.index("pose")] * OFFSET_UNIT
+    offsets = {recording.flight.name: recording.time_offset or 0.0 for recording in job.recordings}
+    for flight, late in zip(job.fitted, pose, strict=True):
+        offsets[flight.name] += float(late)
+    return offsets
+
+
+def conditions_of(job: Job, fitted: Fitted) -> dict[str, dict[str, float]]:
+    """Return flight -> name -> its condition (wind, battery).
+
+    Those of fitted flights were estimated; held-out ones get their mean.
+    """
+    names = fitted.objective.conditions
+    rows = np.asarray(fitted.point.offsets)[len(OFFSETS) :] * units_of(names)[:, None]
+    usual = dict(zip(names, rows.mean(axis=1).tolist(), strict=True))
+    conditions = {recording.flight.name: usual for recording in job.recordings}
+    for flight, values in zip(job.fitted, rows.T.tolist(), strict=True):
+        conditions[flight.name] = dict(zip(names, values, strict=True))
+    return conditions
 
 
 def by_flight(

@@ -21,7 +21,6 @@ import numpy as np
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.core.spans import span
-from tuner.evaluate.validation import point_estimates
 from tuner.findings.findings import Finding
 from tuner.objective.battery import require_voltage
 from tuner.objective.criterion import Point, units_of
@@ -42,7 +41,7 @@ from tuner.search.estimation import (
 )
 from tuner.search.listener import Reporter
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, Progress, loop_of, with_loop
+from tuner.search.progress import Fitted, Progress, loop_of, point_estimates, with_loop
 from tuner.terms.candidates import (
     Selected,
     candidate_groups,

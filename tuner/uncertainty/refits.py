@@ -17,12 +17,12 @@ from tuner.core.errors import ConfigError
 from tuner.core.files import csv_text
 from tuner.engine import Report, current
 from tuner.evaluate.records import RMSE_UNITS
-from tuner.evaluate.validation import best_values, comparison_of
+from tuner.evaluate.validation import comparison_of
 from tuner.objective.normal_equations import Objective
 from tuner.search.estimation import free_parameters, polished
 from tuner.search.listener import Iteration
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fitted, best_values
 from tuner.uncertainty.records import Refit
 from tuner.vehicle import with_values
 

@@ -8,8 +8,10 @@ import pytest
 
 from tuner.config import JobFile
 from tuner.core.numerics import Z95
-from tuner.job.results import _regressed, best_values
+from tuner.job.results import _regressed
 from tuner.objective.space import space_of
+from tuner.search.problem import Job
+from tuner.search.progress import best_values
 from tuner.uncertainty.verdict import ReasonCode, Verdict
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.controller import Filters
@@ -21,10 +23,8 @@ def test_what_the_vehicle_file_leaves_open_is_held_at_the_value_that_flies(name,
     space = space_of(updated, controller, JobFile(free=(name, "motor_constant")))
     settings = SimpleNamespace(vehicle=updated, controller=controller)
     point = SimpleNamespace(coefficients=jnp.asarray(space.initial + 0.5))
-    values = best_values(
-        SimpleNamespace(settings=settings, space=space),
-        SimpleNamespace(point=point, held={name: name}),
-    )
+    job = Job(settings, (), {}, space, objective=None, user_settings=settings)
+    values = best_values(job, SimpleNamespace(point=point, held={name: name}))
     assert values[name] == initial
     assert values["motor_constant"] > updated.aerodynamics.motor_constant
 
