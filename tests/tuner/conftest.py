@@ -51,3 +51,12 @@ def flight(bag):
     from tuner.recordings.loader import load_flight  # noqa: PLC0415
 
     return load_flight(bag)
+
+
+@pytest.fixture
+def without_sensitivity(monkeypatch):
+    """Fly no flights for the sensitivity of outputs, which is half of an examination's time."""
+    from tuner.uncertainty import examination, sensitivity  # noqa: PLC0415 (jax)
+
+    none = sensitivity.LocalSensitivity({}, [], [])
+    monkeypatch.setattr(examination, "local_sensitivity", lambda *_, **__: none)

@@ -11,6 +11,8 @@ from tuner.terms.selection import with_terms_selected
 from tuner.uncertainty.examination import examine
 from tuner.vehicle import term_groups
 
+pytestmark = pytest.mark.usefixtures("without_sensitivity")
+
 TRUTH = {
     "thrust_exponent": 1.93,
     "autopilot_tilt_x": 0.015,

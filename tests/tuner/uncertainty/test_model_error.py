@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -42,6 +41,8 @@ from tuner.uncertainty.model_error import (
 )
 from tuner.vehicle import with_values
 from tuner.vehicle.model import model_of, schedule_of
+
+pytestmark = pytest.mark.usefixtures("without_sensitivity")
 
 SECONDS, FLIGHTS, RATE = 14.0, 3, 100
 FREE = (
@@ -178,16 +179,10 @@ def fitted_at(objective: Objective, point: Point, flights: list[Flight]) -> Fitt
     return replace(fitted, criterion=criterion, scales=scales)
 
 
-@cache
-def draggy(gusts):
-    """Return a fit that lacks the drag of a fuselage, and what it is found to lack."""
-    fitted, flights = fit_of(FUSELAGE, 0, gusts=gusts)
-    return fitted, model_errors_of(fitted, flights)
-
-
 @pytest.mark.parametrize("gusts", [False, True], ids=["still", "gusts"])
 def test_drag_of_a_fuselage_is_found_without_its_name(gusts):
-    _, model_errors = draggy(gusts=gusts)
+    fitted, flights = fit_of(FUSELAGE, 0, gusts=gusts)
+    model_errors = model_errors_of(fitted, flights)
     axes = {
         law.axis
         for law in model_errors.laws
@@ -207,7 +202,8 @@ def test_the_right_model_lacks_nothing():
 
 
 def test_intervals_include_the_shift_by_an_omitted_law():
-    fitted, model_errors = draggy(gusts=False)
+    fitted, flights = fit_of(FUSELAGE, 0, gusts=False)
+    model_errors = model_errors_of(fitted, flights)
     without, held = examine(fitted), examine(fitted, model_errors=model_errors)
     for name, estimate in held.uncertainty.estimates.items():
         parts = estimate.parts
@@ -322,7 +318,6 @@ def test_commands_that_were_recorded_between_two_ticks_are_those_that_hold():
     assert model_errors_of(making.fitted_of(objective, making.truth(objective)), flights) is None
 
 
-@cache
 def flown_with_p(factor):
     """Return a fit at the truth of flights whose P is so many times the file's, and the flights."""
     truth, fitted_to = problem({}), problem({})
