@@ -35,17 +35,15 @@ from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import picked
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import Segments, cut_windows, window_segments
-from tuner.objective.simulation import MOTION, fly
+from tuner.objective.simulation import MOTION, TORQUE_RATE_HZ, fly
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import States, states_at
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle.model import Model, model_of, schedule_of
 
-RATE_HZ = 100.0
-"""The rate of the torque in a prediction."""
 MAX_LAG_S = 1.0
 """The torque is zero after longer lags."""
-LAGS = np.arange(round(MAX_LAG_S * RATE_HZ) + 1) / RATE_HZ
+LAGS = np.arange(round(MAX_LAG_S * TORQUE_RATE_HZ) + 1) / TORQUE_RATE_HZ
 
 ROTOR_INLETS = ("rotor_speed", "actuator")
 """Inlets with recorded rotor speeds or commands as input."""
@@ -111,7 +109,7 @@ class TorqueObserver:
             np.interp(lag, LAGS, self.autocorrelation[:, axis])[:, None] * moment * torque[:, axis]
             for axis, moment in enumerate((inertia.xx, inertia.yy, inertia.zz))
         ]
-        return Disturbance(moment=Vec3(*acting), rate=RATE_HZ)
+        return Disturbance(moment=Vec3(*acting), rate=TORQUE_RATE_HZ)
 
 
 def _residual_acceleration(
@@ -232,6 +230,7 @@ class FlightPredictor:
         self._whole = np.flatnonzero(begins + seconds <= flight.duration + 1e-9)
         self.begins = begins[self._whole]
         self.ahead = np.arange(1, round(seconds * flight.rate) + 1) / flight.rate
+        self._segments: dict[tuple[float, Schedule], Segments] = {}
 
     @cached_property
     def recorded(self) -> States:
@@ -254,16 +253,19 @@ class FlightPredictor:
             Gives the disturbance torque at the start of a prediction.
         """
         motor, schedule = vehicle.motor, schedule_of(controller)
-        segments = window_segments(
-            [self.flight],
-            self._pieces,
-            inlets=[self.inlet],
-            schedule=schedule,
-            lag=0.5 * (motor.time_constant_up + motor.time_constant_down),
-            noise={},
-            free_starts=False,
-        )
-        segments = picked(segments, (..., self._whole))
+        lag = 0.5 * (motor.time_constant_up + motor.time_constant_down)
+        if (lag, schedule) not in self._segments:
+            laid = window_segments(
+                [self.flight],
+                self._pieces,
+                inlets=[self.inlet],
+                schedule=schedule,
+                lag=lag,
+                noise={},
+                free_starts=False,
+            )
+            self._segments[lag, schedule] = picked(laid, (..., self._whole))
+        segments = self._segments[lag, schedule]
         if observer is not None:
             fed = self.flight, self.inlet, self.input_late
             segments = replace(segments, disturbance=observer.disturbance(fed, self.begins))

@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -107,8 +107,14 @@ def find_effective(
     vehicle, converged = fit_effective(run, simulator, recorded, names, on_progress)
     spinning = {r.flight.name for r in recorded[1] if r.flight.spins_freely}
 
+    conditions = {name for flight in run.result.flights for name in flight.conditions}
+
+    @cache
+    def comparison(missing: frozenset[str]) -> Comparison:
+        return _comparison(run, recorded, missing)
+
     def flown(flying: VehicleFile, missing: Collection[str]) -> dict[str, AxesRmse]:
-        errors = _comparison(run, recorded, missing).fly(flying)
+        errors = comparison(frozenset(conditions.intersection(missing))).fly(flying)
         return {name: flight.rmse for name, flight in errors.items()}
 
     def over_flights(rmse: Mapping[str, AxesRmse]) -> PoseRmse:

@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from lanes import Argument, program_of
 from sim_jax import terms
-from sim_jax.environment import Air, Environment
+from sim_jax.environment import Air, Disturbance, Environment
 from sim_jax.frames import gyro_of, markers_of
 from sim_jax.geometry import Vec3
 from sim_jax.inlet import Inlet
@@ -58,6 +58,9 @@ requested are not written."""
 EFFECTS = tuple(name for name, row in COEFFICIENTS.items() if row.is_effect)
 TERMS = tuple(name for name in EFFECTS if COEFFICIENTS[name].group)
 """Coefficients beyond the base model, and those of them that a fit may add."""
+TORQUE_RATE_HZ = 100.0
+"""Of the ticks of a predicted torque. Where values alone are computed with terms it is zero: one
+program serves flights with such a torque and without."""
 CODE = ("sim_jax", "tuner")
 """Packages whose code is run while a program of this one is traced."""
 
@@ -129,10 +132,13 @@ def fly(
     differentiated
         Whether the program with derivatives flies without tangents, too: a fit has built it.
     """
+    moves = differentiated or tangents is not None
     if conditions or {*model.vehicle.effects, *coefficients}.intersection(EFFECTS):
         model, conditions = _with_all_terms(model, segments, conditions)
+        if not moves and segments.disturbance is None:
+            zero = Vec3(*np.zeros((3, 1, segments.count)))
+            segments = replace(segments, disturbance=Disturbance(moment=zero, rate=TORQUE_RATE_HZ))
     names = tuple(segments.measured) if channels is None else channels
-    moves = differentiated or tangents is not None
     # in one order, for it tells programs apart
     logged = tuple(sorted({*LOGGED, *names}))
     coefficients = {**coefficients_in(model), **coefficients}

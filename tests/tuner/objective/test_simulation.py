@@ -16,6 +16,8 @@ from lanes import Run, joined
 from lanes.machine import digest_of
 from lanes.program import _program_of
 from sim_jax import terms
+from sim_jax.environment import Disturbance
+from sim_jax.geometry import Vec3
 from sim_jax.inlet import ActuatorInlet, Inlet, MixedInlet
 from sim_jax.rollout import rollout
 from sim_jax.state import AIRBORNE, hover
@@ -368,6 +370,22 @@ def test_windows_from_recorded_and_from_free_starts_are_the_same_program(full_fl
     free = replace(recorded, segments=replace(recorded.segments, start_sd=sd))
     built(recorded)
     assert built(free) == 0
+
+
+def test_a_predicted_torque_is_no_program_of_its_own():
+    fit = problem(("inertia_xx",))
+    torque = Vec3(*np.zeros((3, 5, fit.segments.count)))
+    observed = Disturbance(moment=torque, rate=simulation.TORQUE_RATE_HZ)
+    built = []
+    for segments in (fit.segments, replace(fit.segments, disturbance=observed)):
+        simulation.fly(
+            *(fit.model, segments, fit.schedule),
+            samples=8,
+            limits=fit.limits,
+            coefficients={"linear_drag_x": 0.1},
+        )
+        built.append(_program_of.cache_info().misses)
+    assert built[0] == built[1]
 
 
 def test_programs_of_flights_are_kept_for_other_processes():
