@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -148,7 +148,7 @@ def proposals_in_words(proposals: Proposals) -> list[str]:
             gains.setdefault(best.name, []).append((share, label))
     sentences = []
     for flight, shares in sorted(gains.items(), key=lambda item: min(item[1])):
-        effects = listed([effect_in_words(share, label) for share, label in sorted(shares)])
+        effects = effects_in_words(sorted(shares))
         sentences.append(f"{flight[0].upper()}{flight[1:]} would {effects}.")
     if not_narrowed:
         sentences.append(
@@ -156,6 +156,13 @@ def proposals_in_words(proposals: Proposals) -> list[str]:
             f"by more than {1 - MAX_WORTHWHILE_SHARE:.0%}."
         )
     return sentences
+
+
+def effects_in_words(shares: Sequence[tuple[float, str]]) -> str:
+    """Return the effects on intervals, those that are narrowed the most first."""
+    narrowed = [f"{of} to {share:.0%}" for share, of in shares if of and share < HALVED_RANGE[0]]
+    first = [f"narrow the interval of {listed(narrowed)} of what it is"] if narrowed else []
+    return listed([*first, *(effect_in_words(*each) for each in shares[len(narrowed) :])])
 
 
 def effect_in_words(share: float, label: str) -> str:
@@ -186,7 +193,7 @@ def log_in_words(proposal: LogProposal) -> str:
         for name, share in proposal.shrinks.items()
         if share < MAX_WORTHWHILE_SHARE
     )
-    effects = listed([effect_in_words(share, label) for share, label in gains[:MAX_EFFECTS]])
+    effects = effects_in_words(gains[:MAX_EFFECTS])
     if fed:
         return (
             f"Log the {signal} at {rate}, so that it can be fed in and the attitude need not be: "

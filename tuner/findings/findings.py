@@ -432,10 +432,10 @@ class Code(Worded):
     FINER_THAN_STEPS = (
         "finer_than_steps",  # seconds
         (
-            "Simulators' steps shift them {milliseconds:g} ms: two of other steps differ by that, "
-            "and the 95 % intervals leave it out."
+            "Latencies go with the simulator's step: another step moves them by {milliseconds:g} "
+            "ms, which the 95 % intervals leave out."
         ),
-        "Take them as known to ±{twice:g} ms: twice as much, in any simulator.",
+        "Take them as known to ±{twice:g} ms, twice as much, in any simulator.",
     )
     REFERENCE_VOLTAGE = (
         "reference_voltage",  # volts

@@ -147,7 +147,7 @@ def in_a_hall(*flights: Proposal) -> Proposals:
     return Proposals(
         arena=(4.0, 3.0, 2.0),
         seconds=20.0,
-        targets=["inertia_xx", "moment_constant", "mass"],
+        targets=["inertia_xx", "inertia_yy", "moment_constant", "mass"],
         fixed_targets=["mass"],
         all_known=False,
         flights=list(flights),
@@ -161,13 +161,20 @@ def flight(name: str, **shrinks: float) -> Proposal:
 def test_sentences_name_each_flight_and_what_it_would_narrow() -> None:
     sentences = proposals_in_words(
         in_a_hall(
-            flight("a circle", inertia_xx=0.2, moment_constant=0.95, mass=0.97),
-            flight("a yaw spin at 4 rad/s", inertia_xx=0.8, moment_constant=0.5, mass=0.99),
+            flight("a circle", inertia_xx=0.2, inertia_yy=0.3, moment_constant=0.95, mass=0.97),
+            flight(
+                "a yaw spin at 4 rad/s",
+                inertia_xx=0.8,
+                inertia_yy=0.9,
+                moment_constant=0.5,
+                mass=0.99,
+            ),
         )
     )
     not_narrowed = "No single flight in this arena would narrow the interval of mass (fixed so far)"
+    narrowed = "inertia_xx to 20% and inertia_yy to 30% of what it is"
     assert sentences == [
-        "A circle would narrow the interval of inertia_xx to 20% of what it is.",
+        f"A circle would narrow the interval of {narrowed}.",
         "A yaw spin at 4 rad/s would halve the interval of moment_constant.",
         f"{not_narrowed} by more than 10%.",
     ]

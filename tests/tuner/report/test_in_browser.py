@@ -13,7 +13,9 @@ pytest.importorskip("playwright", reason="needs the extra 'test' (Playwright)")
 
 from playwright.sync_api import Browser
 
+from tests.tuner.evaluate.test_compare import GOOD
 from tests.tuner.report.browser import CHROMIUM, PATIENCE, Reading, chromium, reading
+from tuner.evaluate.comparison import table_of, write_table
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium or Chrome on the path")
 
@@ -66,6 +68,13 @@ def test_the_first_screen_says_whether_the_fit_can_be_used(browser: Browser, rep
                 assert box is not None
                 assert box["y"] + box["height"] < 900
             assert opened.page.evaluate("document.documentElement.scrollHeight") < 9 * 900
+
+
+def test_a_comparison_on_a_phone_scrolls_within_its_table(browser: Browser, tmp_path: Path) -> None:
+    names = ("a_vehicle_with_a_long_name", "another_one")
+    write_table(table_of({name: {"circle_3mps": GOOD} for name in names}), tmp_path / "c.html")
+    with reading(browser, tmp_path / "c.html", width=390) as opened:
+        assert opened.page.evaluate(WIDTH) <= 390
 
 
 def test_every_figure_draws_on_a_desktop(desktop: Reading) -> None:
