@@ -26,6 +26,7 @@ from tuner.exporters.sdf.model import (
     read_model,
 )
 from tuner.exporters.targets.px4 import outside_range, read_parameters
+from tuner.report.result_texts import EFFECTIVE
 from tuner.result import Run
 from tuner.vehicle import values_of
 
@@ -122,6 +123,8 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
         faults += outside_range(parameters)
         faults += _parameter_faults(parameters, whole, rotors, speeds)
     differences = () if run is None else tuple(_differences_from(run, whole, rotors))
+    if differences and EFFECTIVE in model.root.source.raw:
+        differences = (f"These are {EFFECTIVE}: they differ on purpose.", *differences)
     return Audit(path, whole.mass, tuple(dict.fromkeys(faults)), differences, tuple(model.included))
 
 
@@ -170,12 +173,14 @@ def _inertia_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
 
 def _rotor_faults(rotors: list[Rotor], model: Model) -> Iterator[str]:
     """Yield faults of motors, and differences between them."""
+    has_effective = EFFECTIVE in model.root.source.raw
     for rotor in rotors:
         where, given = f"rotor {rotor.number}", rotor.numbers
         for tag in REQUIRED_TAGS:
             if tag not in given:
                 yield f"{where}: it has no {tag}, and the plugin's default flies"
         for tag, ((low, high), fault, above) in NUMBER_RANGES.items():
+            low = 0.0 if has_effective else low  # noqa: PLW2901
             if not low <= (value := given.get(tag, low)) <= high:
                 text = fault.format(limits=_range((low, high))) + (above if value > high else "")
                 yield f"{where}: {tag} {value:g} {text}"

@@ -114,11 +114,15 @@ def metres(value: float) -> str:
     return f"{100 * value:.2g} cm" if value >= 0.01 else f"{1000 * value:.2g} mm"
 
 
+EFFECTIVE = "effective coefficients, not physical ones"
+"""The mark of an export whose numbers make up for what its simulator lacks."""
+
+
 def exported_numbers(effective: EffectiveResult, simulator: str) -> str:
     """Return a clause on the effective coefficients of an export."""
     lost = listed([term.group for term in effective.lost])
     return (
-        f"effective coefficients, not physical ones: {simulator} lacks {lost}, and misses the "
+        f"{EFFECTIVE}: {simulator} lacks {lost}, and misses the "
         f"flights by {rmse_in_words(effective.rmse_effective)} where all terms miss them by "
         f"{rmse_in_words(effective.rmse_physical)}"
     )
