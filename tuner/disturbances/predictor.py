@@ -211,23 +211,22 @@ class Predictor:
     ) -> Iterator[Filtered]:
         """Yield the filter's results for the first ticks with each column of strengths (8, n).
 
-        Filters run side by side as far as they fill a kernel's block of segments.
+        Filters run side by side as far as they fill a kernel's block of segments, those of one
+        flight first: they have their samples at the same ticks.
         """
-        count = self.inputs.offsets.shape[-1]
+        count, times = self.inputs.offsets.shape[-1], strengths.shape[1]
         inputs = self._inputs_at(point)
-        samples = jax.tree.map(lambda rows: rows[:ticks], inputs.samples)
-        together = max(SEGMENTS_AT_ONCE // count, 1)
-        for first in range(0, strengths.shape[1], together):
-            some = strengths[:, first : first + together]
-            tiled = jax.tree.map(
-                lambda rows, times=some.shape[1]: np.tile(rows, times),
-                replace(inputs, samples=samples),
-            )
-            assumed = self._assumed(objective, point, np.repeat(some, count, axis=-1))
-            found = filtered(self.schedule, tiled, assumed, gains=False, latency=self.latency)
-            for number in range(some.shape[1]):
-                segments = slice(number * count, (number + 1) * count)
-                yield found.first(ticks, segments)
+        inputs = replace(inputs, samples=jax.tree.map(lambda rows: rows[:ticks], inputs.samples))
+        together, found = max(SEGMENTS_AT_ONCE // times, 1), []
+        for first in range(0, count, together):
+            segments = np.arange(first, min(first + together, count)).repeat(times)
+            tiled = jax.tree.map(lambda rows, those=segments: rows[..., those], inputs)
+            of_segments = np.tile(strengths, len(segments) // times)
+            assumed = self._assumed(objective, point, of_segments)
+            found.append(filtered(self.schedule, tiled, assumed, gains=False, latency=self.latency))
+        all_of = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *found)
+        for number in range(times):
+            yield all_of.first(ticks, slice(number, None, times))
 
     @property
     def estimated_noise(self) -> dict[str, float]:
