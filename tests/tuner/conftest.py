@@ -1,10 +1,18 @@
-"""A recording that is simulated once for all tests that need one."""
+"""A terminal, and recordings that are simulated once for all tests that need one."""
 
 import pytest
 
 from tuner.config import TrajectorySettings
 from tuner.core.shipped import configs_folder
 from tuner.vehicle import ControllerFile, read_vehicle
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """A terminal without colours: pipes get whole lines."""
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
+    monkeypatch.setenv("FORCE_COLOR", "1")  # which older releases of rich know alone
+    monkeypatch.setenv("TERM", "dumb")
 
 
 @pytest.fixture(scope="session")

@@ -16,10 +16,7 @@ from tuner.vehicle import COEFFICIENTS
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("TTY_COMPATIBLE", "1")
-    monkeypatch.setenv("FORCE_COLOR", "1")  # which older releases of rich know alone
-    monkeypatch.setenv("TERM", "dumb")
+def folder(tmp_path, terminal):  # noqa: ARG001 (a fixture that acts)
     making.write_run(tmp_path, FREE, ROLLING)
     return tmp_path
 

@@ -99,6 +99,7 @@ def test_mass_and_rolling_moment_stay_as_given(finished):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("terminal")
 def test_the_terminal_says_in_thirty_lines_that_it_can_be_used(finished, capsys):
     print_run(*finished, seconds=40.0)
     lines = capsys.readouterr().out.splitlines()
