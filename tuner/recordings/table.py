@@ -315,7 +315,7 @@ def _unit_by_step(
     """Return the unit of times whose step is that of a flight."""
     steps = []
     for there in sampled:
-        between = np.diff(numbers[there & np.isfinite(numbers)])
+        between = np.diff(np.sort(numbers[there & np.isfinite(numbers)]))
         steps.append(float(np.median(between[between > 0])) if (between > 0).any() else np.nan)
     if not np.isfinite(steps).any():
         return None

@@ -89,6 +89,13 @@ def test_time_that_cannot_be_told_is_named(change, message: str, tmp_path: Path)
     assert "\n" not in str(caught.value)
 
 
+def test_rows_in_the_opposite_order_are_read_by_their_times(tmp_path: Path) -> None:
+    names, *rows = ways.with_time(ways.TIMES["milliseconds"]).splitlines()
+    flight = read(tmp_path, "\n".join([names, *reversed(rows)]))
+    assert_same(flight)
+    assert NoteCode.UNIT_READ in {note.code for note in flight.notes}
+
+
 def test_quick_microseconds_are_no_slow_milliseconds(tmp_path: Path) -> None:
     """At 4 kHz their step is that of milliseconds at 4 Hz; gravity knows better."""
     truth = ways.flown()
