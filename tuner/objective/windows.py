@@ -13,7 +13,7 @@ import numpy as np
 
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
-from tuner.recordings.flight import Flight, InitialState, Series
+from tuner.recordings.flight import Flight, InitialState
 from tuner.recordings.states import initial_state, states_at
 
 BEFORE_S = 1.2
@@ -180,8 +180,9 @@ def _window(
     flight: Flight, first: int, last: int, recorded: InitialState, *, smoothed_widely: bool
 ) -> Window:
     begin, end = float(flight.time[first]), float(flight.time[last])
-    near = {n: s.between(begin - BEFORE_S, end + AFTER_S) for n, s in flight.series.items()}
-    series = {n: Series(s.time - begin, s.values) for n, s in near.items() if len(s.time)}
+    kept = (begin - BEFORE_S, end + AFTER_S)
+    near = {name: s.between(*kept, origin=begin) for name, s in flight.series.items()}
+    series = {name: s for name, s in near.items() if len(s.time)}
     initial = recorded
     if smoothed_widely:  # unless a gap leaves too few samples
         smoothed = initial_state(series)

@@ -100,7 +100,7 @@ class Series(RawSeries):
     def __post_init__(self) -> None:
         if self.time.ndim != 1 or self.values.ndim != 2 or len(self.time) != len(self.values):
             raise ValueError(f"time {self.time.shape} and values {self.values.shape} do not match")
-        if len(self.time) > 1 and not np.all(np.diff(self.time) > 0):
+        if len(self.time) > 1 and not (self.time[1:] > self.time[:-1]).all():
             raise ValueError("time is not strictly increasing")
 
     @property
@@ -108,10 +108,10 @@ class Series(RawSeries):
         """Hz, the median; 0 of a single sample."""
         return 1.0 / float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
 
-    def between(self, start: float, end: float) -> Series:
-        """Return the samples from one time to another, in s, both included."""
+    def between(self, start: float, end: float, *, origin: float = 0.0) -> Series:
+        """Return the samples from one time to another, in s, both included, since an origin."""
         inside = slice(self.time.searchsorted(start), self.time.searchsorted(end, "right"))
-        return Series(self.time[inside].copy(), self.values[inside].copy())
+        return Series(self.time[inside] - origin, self.values[inside].copy())
 
 
 @dataclass(frozen=True)

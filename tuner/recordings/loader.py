@@ -74,8 +74,7 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
         raise RecordingError(path, what, "give 'start' and 'end' in a side-car")
     clock = np.arange(count) / rate
     kept = (start - PRE_MISSION_S, mission.end + POST_MISSION_S + 1e-6)
-    near = {name: data.between(*kept) for name, data in series.items()}
-    nearby = {n: dataclasses.replace(s, time=s.time - start) for n, s in near.items()}
+    nearby = {name: data.between(*kept, origin=start) for name, data in series.items()}
     until = mission.end - start + 1e-6
     mission_series = {name: data.between(-np.inf, until) for name, data in nearby.items()}
     mission_series = {name: data for name, data in mission_series.items() if len(data.time)}
