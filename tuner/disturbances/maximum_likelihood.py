@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Array, scaled_solve
-from tuner.disturbances.disturbances import MAX_STRENGTHS, MIN_STRENGTHS, clipped
+from tuner.disturbances.disturbances import MAX_STRENGTHS, MIN_STRENGTHS, STRENGTHS, clipped
 from tuner.disturbances.predictor import Predictor, unscaled
 from tuner.disturbances.ticks import samples_of_ticks
 from tuner.objective.criterion import OFFSET_SD, OFFSET_UNIT, Criterion, Point, SegmentSums
@@ -44,6 +44,9 @@ MAX_CLOCK_SHIFT = 0.25
 line through their old two ticks is extrapolated."""
 MIN_STEP_GAIN = 0.1
 """Least predicted gain of a step, in the log-likelihood."""
+MIN_SHIFT = 0.25
+"""Standard errors of a coefficient or clock that a step must move one by to be damped and tried
+again: what smaller ones gain is of strengths too small to be seen."""
 NEAR_GAIN, FINAL_GAIN = 1.0, 0.3
 """Predicted gains below which a step is taken untested, and below which it is the last."""
 
@@ -116,6 +119,14 @@ class _Equations(NamedTuple):
     def gain(self, change: Array) -> float:
         """Return the predicted reduction of the loss by a step."""
         return -0.5 * float(self.gradient @ change)
+
+    def shift(self, change: Array) -> float:
+        """Return the largest step of a parameter that is no strength, in standard errors."""
+        moves = np.flatnonzero(change)
+        covariance = scaled_solve(self.hessian[np.ix_(moves, moves)], np.eye(len(moves)))
+        of_others = moves < len(change) - len(STRENGTHS)
+        shifts = np.abs(change[moves]) / np.sqrt(np.diag(covariance))
+        return float(shifts[of_others].max(initial=0.0))
 
     def step(self, space: Space, point: Point, damping: float = 0.0) -> Array | None:
         """Return the damped Gauss-Newton step; parameters that would leave their bounds stay.
@@ -210,6 +221,8 @@ def _descent(
         if _loss(tried, objective, to, criterion) < here or (near and not tried.is_lost):
             return tried, to
         del tried  # its gains are large
+        if equations.shift(change) < MIN_SHIFT:
+            break
     return None
 
 

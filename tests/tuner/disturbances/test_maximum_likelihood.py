@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
-from tuner.disturbances.disturbances import INITIAL_STRENGTHS
+from tuner.disturbances.disturbances import INITIAL_STRENGTHS, STRENGTHS
 from tuner.disturbances.maximum_likelihood import _Equations
 from tuner.disturbances.observer import FilterInput
 from tuner.disturbances.predictor import Predictor
@@ -23,6 +23,16 @@ def test_no_step_is_taken_where_a_filter_has_lost_a_flight():
     assert _Equations(slope * np.nan, np.eye(count), free).step(fit.space, point) is None
     bend = np.where(np.eye(count) > 0.0, np.nan, 0.0)
     assert _Equations(slope, bend, free).step(fit.space, point) is None
+
+
+def test_a_step_is_as_long_as_its_largest_move_but_of_strengths_in_standard_errors():
+    moves = np.append(np.zeros(3), np.ones(len(STRENGTHS)))
+    hessian = np.diag(np.append([4.0, 1.0, 1.0], np.full(len(STRENGTHS), 100.0)))
+    hessian[0, 1] = hessian[1, 0] = 1.2  # together they are known less well: 0.8 and 0.64 of it
+    equations = _Equations(moves, hessian, moves > 0.0)
+    assert equations.shift(moves) == 0.0
+    moves[:2] = 0.5, -0.1
+    assert equations.shift(moves) == pytest.approx(0.5 * 2.0 * 0.8)
 
 
 def test_a_filter_flies_on_the_voltage_that_another_problem_reads():
