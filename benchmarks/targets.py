@@ -17,7 +17,6 @@ from tuner.core.shipped import EXPORT_TARGETS
 from tuner.evaluate.records import AxesRmse
 from tuner.exporters.effective import cached_effective, pose_rmse, refly
 from tuner.exporters.target import target_of, write
-from tuner.report.result_texts import rmse_in_words
 from tuner.result import PoseRmse, read_run
 
 
@@ -28,7 +27,7 @@ def main(folder: str) -> None:
 
     def over_flights(flown: Mapping[str, AxesRmse]) -> str:
         rmse = pose_rmse(axes for name, axes in flown.items() if name not in spinning)
-        return rmse_in_words(rmse)
+        return rmse.words
 
     best = over_flights({f.name: f.rmse_best for f in run.result.flights})
     print("| target | all terms | physical there | effective there | in the simulator itself |")
@@ -45,7 +44,7 @@ def main(folder: str) -> None:
         )
         own = over_flights(refly(run, draft.vehicle))
         there = "–" if draft.flier is None else over_flights(refly(run, draft.vehicle, draft.flier))
-        physical = own if found is None else rmse_in_words(unfitted)
+        physical = own if found is None else unfitted.words
         print(f"| {kind} | {best} | {physical} | {own} | {there} |", flush=True)
 
 

@@ -16,6 +16,7 @@ from pydantic_core import from_json
 from tuner.core.disk import check_links, exists, folder_for, inside, read_bytes, remove_file
 from tuner.core.errors import InputError, OutputError
 from tuner.core.files import MAX_BYTES, FiniteOrNone, Part, ResultFile
+from tuner.core.phrases import metres
 from tuner.core.yaml_section import refuse
 from tuner.design.proposals import LogProposal
 from tuner.evaluate.records import AxesRmse, PredictedErrors
@@ -200,6 +201,15 @@ class PoseRmse(Part):
 
     position: FiniteOrNone
     attitude: FiniteOrNone
+
+    @property
+    def words(self) -> str:
+        """Both with readable units; an attitude that is an input has none."""
+        if self.position is None:
+            return "a crash"
+        if self.attitude is None:
+            return metres(self.position)
+        return f"{metres(self.position)} and {self.attitude:.2g}°"
 
 
 class LostTerm(Part):

@@ -42,6 +42,13 @@ def listed(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
+def metres(value: float) -> str:
+    """Return a length in m, cm or mm."""
+    if value >= 1.0:
+        return f"{value:.3g} m"
+    return f"{100 * value:.2g} cm" if value >= 0.01 else f"{1000 * value:.2g} mm"
+
+
 def percent(share: float) -> str:
     """Return a share as a percentage, of two digits below one hundred percent."""
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"

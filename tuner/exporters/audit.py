@@ -16,6 +16,7 @@ import numpy as np
 from sim_jax.constants import GRAVITY, RAD_S_PER_RPM
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
+from tuner.exporters.effective import MARK
 from tuner.exporters.sdf.model import (
     MAX_ROTORS,
     Inertial,
@@ -26,7 +27,6 @@ from tuner.exporters.sdf.model import (
     read_model,
 )
 from tuner.exporters.targets.px4 import outside_range, read_parameters
-from tuner.report.result_texts import EFFECTIVE
 from tuner.result import Run
 from tuner.vehicle import values_of
 
@@ -123,8 +123,8 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
         faults += outside_range(parameters)
         faults += _parameter_faults(parameters, whole, rotors, speeds)
     differences = () if run is None else tuple(_differences_from(run, whole, rotors))
-    if differences and EFFECTIVE in model.root.source.raw:
-        differences = (f"These are {EFFECTIVE}: they differ on purpose.", *differences)
+    if differences and MARK in model.root.source.raw:
+        differences = (f"These are {MARK}: they differ on purpose.", *differences)
     return Audit(path, whole.mass, tuple(dict.fromkeys(faults)), differences, tuple(model.included))
 
 
@@ -173,7 +173,7 @@ def _inertia_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
 
 def _rotor_faults(rotors: list[Rotor], model: Model) -> Iterator[str]:
     """Yield faults of motors, and differences between them."""
-    has_effective = EFFECTIVE in model.root.source.raw
+    has_effective = MARK in model.root.source.raw
     for rotor in rotors:
         where, given = f"rotor {rotor.number}", rotor.numbers
         for tag in REQUIRED_TAGS:

@@ -39,6 +39,8 @@ from tuner.search.problem import Job, job_of
 from tuner.search.progress import Fitted, Progress, plain_criterion
 from tuner.vehicle import (
     COEFFICIENTS,
+    REGISTRY,
+    Coefficient,
     ControllerFile,
     NotCarried,
     VehicleFile,
@@ -432,3 +434,42 @@ def cached_effective(run: Run, simulator: Simulator) -> Effective | None:
         write_vehicle(found.vehicle, vehicle_file, header=f"Effective in {simulator.title}.")
     Kept(of=key, effective=None if found is None else found.result).write(run.folder)
     return found
+
+
+MARK = "effective coefficients, not physical ones"
+"""The mark of an export whose numbers make up for what its simulator lacks."""
+
+
+def exported_numbers(effective: EffectiveResult, simulator: str) -> str:
+    """Return a clause on the effective coefficients of an export."""
+    lost = listed([term.group for term in effective.lost])
+    return (
+        f"{MARK}: {simulator} lacks {lost}, and misses the "
+        f"flights by {effective.rmse_effective.words} where all terms miss them by "
+        f"{effective.rmse_physical.words}"
+    )
+
+
+def lost_groups(
+    effective: EffectiveResult,
+    entry: Callable[[Coefficient], Written | NotCarried | None],
+    deviations: Sequence[str],
+) -> tuple[str, ...]:
+    """Return a clause on each missing group: the reason, and the RMSE without it.
+
+    ``deviations`` are the simulator's differences that have no coefficient.
+    """
+    clauses = []
+    for term in effective.lost:
+        rmse = term.rmse_without.words
+        if not term.names:
+            clauses.append(
+                f"the simulator computes otherwise: {'; '.join(deviations)}; that alone misses the "
+                f"flights by {rmse}"
+            )
+        elif isinstance(held := entry(REGISTRY[term.names[0]]), NotCarried):
+            clauses.append(
+                f"{term.group} is not exported: {held.reason}; without it alone the flights are "
+                f"missed by {rmse}"
+            )
+    return tuple(clauses)

@@ -16,7 +16,13 @@ from tuner.core.disk import check_file, exists, file_name, inside
 from tuner.core.errors import ExportError, InputError
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse
 from tuner.exporters.draws import draws_of, write_draws
-from tuner.exporters.effective import Effective, cached_effective, refly
+from tuner.exporters.effective import (
+    Effective,
+    cached_effective,
+    exported_numbers,
+    lost_groups,
+    refly,
+)
 from tuner.exporters.simulators import GAZEBO_CLASSIC, hover_command, thrust_to_weight
 from tuner.exporters.target import (
     Draft,
@@ -28,7 +34,6 @@ from tuner.exporters.target import (
     write,
 )
 from tuner.options import ExportOptions
-from tuner.report.result_texts import exported_numbers, lost_groups
 from tuner.result import (
     EXPORTS,
     OF_A_RUN,

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from tuner.core.phrases import as_sentence, listed, listed_within
+from tuner.core.phrases import as_sentence, listed, listed_within, metres
 from tuner.findings.findings import Code, Finding, remedy, sentence
 from tuner.ground.measurement import BenchRecord, bench_in_words
-from tuner.report.result_texts import metres, simulator_lacks
+from tuner.report.result_texts import simulator_lacks
 from tuner.report.section import Cell, Table
 from tuner.result import ExportRecord, FlightResult, RunResult
 from tuner.uncertainty.records import Knowledge

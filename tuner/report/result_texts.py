@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from math import sqrt
 from pathlib import Path
 
 from tuner.core.errors import InputError
 from tuner.core.phrases import listed, percent
 from tuner.evaluate.records import RMSE_UNITS
-from tuner.result import EffectiveResult, Ending, FlightResult, PoseRmse, RunResult
+from tuner.result import EffectiveResult, Ending, FlightResult, RunResult
 from tuner.uncertainty.records import Calibration
-from tuner.vehicle import REGISTRY, Coefficient, NotCarried, Written
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 MIN_NEARLY_KEPT_GAIN = 0.01
@@ -81,9 +80,9 @@ def effective_in_words(effective: EffectiveResult) -> str:
     lost = listed([term.group for term in effective.lost])
     text = (
         f"Gazebo cannot fly {lost}. With its effective coefficients it misses the flights by "
-        f"{rmse_in_words(effective.rmse_effective)}, the physical model by "
-        f"{rmse_in_words(effective.rmse_physical)}; with the physical coefficients and without "
-        f"these terms it would be {rmse_in_words(effective.rmse_unfitted)}."
+        f"{effective.rmse_effective.words}, the physical model by "
+        f"{effective.rmse_physical.words}; with the physical coefficients and without "
+        f"these terms it would be {effective.rmse_unfitted.words}."
     )
     if effective.carried:
         text += f" Gazebo has a place for {listed(effective.carried)}."
@@ -94,63 +93,8 @@ def simulator_lacks(effective: EffectiveResult) -> str:
     """Return a sentence on the terms that Gazebo lacks, and its RMSE."""
     return (
         f"Gazebo lacks {listed([term.group for term in effective.lost])}, and with effective "
-        f"coefficients misses them by {rmse_in_words(effective.rmse_effective)}."
+        f"coefficients misses them by {effective.rmse_effective.words}."
     )
-
-
-def rmse_in_words(rmse: PoseRmse) -> str:
-    """Return an RMSE with readable units, without that of an attitude as input."""
-    if rmse.position is None:
-        return "a crash"
-    if rmse.attitude is None:
-        return metres(rmse.position)
-    return f"{metres(rmse.position)} and {rmse.attitude:.2g}°"
-
-
-def metres(value: float) -> str:
-    """Return a length in m, cm or mm."""
-    if value >= 1.0:
-        return f"{value:.3g} m"
-    return f"{100 * value:.2g} cm" if value >= 0.01 else f"{1000 * value:.2g} mm"
-
-
-EFFECTIVE = "effective coefficients, not physical ones"
-"""The mark of an export whose numbers make up for what its simulator lacks."""
-
-
-def exported_numbers(effective: EffectiveResult, simulator: str) -> str:
-    """Return a clause on the effective coefficients of an export."""
-    lost = listed([term.group for term in effective.lost])
-    return (
-        f"{EFFECTIVE}: {simulator} lacks {lost}, and misses the "
-        f"flights by {rmse_in_words(effective.rmse_effective)} where all terms miss them by "
-        f"{rmse_in_words(effective.rmse_physical)}"
-    )
-
-
-def lost_groups(
-    effective: EffectiveResult,
-    entry: Callable[[Coefficient], Written | NotCarried | None],
-    deviations: Sequence[str],
-) -> tuple[str, ...]:
-    """Return a clause on each missing group: the reason, and the RMSE without it.
-
-    ``deviations`` are the simulator's differences that have no coefficient.
-    """
-    clauses = []
-    for term in effective.lost:
-        rmse = rmse_in_words(term.rmse_without)
-        if not term.names:
-            clauses.append(
-                f"the simulator computes otherwise: {'; '.join(deviations)}; that alone misses the "
-                f"flights by {rmse}"
-            )
-        elif isinstance(held := entry(REGISTRY[term.names[0]]), NotCarried):
-            clauses.append(
-                f"{term.group} is not exported: {held.reason}; without it alone the flights are "
-                f"missed by {rmse}"
-            )
-    return tuple(clauses)
 
 
 _REASONS = {

@@ -10,9 +10,9 @@ from tests.tuner.exporters.conftest import MODELS
 from tuner.cli import main
 from tuner.core.errors import ExportError
 from tuner.exporters.audit import audit
+from tuner.exporters.effective import MARK
 from tuner.exporters.simulators import GZ_SIM
 from tuner.exporters.targets.px4 import parameters, parameters_text
-from tuner.report.result_texts import EFFECTIVE
 
 CLASSIC, GZ = MODELS / "quad_x.sdf", MODELS / "quad_x_gz.sdf"
 SHIPPED = Path(__file__).resolve().parents[4] / "shared" / "models"
@@ -93,10 +93,10 @@ def test_effective_coefficients_of_an_export_are_no_fault(make_run, tmp_path):
     model, quick = tmp_path / "m.sdf", CLASSIC.read_text().replace("Up>0.0125<", "Up>0.001<")
     model.write_text(quick)
     assert "timeConstantUp 0.001 s is no motor's" in audit(model).faults[0]
-    model.write_text(quick.replace("<link", f"<!-- {EFFECTIVE} --><link", 1))
+    model.write_text(quick.replace("<link", f"<!-- {MARK} --><link", 1))
     found = audit(model, run=make_run())
     assert found.faults == ()
-    assert found.differences[0] == f"These are {EFFECTIVE}: they differ on purpose."
+    assert found.differences[0] == f"These are {MARK}: they differ on purpose."
 
 
 def test_what_is_included_from_elsewhere_is_named(tmp_path, capsys):

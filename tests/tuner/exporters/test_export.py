@@ -10,7 +10,7 @@ from tuner.config import ExportSettings
 from tuner.core import shipped
 from tuner.core.errors import ExportError, InputError, OutputError
 from tuner.exporters import export as exporting
-from tuner.exporters.effective import Effective
+from tuner.exporters.effective import Effective, lost_groups
 from tuner.exporters.export import (
     RUN_CONDITIONS,
     check,
@@ -23,7 +23,7 @@ from tuner.exporters.target import Draft, write
 from tuner.options import ExportOptions
 from tuner.report.result_texts import export_sentence
 from tuner.result import EffectiveResult, LostTerm, PoseRmse
-from tuner.vehicle import read_vehicle
+from tuner.vehicle import Written, read_vehicle
 
 TODAY = date(2024, 5, 6)
 
@@ -383,3 +383,7 @@ def test_effective_coefficients_of_other_flights_are_no_fault_of_ours(make_run):
     edited = EFFECTIVE.model_copy(update={"flights": {"circle": rmse(0.005)}})
     with pytest.raises(ExportError, match="no flight 'held'; was it edited"):
         exported(make_run(**DRAGGY, effective=edited), "sdf")
+
+
+def test_what_a_target_holds_is_not_lost_there():
+    assert lost_groups(EFFECTIVE, lambda _: Written("a tag"), ()) == ()

@@ -8,14 +8,11 @@ from tuner.report.result_texts import (
     calibration_in_words,
     effective_in_words,
     gain_in_words,
-    lost_groups,
     reason_in_words,
-    rmse_in_words,
     selection_in_words,
 )
 from tuner.result import PoseRmse
 from tuner.uncertainty.records import COVERAGE_LEVELS, Calibration, CoverageRecord, calibration
-from tuner.vehicle import Written
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 
@@ -30,13 +27,9 @@ def test_the_second_answer_is_said_with_what_it_costs():
 
 
 def test_a_crash_and_a_metre_are_said_as_such():
-    assert rmse_in_words(PoseRmse(position=None, attitude=None)) == "a crash"
-    assert rmse_in_words(PoseRmse(position=2.345, attitude=12.0)) == "2.35 m and 12°"
-    assert rmse_in_words(PoseRmse(position=2.345, attitude=None)) == "2.35 m"  # it is followed
-
-
-def test_what_a_target_holds_is_not_lost_there():
-    assert lost_groups(EFFECTIVE, lambda _: Written("a tag"), ()) == ()
+    assert PoseRmse(position=None, attitude=None).words == "a crash"
+    assert PoseRmse(position=2.345, attitude=12.0).words == "2.35 m and 12°"
+    assert PoseRmse(position=2.345, attitude=None).words == "2.35 m"  # it is followed
 
 
 def row(code, *, kept=False):

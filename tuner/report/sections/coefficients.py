@@ -22,7 +22,6 @@ from tuner.report.result_texts import (
     calibration_in_words,
     effective_in_words,
     refits_in_words,
-    rmse_in_words,
 )
 from tuner.report.section import (
     FITTED,
@@ -292,7 +291,7 @@ def effective(result: RunResult) -> Section | None:
         if name in physical and value != physical[name]
     ]
     lost = [
-        (Cell(term.group, small=", ".join(term.names)), rmse_in_words(term.rmse_without))
+        (Cell(term.group, small=", ".join(term.names)), term.rmse_without.words)
         for term in found.lost
     ]
     columns = ("coefficient", "physical", "in Gazebo", "unit", "change")
