@@ -134,10 +134,13 @@ def fly(
     """
     moves = differentiated or tangents is not None
     if conditions or {*model.vehicle.effects, *coefficients}.intersection(EFFECTS):
-        model, conditions = _with_all_terms(model, segments, conditions)
+        model, segments, conditions = _with_all_terms(model, segments, conditions)
         if not moves and segments.disturbance is None:
             zero = Vec3(*np.zeros((3, 1, segments.count)))
             segments = replace(segments, disturbance=Disturbance(moment=zero, rate=TORQUE_RATE_HZ))
+    else:  # nothing reads the voltage: recordings with and without it share a program
+        model = replace(model, reference_voltage=None)
+        segments = replace(segments, log_voltage=None)
     names = tuple(segments.measured) if channels is None else channels
     # in one order, for it tells programs apart
     logged = tuple(sorted({*LOGGED, *names}))
@@ -192,16 +195,17 @@ def fly(
 
 def _with_all_terms(
     model: Model, segments: Segments, conditions: Mapping[str, Any]
-) -> tuple[Model, dict[str, Any]]:
-    """Return model and conditions with all terms and conditions, at neutral values.
+) -> tuple[Model, Segments, dict[str, Any]]:
+    """Return model, segments and conditions with all terms and conditions, at neutral values.
 
-    So two programs serve all vehicles: one of the base model, and one of any terms beyond it.
+    So two programs serve all vehicles: one of the base model, and one of any terms beyond it,
+    whether or not the battery's voltage was recorded.
     """
-    around = ["wind_x", "wind_y"]
-    if segments.log_voltage is None:
-        around.append("battery_decline")
-    calm = dict.fromkeys(around, np.zeros(segments.count))
-    return with_terms_computed(model, TERMS), {**calm, **conditions}
+    calm = dict.fromkeys(("wind_x", "wind_y", "battery_decline"), np.zeros(segments.count))
+    if segments.log_voltage is None or model.reference_voltage is None:
+        model = replace(model, reference_voltage=np.asarray(1.0))
+        segments = replace(segments, log_voltage=np.full((1, segments.count), np.nan))
+    return with_terms_computed(model, TERMS), segments, {**calm, **conditions}
 
 
 def flown_part(segments: Segments) -> Segments:

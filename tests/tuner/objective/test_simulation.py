@@ -388,6 +388,27 @@ def test_a_predicted_torque_is_no_program_of_its_own():
     assert built[0] == built[1]
 
 
+@pytest.mark.parametrize("exponent", [None, 0.8])
+def test_a_battery_that_was_recorded_is_no_program_of_its_own(exponent):
+    """It turns the rotors of a vehicle with an exponent, where its reference is known, too."""
+    fit = problem(("inertia_xx",))
+    read = replace(fit.segments, log_voltage=np.full((9, fit.segments.count), np.log(15.0)))
+    known = replace(fit.model, reference_voltage=np.asarray(16.0))
+    built, speeds = [], []
+    for model, segments in ((fit.model, fit.segments), (fit.model, read), (known, read)):
+        flown = simulation.fly(
+            *(model, segments, fit.schedule),
+            samples=8,
+            limits=fit.limits,
+            coefficients={} if exponent is None else {"battery_exponent": exponent},
+        )
+        built.append(_program_of.cache_info().misses)
+        speeds.append(flown.channels["rotor_speed"])
+    assert built[0] == built[1] == built[2]
+    np.testing.assert_array_equal(speeds[0], speeds[1])
+    assert np.array_equal(speeds[0], speeds[2]) == (exponent is None)
+
+
 def test_programs_of_flights_are_kept_for_other_processes():
     assert digest_of((simulation._flight, terms.TERMS), simulation.CODE)
 
