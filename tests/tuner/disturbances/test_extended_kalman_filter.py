@@ -135,7 +135,8 @@ def test_innovations_are_those_of_a_filter_in_matrices() -> None:
     def errors(change, state, number):
         read = jax.tree.map(lambda leaf: leaf[number], one.samples)
         now = observer.outputs(observer.corrected(state, change, number, in_flight), number)
-        return jnp.concatenate(observer.errors(now, now, read)), observer.sampled(read)
+        found = jnp.concatenate(observer.errors(now, now, read))
+        return found, (found, observer.sampled(read))
 
     def later(change, state, pushed, number, draught):
         moved = observer.corrected(state, change[:-PROCESSES], number, in_flight)
@@ -144,14 +145,14 @@ def test_innovations_are_those_of_a_filter_in_matrices() -> None:
         numbers = observer.numbers(after, number + 1, in_flight)
         return jnp.concatenate([numbers, kept]), after
 
-    told_by = jax.jit(lambda *args: (*errors(*args), jax.jacfwd(errors, has_aux=True)(*args)[0]))
+    told_by = jax.jit(jax.jacfwd(errors, has_aux=True))
     moved_by = jax.jit(jax.jacfwd(later, has_aux=True))
     processes, pushed = observer.processes, jnp.zeros(PROCESSES)
     sd = np.concatenate([first_errors(state, in_flight), processes.sd])
     covariance, fresh = np.diag(sd**2), np.diag([*np.zeros(size - PROCESSES), *processes.added])
     gust = size - PROCESSES + SLOW.index("gust_z")
     for number in range(TICKS):
-        error, sampled, slopes = map(
+        slopes, (error, sampled) = jax.tree.map(
             np.asarray, told_by(jnp.zeros(size - PROCESSES), state, jnp.asarray(number))
         )
         along = np.hstack([slopes, np.zeros((len(slopes), PROCESSES))])[sampled]
