@@ -46,7 +46,7 @@ from tuner.recordings.flight import Series
 from tuner.search.job_flights import predicts_turning, read_recordings, regressors
 from tuner.search.problem import job_of
 
-SECONDS = 7.0
+SECONDS = 5.0
 TILTING = ("inertia_xx", "inertia_yy")
 
 
