@@ -58,7 +58,12 @@ def references() -> ReferenceInlet:
     z = np.stack([1.0 + run_stages * 0.4 * np.sin(2.7 * time), still + 1.0], axis=-1)
     nothing = Vec3.zeros(jnp.asarray(x))
     point = ReferencePoint(Vec3(jnp.asarray(x), jnp.asarray(y), jnp.asarray(z)), nothing, nothing)
-    return ReferenceInlet(point, spins=jnp.asarray([False, True]), yaw_rate=jnp.asarray([0.0, 2.0]))
+    return ReferenceInlet(
+        point,
+        spins=jnp.asarray([False, True]),
+        yaw_rate=jnp.asarray([0.0, 2.0]),
+        level_held=jnp.asarray([False, False]),
+    )
 
 
 def problem(

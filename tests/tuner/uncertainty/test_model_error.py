@@ -24,6 +24,7 @@ from tuner.equation_error.omitted_laws import _likeliest
 from tuner.equation_error.rate_controller import ControllerEstimate
 from tuner.findings.findings import Code
 from tuner.objective.criterion import Point
+from tuner.objective.initial_conditions import SPIN_ROWS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.simulation import SETPOINTS
@@ -88,7 +89,7 @@ def problem(
     controller = controller.replace(sensing=sensing)
     space = space_of(vehicle, controller, JobFile(free=free))
     model = model_of(vehicle, controller)
-    schedule = schedule_of(controller, log_rate=RATE)
+    schedule = schedule_of(controller)
     resting_parameters = Vec3(jnp.zeros(FLIGHTS), jnp.zeros(FLIGHTS), jnp.ones(FLIGHTS))
     start = jax.tree.map(
         lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (FLIGHTS,)),
@@ -106,26 +107,30 @@ def problem(
             spins=[1.0 if rotor.spin == "ccw" else -1.0 for rotor in vehicle.rotors],
             moment_constant=vehicle.aerodynamics.moment_constant,
         )
-    samples = round(SECONDS * RATE)
-    segments = Segments(references(), start, {}, jnp.arange(FLIGHTS), disturbance=pushing)
+    samples = round(SECONDS * schedule.log_rate)
+    segments = Segments(
+        references(), start, {}, jnp.arange(FLIGHTS), disturbance=pushing, free_rows=SPIN_ROWS
+    )
     return Objective(model, segments, space, schedule, samples, AIRBORNE)
 
 
 def flown(
     truth: Objective, seed: int, *, loop: bool = False
 ) -> tuple[dict[str, Measured], list[Flight]]:
-    """Return what is measured of flights of a truth, at every sample, and the recordings.
+    """Return what is measured of flights of a truth, at `RATE`, and the recordings.
 
     ``loop``: whether those hold commands and set-points, too.
     """
-    random, time = np.random.default_rng(seed), np.arange(truth.samples) / RATE
+    random, time = np.random.default_rng(seed), np.arange(round(SECONDS * RATE)) / RATE
     within = ("command", SETPOINTS) if loop else ()
     channels = {
         name: Measured(jnp.zeros((1, FLIGHTS)), jnp.zeros((1, 3, FLIGHTS)), None)
         for name in (*NOISE, *within)
     }
     segments = replace(truth.segments, measured=channels)
-    trace = making.fly_at(replace(truth, segments=segments), making.truth(truth))
+    every = round(truth.schedule.log_rate) // RATE
+    flight = making.fly_at(replace(truth, segments=segments), making.truth(truth))
+    trace = {name: rows[::every] for name, rows in flight.items()}
     measured, recorded = {}, [dict[str, Series]() for _ in range(FLIGHTS)]
     for name, sigma in NOISE.items():
         values = np.array(trace[name])
@@ -312,7 +317,7 @@ def test_commands_that_were_recorded_between_two_ticks_are_those_that_hold():
     measured, flights = flown(problem({}), 0, loop=True)
     for series in (flight.series for flight in flights):
         command = series["command"]
-        series["command"] = Series(command.time + 0.5 / RATE, command.values)
+        series["command"] = Series(command.time + 0.5 / making.PHYSICS, command.values)
     objective = problem({})
     objective = replace(objective, segments=replace(objective.segments, measured=measured))
     assert model_errors_of(making.fitted_of(objective, making.truth(objective)), flights) is None
