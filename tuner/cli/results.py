@@ -53,7 +53,7 @@ def console(width: int = CONSOLE_WIDTH) -> Console:
     """Return a console of at least so many columns, so that no number is cut."""
     fitting = _Screen(highlight=False, markup=False)
     columns = max(fitting.width, width) if fitting.is_terminal else PIPE_WIDTH
-    return _Screen(highlight=False, markup=False, width=columns)
+    return _Screen(highlight=False, markup=False, width=columns, height=fitting.height)
 
 
 def line_width(screen: Console) -> int:
