@@ -220,7 +220,7 @@ class Predictor:
         together, found = max(SEGMENTS_AT_ONCE // times, 1), []
         for first in range(0, count, together):
             segments = np.arange(first, min(first + together, count)).repeat(times)
-            tiled = jax.tree.map(lambda rows, those=segments: rows[..., those], inputs)
+            tiled = jax.tree.map(lambda rows, those=segments: np.asarray(rows)[..., those], inputs)
             of_segments = np.tile(strengths, len(segments) // times)
             assumed = self._assumed(objective, point, of_segments)
             found.append(filtered(self.schedule, tiled, assumed, gains=False, latency=self.latency))
