@@ -22,9 +22,9 @@ from tuner.core.runtime import collect_rarely, set_environment
 def __getattr__(name: str) -> Any:
     if name != "checked":
         raise AttributeError(name)
-    from beartype import BeartypeConf, beartype  # noqa: PLC0415 (tests' child processes need none)
+    from tests.annotations import checked  # noqa: PLC0415 (tests' child processes need none)
 
-    return beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int passes for a float
+    return checked
 
 
 if not os.environ.get("TUNE_TESTS_OPTIMISED"):

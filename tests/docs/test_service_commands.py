@@ -23,7 +23,7 @@ pytest.importorskip("fastapi", reason="needs the extra 'service'")
 import httpx
 
 from tests.docs.pages import ROOT, WITH_COMMANDS, Family, commands, expanded, name_of
-from tests.test_deploy import instruction, started_by_the_unit
+from tests.project.test_deploy import instruction, started_by_the_unit
 from tests.tuner.service.conftest import FAKE_WORKER, LIMITS, listening, submit, upload
 from tuner.cli import main
 from tuner.service import dispatcher

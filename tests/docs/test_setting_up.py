@@ -54,7 +54,7 @@ SHOWN = list(
     dict.fromkeys(line for page in WITH_COMMANDS for line in commands(page, Family.SET_UP))
 )
 INSTALL = commands(DOCS / "tutorials" / "install.md", Family.SET_UP)
-"""`tests.test_release` follows this page, in an environment of its own."""
+"""`tests.project.test_release` follows this page, in an environment of its own."""
 AT_LENGTH = "python -m benchmarks.targets RUN"
 """What fits effective coefficients for each simulator, as `tests/tuner/exporters` does for some."""
 RUN = [
