@@ -14,7 +14,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 from llvmlite import ir
 
-from lanes.dependence import dependent, dependent_in_scan, dependent_in_while
+from lanes.dependence import dependent, dependent_in_scan, dependent_in_while, parts_of_scan
 from lanes.lowering import CONTROL, I64, MAX_CARRIED_IN_REGISTERS, Lowering, dtype_of, shape_of
 from lanes.rules import constant, is_bool, type_of
 from lanes.values import (
@@ -154,8 +154,7 @@ def _laid_before(lower: Lowering, value: Value, *, indexed: bool) -> Value:
 
 def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -> list[Value]:
     p, b = eqn.params, lower.b
-    consts, carried, length = p["num_consts"], p["num_carry"], p["length"]
-    body = p["jaxpr"]
+    (consts, carried), length, body = parts_of_scan(eqn), p["length"], p["jaxpr"]
     once = length == 1
     if not once:
         operands = lower.with_tangents_in_memory(operands, consts)
@@ -163,7 +162,7 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     fixed = [_laid_before(lower, v, indexed=False) for v in operands[:consts]]
     rows = [_laid_before(lower, v, indexed=not once) for v in operands[consts + carried :]]
     given = [*fixed, *operands[consts : consts + carried], *rows]
-    kinds = dependent_in_scan(p, [*map(kind_of, given)])
+    kinds = dependent_in_scan(eqn, [*map(kind_of, given)])
     into = [
         bound[var] if var in bound else lower.local(shape_of(var), type_of(dtype_of(var)), kind)
         for var, kind in zip(eqn.outvars[carried:], kinds[carried:], strict=True)

@@ -7,7 +7,7 @@ from functools import reduce
 from operator import or_
 from typing import Any
 
-from jax.extend.core import Jaxpr, Literal
+from jax.extend.core import Jaxpr, JaxprEqn, Literal
 
 CALLS = frozenset(
     {
@@ -51,7 +51,7 @@ def dependent(jaxpr: Jaxpr, flags: Sequence[int]) -> list[int]:
             for branch in eqn.params["branches"]:
                 outs = list(map(or_, outs, dependent(branch.jaxpr, ins[1:])))
         elif name == "scan":
-            outs = dependent_in_scan(eqn.params, ins)
+            outs = dependent_in_scan(eqn, ins)
         elif name == "while":
             outs = dependent_in_while(eqn.params, ins)
         elif name in CALLS:
@@ -62,9 +62,24 @@ def dependent(jaxpr: Jaxpr, flags: Sequence[int]) -> list[int]:
     return [0 if isinstance(v, Literal) else known.get(v, 0) for v in jaxpr.outvars]
 
 
-def dependent_in_scan(params: Any, flags: Sequence[int]) -> list[int]:
+def parts_of_scan(eqn: JaxprEqn) -> tuple[int, int]:
+    """Return how many operands of a scan are constants, and how many values it carries.
+
+    Told by the axis that only what goes by turns has outside of the body: releases of jax name
+    these numbers differently.
+    """
+    body = eqn.params["jaxpr"].jaxpr
+
+    def by_turns(outside: Sequence[Any], inside: Sequence[Any]) -> int:
+        return sum(o.aval.ndim > i.aval.ndim for o, i in zip(outside, inside, strict=True))
+
+    carried = len(eqn.outvars) - by_turns(eqn.outvars, body.outvars)
+    return len(eqn.invars) - by_turns(eqn.invars, body.invars) - carried, carried
+
+
+def dependent_in_scan(eqn: JaxprEqn, flags: Sequence[int]) -> list[int]:
     """Return for each output of a scan, carry first, whether it depends on a flagged operand."""
-    body, consts, carried = params["jaxpr"].jaxpr, params["num_consts"], params["num_carry"]
+    body, (consts, carried) = eqn.params["jaxpr"].jaxpr, parts_of_scan(eqn)
     now = list(flags)
     while True:
         outs = dependent(body, now)

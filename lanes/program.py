@@ -305,7 +305,7 @@ class Program:
         _, (shapes, _), stand_ins = self._traced
 
         def laid(leaf: Any, shape: Any) -> NDArray[Any]:
-            return np.moveaxis(leaf, 0, 1 if is_laid_by_loop(shape, stand_ins) else -1)
+            return np.moveaxis(np.asarray(leaf), 0, 1 if is_laid_by_loop(shape, stand_ins) else -1)
 
         return Run(jax.tree.map(np.asarray, found), jax.tree.map(laid, columns, shapes))
 

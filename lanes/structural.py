@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import reduce
 from math import prod
 
@@ -91,6 +91,18 @@ def _slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
         return lower.at(value, moved)
 
     return lower.deferred(shape_of(eqn.outvars[0]), at, (value,))
+
+
+def _unstack(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> list[Value]:
+    (value,), axis = operands, eqn.params["axis"]
+
+    def at(number: int) -> Callable[[Index], Element]:
+        return lambda index: lower.at(value, [*index[:axis], constant(I64, number), *index[axis:]])
+
+    return [
+        lower.deferred(shape_of(out), at(number), (value,))
+        for number, out in enumerate(eqn.outvars)
+    ]
 
 
 def _pad(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
@@ -221,6 +233,7 @@ STRUCTURAL.update(
                 axis=eqn.params["axis"],
             )
         ),
+        "unstack": _unstack,
         "rev": lambda lower, eqn, operands: np.flip(
             lower.elements(operands[0]), eqn.params["dimensions"]
         ),

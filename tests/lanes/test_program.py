@@ -85,6 +85,7 @@ def test_one_program_serves_every_length_and_every_number_of_lanes(program, coun
     got = program(values, tangents, lanes=count, turns=turns)
     assert all(leaf.ctypes.data % LINE_BYTES == 0 for leaf in jax.tree.leaves(got.values))
     want = program.by_xla(values, tangents, turns=turns)
+    assert all(type(leaf) is np.ndarray for leaf in jax.tree.leaves((want.values, want.columns)))
     for mine, theirs in zip(flat(got), flat(want), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13)
 

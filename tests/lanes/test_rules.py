@@ -186,6 +186,7 @@ ARRAYS = {
     "transpose": lambda x: x.reshape(2, 3).T,
     "concatenate": lambda x: jnp.concatenate([x[2:], x[:2]]),
     "stack": lambda x: jnp.stack([x, 2.0 * x], axis=1),
+    "unstack": lambda x: jnp.unstack(x.reshape(2, 3), axis=1)[1],
     "slice": lambda x: x[1:6:2],
     "split": lambda x: jnp.split(x, [2, 5])[1],
     "reverse": lambda x: x[::-1],
@@ -212,6 +213,7 @@ def test_long_arrays_are_joined_and_cut_without_being_laid_out():
     read = {
         "row": lambda x, number: lax.dynamic_index_in_dim(long(x), number, 0),
         "cut": lambda x, _: long(x)[299:302],
+        "column": lambda x, n: lax.dynamic_index_in_dim(jnp.unstack(long(x), axis=1)[2], n, 0),
     }
     agree(read, RANDOM.normal(size=(3, 9)), numbers)
 

@@ -86,7 +86,7 @@ COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 """The event of `jax.monitoring` at the end of compiling, or of reading compiled code."""
 
 #: Releases of jaxlib (major.minor) known to accept the flags below: an unknown one is fatal.
-_RELEASES_KNOWN = ("0.10",)
+RELEASES_KNOWN = ("0.10", "0.11", "0.12")
 _LARGER_THAN_ANY_LOOP = 10**15
 """bytes"""
 _FLAGS = {
@@ -118,6 +118,11 @@ def cores() -> int:
         return os.cpu_count() or 1
 
 
+def release_of(distribution: str) -> str:
+    """Return the installed release of a distribution, as ``0.10``."""
+    return ".".join(version(distribution).split(".")[:2])
+
+
 def set_environment() -> None:
     """Set what jax and NumPy read from the environment when they are imported."""
     os.environ.setdefault("NPROC", "1")
@@ -127,7 +132,7 @@ def set_environment() -> None:
         os.environ.setdefault(name, "1")
     # Loading its own compiled code, XLA complains of pseudo-features that no processor reports.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    if version("jaxlib").rpartition(".")[0] not in _RELEASES_KNOWN:
+    if release_of("jaxlib") not in RELEASES_KNOWN:
         return
     given = os.environ.get("XLA_FLAGS", "")
     names = {flag.partition("=")[0] for flag in given.split()}

@@ -2,6 +2,7 @@ import gc
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -89,6 +90,22 @@ def test_what_the_user_has_set_stays(tmp_path: Path) -> None:
     assert report["dtype"] == "float32"
     assert report["nproc"] == "2"
     assert report["cache"] == str(tmp_path / "elsewhere")
+
+
+def test_releases_of_jax_that_may_be_installed_are_those_whose_flags_are_known() -> None:
+    text = (Path(runtime.__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8")
+    (bounds,) = re.findall(r'"jax>=0\.(\d+),.*<0\.(\d+)"', text)
+    assert [f"0.{n}" for n in range(*map(int, bounds))] == list(runtime.RELEASES_KNOWN)
+
+
+def test_an_unknown_release_gets_no_flags(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    for release, known in {"0.10.1": True, "0.12.0.1": True, "0.99.0": False}.items():
+        monkeypatch.setattr(runtime, "version", lambda _, release=release: release)
+        monkeypatch.setattr(os, "environ", dict(os.environ))
+        runtime.set_environment()
+        assert ("XLA_FLAGS" in os.environ) == known
+        os.environ.pop("XLA_FLAGS", None)
 
 
 def test_a_program_that_has_already_computed_goes_on(tmp_path: Path) -> None:
