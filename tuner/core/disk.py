@@ -97,8 +97,8 @@ def write_text(path: Path, text: str) -> None:
 def whole_file(path: Path) -> Iterator[Path]:
     """Give the path of an unfinished file beside ``path`` that takes its place in the end.
 
-    Its folder is made where there is none. If anything fails before, what stood at ``path`` stays
-    as it was and nothing is left beside it.
+    A link stays one: what it leads to is written. Its folder is made where there is none. If
+    anything fails before, what stood at ``path`` stays as it was and nothing is left beside it.
 
     Raises
     ------
@@ -106,6 +106,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         The system refuses to write there.
     """
     with _refusals(path):
+        path = Path(os.path.realpath(path))
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
         mode = path.stat().st_mode & 0o777 if path.is_file() else None

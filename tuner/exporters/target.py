@@ -153,7 +153,7 @@ def write(draft: Draft, path: Path, others: Mapping[Path, Path] | None = None) -
     with ExitStack() as stack:
 
         def written(place: Path, text: str) -> Path:
-            unfinished = stack.enter_context(whole_file(place.resolve()))  # a link stays one
+            unfinished = stack.enter_context(whole_file(place))
             unfinished.write_text(text, encoding="utf-8", newline="")
             return unfinished
 

@@ -66,6 +66,18 @@ def test_an_interruption_leaves_what_stood_there(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["x.csv"]
 
 
+def test_a_link_stays_one_and_what_it_leads_to_is_written(tmp_path):
+    there, link, dangling = tmp_path / "disk" / "x.csv", tmp_path / "x.csv", tmp_path / "y.csv"
+    write_text(there, "before")
+    link.symlink_to(there)
+    dangling.symlink_to("disk/y.csv")
+    for path in (link, dangling):
+        write_text(path, "after")
+        assert path.is_symlink()
+        assert (there.parent / path.name).read_text() == "after"
+    assert len(list(tmp_path.iterdir())) == 3
+
+
 def test_a_refusal_that_nobody_foresaw_is_reported_with_its_own_words(tmp_path):
     error = OSError(errno.EIO, os.strerror(errno.EIO))
     with pytest.raises(OutputError, match="Input/output error"), whole_file(tmp_path / "x"):
