@@ -12,7 +12,7 @@ from rich.segment import Segment
 from rich.table import Table as DrawnTable
 from rich.text import Text
 
-from tuner.core.phrases import listed_within, printable, shorten
+from tuner.core.phrases import listed_within, percent, printable, shorten
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.recordings.notes import damage_sentence, note_in_words
 from tuner.report.section import Cell, Table
@@ -127,7 +127,7 @@ def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
     from tuner.vehicle import COEFFICIENTS
 
     rows = [
-        (name, f"{of.value:.4g}", f"{of.error:.0%}", COEFFICIENTS[name].unit, of.source)
+        (name, f"{of.value:.4g}", percent(of.error), COEFFICIENTS[name].unit, of.source)
         for name, of in estimates.items()
     ]
     columns = ("coefficient", "value", "±", "unit", "source")

@@ -12,7 +12,7 @@ from pydantic import JsonValue, model_validator
 
 from tuner.core.disk import write_text
 from tuner.core.files import Part, ResultFile, csv_text
-from tuner.core.phrases import listed
+from tuner.core.phrases import listed, percent
 from tuner.core.yaml_section import refuse
 
 NEXT_FLIGHT_TABLE = "next_flight.csv"
@@ -153,29 +153,22 @@ def proposals_in_words(proposals: Proposals) -> list[str]:
     if not_narrowed:
         sentences.append(
             f"No single flight in this arena would narrow the interval of {listed(not_narrowed)} "
-            f"by more than {1 - MAX_WORTHWHILE_SHARE:.0%}."
+            f"by more than {percent(1 - MAX_WORTHWHILE_SHARE)}."
         )
     return sentences
 
 
 def effects_in_words(shares: Sequence[tuple[float, str]]) -> str:
-    """Return the effects on intervals, those that are narrowed the most first."""
-    narrowed = [f"{of} to {share:.0%}" for share, of in shares if of and share < HALVED_RANGE[0]]
-    first = [f"narrow the interval of {listed(narrowed)} of what it is"] if narrowed else []
-    return listed([*first, *(effect_in_words(*each) for each in shares[len(narrowed) :])])
-
-
-def effect_in_words(share: float, label: str) -> str:
-    """Return the effect on an interval that keeps a share of its width, in words.
-
-    ``label`` names the coefficient; empty stands for all.
-    """
-    of = f"the interval of {label}" if label else "every interval"
-    if HALVED_RANGE[0] <= share <= HALVED_RANGE[1]:
-        return f"halve {of}"
-    if share < HALVED_RANGE[0]:
-        return f"narrow {of} to {share:.0%} of what it is"
-    return f"narrow {of} by {1 - share:.0%}"
+    """Return the effects on intervals that keep a share of their width, least shares first."""
+    narrowed = [f"{of} to {percent(share)}" for share, of in shares if share < HALVED_RANGE[0]]
+    effects = [f"narrow the interval of {listed(narrowed)} of what it is"] if narrowed else []
+    for share, of in shares[len(narrowed) :]:
+        interval = f"the interval of {of}"
+        halved = share <= HALVED_RANGE[1]
+        effects.append(
+            f"halve {interval}" if halved else f"narrow {interval} by {percent(1 - share)}"
+        )
+    return listed(effects)
 
 
 def log_in_words(proposal: LogProposal) -> str:
@@ -185,7 +178,7 @@ def log_in_words(proposal: LogProposal) -> str:
         share = min(proposal.shrinks.values())
         return (
             f"Log the {signal} at {rate}: as far as the simulation misses what lies between its "
-            f"samples, that would {effect_in_words(share, '')}."
+            f"samples, that would {effects_in_words([(share, 'every coefficient')])}."
         )
     fed = proposal.change == "fed"
     gains = sorted(

@@ -336,7 +336,7 @@ def _differences_from(run: Run, whole: Inertial, rotors: list[Rotor]) -> Iterato
         error = None if row is None else row.std_error
         beyond = f", {abs(value - fitted[name]) / error:.3g} standard errors" if error else ""
         share = value / fitted[name] - 1
-        yield f"{name} {value:.4g}, fitted {fitted[name]:.4g}: {share:+.1%}{beyond}"
+        yield f"{name} {value:.4g}, fitted {fitted[name]:.4g}: {100 * share:+.1f} %{beyond}"
 
 
 def _listed(values: Iterable[float]) -> str:

@@ -20,7 +20,7 @@ from scipy.special import chdtrc  # scipy.stats takes a second to import
 from tuner.core.errors import InputError
 from tuner.core.files import Part, ResultFile
 from tuner.core.numerics import Array, scaled_inverse, scaled_solve, symmetric_eigen
-from tuner.core.phrases import listed
+from tuner.core.phrases import listed, percent
 from tuner.vehicle import COEFFICIENTS, VehicleFile
 from tuner.vehicle.joint_prior import JointPrior
 
@@ -364,7 +364,7 @@ def _as_floats(numbers: Mapping[str, float]) -> dict[str, float]:
 REMARKS: Mapping[str, str] = {
     "swing": "{oscillations:.0f} oscillations of {frequency:.4f} Hz, at first by {degrees:.1f}°.",
     "beat": (
-        "A second oscillation has {share:.0%} of the amplitude, a beat: hang it so that it turns "
+        "A second oscillation has {percent} of the amplitude, a beat: hang it so that it turns "
         "only, without swinging sideways."
     ),
     "drift": "The angle drifts by {drift:.2g} rad, which was fitted beside it.",
@@ -385,7 +385,7 @@ REMARKS: Mapping[str, str] = {
     ),
     "not_first_order": (
         "The response is not first order: a second lag of {milliseconds:.1f} ms explains "
-        "{explained:.0%} of what remains."
+        "{percent} of what remains."
     ),
     "points": "{points:.0f} points.",
     "explained": (
@@ -409,7 +409,8 @@ def remarks_in_words(experiment: ExperimentRecord) -> list[str]:
         numbers["degrees"] = math.degrees(numbers.get("amplitude", 0.0))
         numbers["early"] = 1e3 * numbers.get("seconds", 0.0)
         numbers["milliseconds"] = 1e3 * numbers.get("lag", 0.0)
-        sentences.append(REMARKS[remark.code].format(**numbers))
+        share = percent(numbers.get("share", numbers.get("explained", 0.0)))
+        sentences.append(REMARKS[remark.code].format(**numbers, percent=share))
     return sentences
 
 

@@ -414,8 +414,8 @@ def _main_clause(reason: Reason) -> str:
         f"on {prior}",
         ReasonCode.REFUTED: "the fitted vehicle does not fly what was recorded, so that its "
         f"flights say nothing about it; the interval is no narrower than that of {prior}",
-        ReasonCode.PRIOR_DOMINATES: f"{reason.prior_share or 0.0:.0%} of the information about it "
-        f"is that of {prior}",
+        ReasonCode.PRIOR_DOMINATES: f"{percent(reason.prior_share or 0.0)} of the information "
+        f"about it is that of {prior}",
         ReasonCode.NOT_WITH_ALL_FREE: "the flights do not identify it while all others are free",
         ReasonCode.IMPOSSIBLE_INERTIA: f"fitted to {reason.fitted_value or 0.0:.4g}, which no "
         "rigid body has together with the other moments of inertia",
@@ -465,7 +465,7 @@ def direction_in_words(direction: Direction) -> str:
         return f"{next(iter(moves))} alone: it {precision}."
     rising = [name for name, move in moves.items() if move > 0]
     falling = [name for name, move in moves.items() if move < 0]
-    proportion = ", ".join(f"{name} {move:+.0%}" for name, move in moves.items())
+    proportion = ", ".join(f"{name} {100 * move:+.0f} %" for name, move in moves.items())
     if falling:
         verb = f"trade{'s' if len(rising) == 1 else ''} off against {listed(falling)}"
     else:

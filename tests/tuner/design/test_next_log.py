@@ -147,9 +147,9 @@ def test_sentences_name_what_gains_most():
     of_added, of_faster = map(log_in_words, (added, faster))
     assert of_added == (
         "Log the rotor speed, at 100 Hz and good to 17 rad/s: it would narrow the interval of "
-        "input_scaling to 20% of what it is and halve the interval of motor_constant."
+        "input_scaling to 20 % of what it is and halve the interval of motor_constant."
     )
     assert of_faster == (
         "Log the command at 250 Hz: as far as the simulation misses what lies between its "
-        "samples, that would narrow every interval by 30%."
+        "samples, that would narrow the interval of every coefficient by 30 %."
     )

@@ -172,11 +172,11 @@ def test_sentences_name_each_flight_and_what_it_would_narrow() -> None:
         )
     )
     not_narrowed = "No single flight in this arena would narrow the interval of mass (fixed so far)"
-    narrowed = "inertia_xx to 20% and inertia_yy to 30% of what it is"
+    narrowed = "inertia_xx to 20 % and inertia_yy to 30 % of what it is"
     assert sentences == [
         f"A circle would narrow the interval of {narrowed}.",
         "A yaw spin at 4 rad/s would halve the interval of moment_constant.",
-        f"{not_narrowed} by more than 10%.",
+        f"{not_narrowed} by more than 10 %.",
     ]
 
 

@@ -175,9 +175,9 @@ def test_coefficients_are_compared_with_a_runs(make_run, capsys):
     run = make_run()
     assert main(["audit", str(CLASSIC), "--run", str(run.folder), "--json"]) == 0
     compared = json.loads(capsys.readouterr().out)["compared"]
-    assert "mass 2.079, fitted 2.243: -7.3%, 7.31 standard errors" in compared
+    assert "mass 2.079, fitted 2.243: -7.3 %, 7.31 standard errors" in compared
     (constant,) = [line for line in compared if line.startswith("motor_constant")]
-    assert constant == "motor_constant 8.55e-06, fitted 1.45e-05: -41.0%, 41 standard errors"
+    assert constant == "motor_constant 8.55e-06, fitted 1.45e-05: -41.0 %, 41 standard errors"
 
 
 def test_what_is_no_model_is_refused_in_a_line(tmp_path, capsys):

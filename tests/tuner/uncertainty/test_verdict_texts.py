@@ -69,7 +69,7 @@ def test_a_coefficient_that_the_prior_determines() -> None:
     reason = Reason(code=ReasonCode.WIDE_INTERVAL, half_width=15.0, prior_given=False)
     assert reason_in_words(reason).startswith("the flights alone hardly tell it from ten times as")
     reason = Reason(code=ReasonCode.PRIOR_DOMINATES, prior_share=0.7, prior_given=True)
-    assert reason_in_words(reason) == "70% of the information about it is that of the given prior"
+    assert reason_in_words(reason) == "70 % of the information about it is that of the given prior"
     reason = Reason(code=ReasonCode.NO_INFORMATION, prior_given=False)
     assert reason_in_words(reason).startswith("the flights hold no information about it")
 
@@ -112,14 +112,14 @@ def test_a_common_scale_is_named_as_such() -> None:
             {"motor_constant": 1.0, "input_scaling": -0.5},
             (
                 "motor_constant trades off against input_scaling (in the proportion "
-                "motor_constant +100%, input_scaling -50%): their combination is known to ±20 %."
+                "motor_constant +100 %, input_scaling -50 %): their combination is known to ±20 %."
             ),
         ),
         (
             {"motor_constant": 1.0, "input_scaling": 0.5},
             (
                 "motor_constant and input_scaling rise and fall together (in the proportion "
-                "motor_constant +100%, input_scaling +50%): their combination is known to ±20 %."
+                "motor_constant +100 %, input_scaling +50 %): their combination is known to ±20 %."
             ),
         ),
     ],

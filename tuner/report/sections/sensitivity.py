@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tuner.core.phrases import percent
 from tuner.design.proposals import LogProposal, Proposals, log_in_words, proposals_in_words
 from tuner.report.section import (
     FITTED,
@@ -214,7 +215,7 @@ def _stacked(
             [round(100 * share, 2) for share in shares],
             colour,
             [
-                f"{label}: {share:.1%} from {name}"
+                f"{label}: {percent(share)} from {name}"
                 for label, share in zip(labels, shares, strict=True)
             ],
         )
@@ -441,7 +442,7 @@ def next_flight(proposals: Proposals) -> Section:
         texts = [
             [
                 f"{flight.name}: the interval of {name} would be "
-                f"{flight.shrinks[name]:.0%} of what it is"
+                f"{percent(flight.shrinks[name])} of what it is"
                 for name in proposals.targets
             ]
             for flight in proposals.flights
