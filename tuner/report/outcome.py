@@ -18,7 +18,7 @@ from tuner.report.section import Cell, Table
 from tuner.result import ExportRecord, FlightResult, RunResult
 from tuner.uncertainty.records import Knowledge
 from tuner.uncertainty.verdict import Verdict, verdict_in_words
-from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle import COEFFICIENTS, scale_group
 
 MAX_NAMES_LETTERS = 90
 """The names of flights in a sentence take at most so many letters."""
@@ -26,6 +26,8 @@ MAX_NOISE_RATIO = 1.5
 """A flight whose RMSE is at most so many times the noise is matched."""
 MIN_UNCHANGED_RATIO = 0.8
 """An RMSE above this share of the initial one is unchanged."""
+MAX_PRIOR_DEVIATIONS = 3.0
+"""A coefficient so many prior standard deviations from a default vehicle's is another vehicle's."""
 Errors = tuple[float | None, float | None, float | None]
 """RMSE before and after a fit, and of the noise."""
 WRONG_VEHICLE_CODES = frozenset(
@@ -306,7 +308,7 @@ def _usability(
     not_found = other_vehicle and codes & {Code.HOLDING_BETTER, Code.RATE_WORSE}
     if not_found or any(found.level == "failure" for found in result.findings):
         return Usability.UNUSABLE
-    if _is_unfounded(result, flights):
+    if _is_unfounded(result, flights) or _not_of_default_vehicle(result):
         return Usability.UNUSABLE
     fitted = [row for row in result.coefficients.values() if row.fitted]
     unsure = (
@@ -328,6 +330,24 @@ def _is_unfounded(result: RunResult, flights: Sequence[FlightOutcome]) -> bool:
     ]
     unknown = bool(base) and all(identifiable is False for identifiable in base)
     return unknown and bool(flights) and not any(one.held_out for one in flights)
+
+
+def _not_of_default_vehicle(result: RunResult) -> list[str]:
+    """Return the coefficients that show that another vehicle flew than the default one.
+
+    They are of those that go with the mass, which no flight shows.
+    """
+    if not any(found.code is Code.VEHICLE_NOT_GIVEN for found in result.findings):
+        return []
+    names = [name for name in scale_group() if COEFFICIENTS[name].scale == "log"]
+    rows = {name: row for name in names if (row := result.coefficients.get(name))}
+    return [
+        name
+        for name, row in rows.items()
+        if row.fitted
+        and abs(math.log(row.best / row.initial))
+        > MAX_PRIOR_DEVIATIONS * COEFFICIENTS[name].prior_sd
+    ]
 
 
 def _fit_summary(result: RunResult) -> str:
@@ -389,6 +409,10 @@ def _reasons(result: RunResult, checks: Sequence[FlightOutcome]) -> tuple[str, .
         sentences.append("No flight was held out, so that nothing checks the fit: hold one out.")
     if _is_unfounded(result, checks):
         sentences.append("Its flights determine no coefficient of the motor model.")
+    if others := _not_of_default_vehicle(result):
+        sentences.append(
+            f"Another vehicle than the default one flew: {listed(others)} ended far from its."
+        )
     if not result.search.converged:
         sentences.append("The search stopped at its limit of iterations: resume it.")
     return tuple(sentences)

@@ -107,6 +107,27 @@ def test_a_vehicle_not_given_whose_rate_is_predicted_worse_than_before_is_not_us
     assert outcome(noticing(result, default, worse)).usability is Usability.UNUSABLE
 
 
+def test_a_fit_that_leaves_a_vehicle_that_was_not_given_is_not_usable(result):
+    """As of 27 g that fly with the default 2 kg: no flight shows the mass, inertia over mass is."""
+    default = Finding(Code.VEHICLE_NOT_GIVEN, "warning", "hovergames", {"mass": 2.079})
+
+    def ended(share):
+        row = result.coefficients["inertia_xx"]
+        moved = row.model_copy(update={"fitted": True, "best": share * row.initial})
+        return result.model_copy(
+            update={"coefficients": {**result.coefficients, "inertia_xx": moved}}
+        )
+
+    for factor in (1 / 7, 7.0):
+        assert outcome(ended(factor)).usability is Usability.USABLE
+        found = outcome(noticing(ended(factor), default))
+        assert found.usability is Usability.UNUSABLE
+        assert found.reasons[-1] == (
+            "Another vehicle than the default one flew: inertia_xx ended far from its."
+        )
+    assert outcome(noticing(ended(0.4), default)).usability is Usability.WITH_CARE
+
+
 def test_flights_that_tell_nothing_of_the_vehicle_and_check_nothing_are_not_usable(result):
     rows = {
         name: row.model_copy(update={"identifiable": COEFFICIENTS[name].is_effect})
