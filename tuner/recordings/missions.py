@@ -29,13 +29,15 @@ MIN_LANDING_S = 0.2
 """A shorter time on the ground is no landing: a bounce takes longer."""
 MIN_MISSION_S = 2.0
 """A shorter stretch is no mission."""
-MAX_IDLE_COMMAND = 0.12
-MAX_IDLE_SPEED = 80.0
+MAX_IDLE_COMMAND, MAX_OFF_COMMAND = 0.12, 0.02
 MAX_IDLE_SHARE = 0.5
-MAX_OFF_COMMAND = 0.02
-MAX_OFF_SPEED = 20.0
-"""A mean motor command or thrust, and a rotor speed in rad/s, below these is idle; but not above
-`MAX_IDLE_SHARE` of their median in the air, nor below those of stopped motors."""
+IDLE = {
+    "command": (MAX_IDLE_COMMAND, MAX_OFF_COMMAND),
+    "rotor_speed": (80.0, 20.0),
+    "thrust_setpoint": (MAX_IDLE_COMMAND, MAX_OFF_COMMAND),
+}
+"""A mean motor command or thrust, and a rotor speed in rad/s, below the first is idle; but not
+above `MAX_IDLE_SHARE` of its median in the air, nor below the second, that of stopped motors."""
 MIN_FLYING_HEIGHT_M = 0.12
 """The vehicle flies if it is higher above the ground."""
 MAX_RESTING_RANGE_M = 0.01
@@ -122,6 +124,16 @@ def mission_error(path: Path, series: Mapping[str, Series]) -> RecordingError:
             path,
             "flies only if z of its position points down, as in NED axes",
             "give position, and what else is so, frame: ned_frd in a topic map (--topics FILE)",
+        )
+    others = {name: samples for name, samples in series.items() if name not in IDLE}
+    motors = next((name for name in IDLE if name in series), None)
+    moves = np.ptp(position.values, axis=0).max() > 3 * MIN_FLYING_HEIGHT_M
+    if motors and moves and find_missions(others):
+        there = np.nanmedian(series[motors].values)
+        return RecordingError(
+            path,
+            f"moves with motors that idle, by its {motors}, which is read as {there:.2g}",
+            f"if it flew, give {motors} its unit in a topic map (--topics FILE)",
         )
     return RecordingError(
         path,
@@ -210,11 +222,7 @@ def _idle(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return at which times the motors idle, and at which times they were recorded."""
     clear = height > float(np.quantile(height, 0.02)) + 3 * MIN_FLYING_HEIGHT_M
-    for name, limit, off in (
-        ("command", MAX_IDLE_COMMAND, MAX_OFF_COMMAND),
-        ("rotor_speed", MAX_IDLE_SPEED, MAX_OFF_SPEED),
-        ("thrust_setpoint", MAX_IDLE_COMMAND, MAX_OFF_COMMAND),
-    ):
+    for name, (limit, off) in IDLE.items():
         if name in series and len(series[name].time) > 1:
             samples = series[name]
             known = np.isfinite(samples.values).any(axis=1)

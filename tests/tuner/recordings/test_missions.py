@@ -19,6 +19,7 @@ from tuner.recordings.missions import (
     Mission,
     airborne,
     find_missions,
+    mission_error,
     split_into_manoeuvres,
     yaw_spin,
 )
@@ -100,6 +101,18 @@ def test_two_flights_with_a_landing_between() -> None:
 def test_what_never_flies_has_no_mission() -> None:
     signals = flight(climb=100, land=200) | {"command": series(np.zeros((len(TIME), 4)))}
     assert find_missions(signals) == ()
+    assert mission_error(Path("x"), signals).what.startswith("nothing flies in it")
+
+
+def test_motors_that_idle_in_flight_are_named_with_what_was_read() -> None:
+    """As commands in percent that a topic map calls pulses of PWM."""
+    percent = np.where((TIME > 5) & (TIME < 36), 60.0, 0.0)
+    signals = flight() | {"command": series(np.tile(1e-3 * (percent[:, None] - 1000), 4))}
+    assert find_missions(signals) == ()
+    assert str(mission_error(Path("x"), signals)) == (
+        "x: moves with motors that idle, by its command, which is read as -0.94; if it flew, give "
+        "command its unit in a topic map (--topics FILE)"
+    )
 
 
 @pytest.mark.parametrize(
