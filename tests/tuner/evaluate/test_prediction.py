@@ -191,13 +191,33 @@ def test_errors_that_predictions_share_are_chance_but_once():
     assert 0.0 < np.mean([bool(names) for names in found]) < 0.06  # 2.5 % to one side
 
 
-def test_rotors_of_a_window_followed_the_commands_at_their_corrected_times(full_flight, updated):
-    """Stamps of commands that are late, by a lateness that is known, change no error."""
+def without_speeds(flight):
     series, signals = (
         {name: one for name, one in of.items() if name != "rotor_speed"}
-        for of in (full_flight.series, full_flight.signals)
+        for of in (flight.series, flight.signals)
     )
-    flight = replace(full_flight, series=series, signals=signals)
+    return replace(flight, series=series, signals=signals)
+
+
+def test_a_predictor_predicts_each_vehicle_and_loop_as_if_it_were_the_first(full_flight, updated):
+    """Rotors that no tachometer shows begin as their lag has it; steps are the loop's."""
+    lags = dict.fromkeys(("time_constant_up", "time_constant_down"), 0.2)
+    slow, usual = with_values(updated, lags), ControllerFile()
+    fine = usual.replace(physics=usual.physics.replace(rate=800.0))
+
+    def make():
+        return FlightPredictor(without_speeds(full_flight), "actuator", stride=2.0)
+
+    first = make()
+    for vehicle, controller in ((updated, usual), (slow, usual), (slow, fine)):
+        again, fresh = (p.predict(vehicle, controller) for p in (first, make()))
+        for name, errors in fresh.errors.items():
+            np.testing.assert_array_equal(again.errors[name], errors, err_msg=name)
+
+
+def test_rotors_of_a_window_followed_the_commands_at_their_corrected_times(full_flight, updated):
+    """Stamps of commands that are late, by a lateness that is known, change no error."""
+    flight = without_speeds(full_flight)
     late = stamped_earlier(flight, ["command"], -0.05)
     plain, corrected = (
         Comparison([recording], ControllerFile()).fly(updated)[flight.name].attitude.error

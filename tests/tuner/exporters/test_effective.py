@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.exporters.conftest import as_fitted
+from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.records import AxesRmse
 from tuner.exporters.effective import (
     carried_terms,
@@ -16,7 +17,7 @@ from tuner.exporters.effective import (
 )
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.result import PoseRmse
-from tuner.vehicle import values_of, with_values
+from tuner.vehicle import ControllerFile, values_of, with_values
 
 
 def axes(*values):
@@ -136,6 +137,32 @@ def test_nothing_free_is_nothing_refitted(run):
     result = run.result.model_copy(update={"coefficients": fixed})
     found = find_effective(run.model_copy(update={"result": result}), GAZEBO_CLASSIC, recordings_of)
     assert found.vehicle == GAZEBO_CLASSIC.with_built_in(run.vehicle, ["fuselage_drag"])
+
+
+def test_a_condition_that_gazebo_lacks_is_left_out_where_it_flies_alone(run):
+    """Without the drag the battery declines, without its decline the drag acts."""
+    run = of_vehicle(as_fitted(run), effects={"fuselage_drag": 0.04})
+    (flight,) = run.result.flights
+    flight = flight.model_copy(update={"conditions": {"battery_decline": 0.3}})
+    fixed = {
+        name: row.model_copy(update={"fitted": False})
+        for name, row in run.result.coefficients.items()
+    }
+    update = {"coefficients": fixed, "flights": (flight,)}
+    run = run.model_copy(update={"result": run.result.model_copy(update=update)})
+    found = find_effective(run, GAZEBO_CLASSIC, recordings_of)
+    bare = GAZEBO_CLASSIC.with_built_in(run.vehicle, ["fuselage_drag"])
+    (recording,) = recordings_of(run)[1]
+
+    def flown(vehicle, conditions):
+        held = Comparison([replace(recording, conditions=conditions)], ControllerFile())
+        return pose_rmse([held.fly(vehicle)[flight.name].rmse])
+
+    assert {term.group: term.rmse_without for term in found.result.lost} == {
+        "fuselage_drag": flown(bare, flight.conditions),
+        "battery_decline": flown(run.vehicle, {}),
+    }
+    assert found.result.rmse_unfitted == flown(bare, {})
 
 
 def test_the_rmse_over_flights_is_of_distances_and_a_crash_stays_one():

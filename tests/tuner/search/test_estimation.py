@@ -258,6 +258,31 @@ def test_a_rough_fit_ends_where_a_linear_step_is_left(left, steps):
     assert len(made) == steps
 
 
+def test_what_is_held_keeps_its_value_and_the_others_are_fitted():
+    objective = problem(PLAIN, seed=0)
+    start = 1.02 * np.array(truth(objective).coefficients)
+    job = SimpleNamespace(
+        objective=objective,
+        space=objective.space,
+        settings=SimpleNamespace(job=JobFile(), controller=ControllerFile()),
+        fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
+        inlets=("reference", "reference"),
+        recordings=[SimpleNamespace(time_offset=0.0, holdout=False)] * 2,
+    )
+    again = estimation.polished(
+        job,
+        fitted_of(objective, objective.start(start)),
+        free=estimation.free_parameters(job, held=("inertia_xx",)),
+        title="again",
+        on_progress=lambda _: None,
+        stages=estimation.FIRST_POLISH,
+    )
+    moved = again.point.coefficients != start
+    assert dict(zip(objective.space.names, moved, strict=True)) == {
+        name: name != "inertia_xx" for name in PLAIN
+    }
+
+
 @pytest.mark.parametrize("own", [Loop(0.0, 1.0), Loop(1.0, 0.0)])
 def test_a_search_begins_with_the_set_ups_own_loop(own):
     objective = with_loop(problem(PLAIN), own)
