@@ -16,8 +16,8 @@ import os
 import sys
 import tempfile
 import types
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
@@ -131,16 +131,50 @@ def _compiled(text: str) -> bytes:
 
 
 def load_or_make(key: str, made: Callable[[], bytes]) -> bytes:
-    """Return the content for a key on this machine, from the cache or made now and cached."""
-    if not _folder:
+    """Return the content for a key on this machine, from the cache or made now and cached.
+
+    What another process is making is waited for.
+    """
+    path = _path_of(key)
+    if path is None:
         return made()
-    digest = hashlib.sha256(f"{_machine_name()}\n{key}".encode()).hexdigest()
-    path = _folder[0] / f"{digest}.o"
     content = _read(path)
     if content is None:
-        content = made()
-        _write(path, content)
+        with _made_once(path):
+            content = _read(path)
+            if content is None:
+                content = made()
+                _write(path, content)
     return content
+
+
+def is_kept(key: str) -> bool:
+    """Return whether the cache has content for a key on this machine."""
+    path = _path_of(key)
+    return path is not None and path.exists()
+
+
+def _path_of(key: str) -> Path | None:
+    """Return the file with the content for a key; None where nothing is kept."""
+    if not _folder:
+        return None
+    digest = hashlib.sha256(f"{_machine_name()}\n{key}".encode()).hexdigest()
+    return _folder[0] / f"{digest}.o"
+
+
+@contextmanager
+def _made_once(path: Path) -> Iterator[None]:
+    """Wait for other processes that make a file; where locks are unknown, it may be made twice."""
+    lock = path.with_suffix(".lock")
+    with ExitStack() as held:
+        with suppress(ImportError, OSError):
+            import fcntl  # noqa: PLC0415 (not on Windows)
+
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = held.enter_context(lock.open("w"))
+            fcntl.flock(file, fcntl.LOCK_EX)
+            held.callback(lock.unlink, missing_ok=True)
+        yield
 
 
 def object_code(text: str) -> bytes:

@@ -32,6 +32,7 @@ from lanes.machine import (
     Code,
     UnknownError,
     digest_of,
+    is_kept,
     keep_code_in,
     load_or_make,
     object_code,
@@ -125,7 +126,9 @@ def _program_of(
     options: tuple[tuple[str, Any], ...],
 ) -> Program:
     arguments = jax.tree.unflatten(structure, leaves)
-    return Program(partial(function, *static), arguments, **dict(options))
+    program = Program(partial(function, *static), arguments, **dict(options))
+    program.made_by = partial(program_of, **dict(options)), (function, arguments, *static)
+    return program
 
 
 class Program:
@@ -169,10 +172,18 @@ class Program:
         names = {length for a in leaves for length in a.shape if isinstance(length, str)}
         self.names = tuple(sorted(names))
         self._kernels: dict[int, _Compiled | None] = {}
+        #: Of `program_of`: what makes it again in another process, and its arguments.
+        self.made_by: tuple[Callable[..., Program], tuple[Any, ...]] | None = None
         self.key: str | None = None
         if made_of is not None:
             with suppress(UnknownError):
                 self.key = digest_of((made_of, arguments), packages)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what `program_of` was given, without kernels."""
+        if self.made_by is None:
+            raise TypeError(f"{self.name} is a program of this process alone")
+        return self.made_by
 
     def _with_tangents(self, lengths: Lengths) -> Callable[..., Any]:
         """Return the function of flat arguments and tangents, or of arguments alone."""
@@ -218,6 +229,30 @@ class Program:
     def stand_ins(self) -> dict[str, int]:
         """Name -> the number that stands for each length while it is traced."""
         return dict(zip((*self.names, "turns"), _STAND_INS, strict=False))
+
+    def build(self) -> None:
+        """Have the kernel for few lanes, on disk if such are kept."""
+        self._kernel()
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the kernel for few lanes is on disk, from where other processes have it."""
+        return self.key is not None and is_kept(self._key_of(1))
+
+    def _key_of(self, vectors: int) -> str:
+        return f"{self.key} {self._width(vectors)}"
+
+    def _width(self, vectors: int) -> int:
+        """Return how many lanes blocks of so many vectors have."""
+        widest = max(
+            (
+                np.dtype(a.dtype).itemsize
+                for a in self.arguments
+                if np.issubdtype(a.dtype, np.floating)
+            ),
+            default=8,
+        )
+        return max(vectors * register_bytes() // widest, 1)
 
     def _kernel(self, steps: int = 1) -> _Compiled | None:
         """Return the kernel for so many lanes times turns; None where something has no rule."""
@@ -339,24 +374,15 @@ class _Compiled:
 
     def __init__(self, program: Program, vectors: int) -> None:
         self.program, self.lengths = program, program.stand_ins
-        widest = max(
-            (
-                np.dtype(a.dtype).itemsize
-                for a in program.arguments
-                if np.issubdtype(a.dtype, np.floating)
-            ),
-            default=8,
-        )
-        self.width = max(vectors * register_bytes() // widest, 1)
+        self.width = program._width(vectors)
         self.structure: Any
         self.outputs: list[jax.ShapeDtypeStruct]
         self.moved: list[bool]
         if program.key is None:
             self.structure, self.outputs, self.moved, code = self._build()
         else:
-            head, _, code = load_or_make(f"{program.key} {self.width}", self._to_keep).partition(
-                b"\n"
-            )
+            kept = load_or_make(program._key_of(vectors), self._to_keep)
+            head, _, code = kept.partition(b"\n")
             known = json.loads(head)
             self.structure = PyTreeDef.deserialize_using_proto(
                 default_registry, bytes.fromhex(known["structure"])

@@ -1,7 +1,12 @@
 """A program's digest is of all that it is made of, or there is none; what is kept is not traced."""
 
+import pickle
+import subprocess
+import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Event
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lanes import Argument, Program, keep_code_in, machine
+from lanes import Argument, Program, keep_code_in, machine, program_of
 from lanes.machine import UnknownError, digest_of
 
 
@@ -130,3 +135,52 @@ def test_a_kept_program_is_not_traced_again():
     program(3.0)(x, [np.eye(3)], lanes=2)
     program(2.0, (2, 3))(np.ones((2, 3, 2)), [np.ones((1, 2, 3))], lanes=2)
     assert traced == [2.0, 3.0, 2.0]
+
+
+def scaled(factor: float, x: Any, _: Any) -> Any:
+    """Return a function of this module, which another process finds."""
+    return factor * x
+
+
+def test_another_process_builds_what_is_then_loaded(kernels, monkeypatch):
+    argument = Argument((3,), float, lanes=True)
+    program = program_of(scaled, argument, 3.0, name="scaled", made_of=3.0, packages=HERE)
+    assert not program.is_kept
+    code = (
+        "import pickle, sys; from pathlib import Path; from lanes import keep_code_in\n"
+        "keep_code_in(Path(sys.argv[1])); pickle.load(sys.stdin.buffer).build()"
+    )
+    run = [sys.executable, "-c", code, str(kernels)]
+    subprocess.run(run, input=pickle.dumps(program), check=True)
+    assert program.is_kept
+    monkeypatch.delattr("lanes.program._Compiled._build")
+    values = np.arange(6.0).reshape(3, 2)
+    np.testing.assert_array_equal(program(values, lanes=2).values, 3.0 * values.T)
+
+
+def test_a_program_of_one_process_goes_to_no_other():
+    program = Program(scaled, Argument((), float, lanes=True), name="alone")
+    with pytest.raises(TypeError, match="alone is a program of this process"):
+        pickle.dumps(program)
+
+
+@pytest.mark.usefixtures("kernels")
+def test_what_another_makes_is_waited_for():
+    makes, ends = Event(), Event()
+    made = []
+
+    def first() -> bytes:
+        makes.set()
+        ends.wait(60.0)
+        made.append("first")
+        return b"first"
+
+    with ThreadPoolExecutor(2) as threads:
+        one = threads.submit(machine.load_or_make, "key", first)
+        makes.wait(60.0)
+        other = threads.submit(machine.load_or_make, "key", lambda: made.append("other") or b"")
+        with pytest.raises(TimeoutError):
+            other.result(timeout=0.2)
+        ends.set()
+        assert one.result() == other.result() == b"first"
+    assert made == ["first"]

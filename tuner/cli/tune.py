@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from contextvars import ContextVar
+from importlib import import_module
 from typing import Annotated, Any, get_args
 
 from cyclopts import CoercionError, Parameter, Token, convert
@@ -73,28 +74,30 @@ def tune(
         print(job_script_for(options.cluster))
         return
     began = time.perf_counter()
-    from tuner.cli.progress import profiling
+    # before the process beside this one, which then has them too
+    from tuner.cli.progress import profiling, progress_on_terminal
+    from tuner.cli.results import print_run
+    from tuner.config import resolve_settings
+    from tuner.core.runtime import configure, kernel_folder
     from tuner.core.spans import span
+    from tuner.engine.beside import beside, do_beside
+    from tuner.recordings.loader import load_flights
 
-    with profiling(profile, quiet=quiet) as profile_into:
-        with span("import"):
-            from tuner.cli.progress import progress_on_terminal
-            from tuner.cli.results import print_run
-            from tuner.config import resolve_settings
-            from tuner.recordings.loader import read_beside
-
+    with beside(), profiling(profile, quiet=quiet) as profile_into:
         settings = resolve_settings(options)
         job = settings.job
-        with read_beside(settings.flights, topics=job.topics, namespace=job.namespace):
-            with span("import"):
-                from tuner.core.runtime import configure
+        for path in reversed(settings.flights):  # the first are read here
+            do_beside(load_flights, path, topics=job.topics, namespace=job.namespace)
+        if not kernel_folder().exists():  # kernels of the job will be built there
+            do_beside(configure)
+            do_beside(import_module, "tuner.objective.simulation")
+        with span("import"):
+            configure()
+            from tuner.job.run import run
+            from tuner.search.job_flights import read_inertial_flights
 
-                configure()
-                from tuner.job.run import run
-                from tuner.search.job_flights import read_inertial_flights
-
-            with span("reading"):
-                bare, left_out = read_inertial_flights(settings)
+        with span("reading"):
+            bare, left_out = read_inertial_flights(settings)
         told = progress_on_terminal(quiet=quiet, verbose=verbose)
         if bare:
             from tuner.job.without_pose import fit_without_pose

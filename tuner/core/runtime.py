@@ -19,6 +19,7 @@ import platform
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from tuner.core.disk import cache_folder
 from tuner.core.errors import InputError
@@ -154,6 +155,11 @@ def keep_memory() -> None:
         mallopt(_M_TRIM_THRESHOLD, _MAX_KEPT_BYTES)
 
 
+def kernel_folder() -> Path:
+    """Return the folder in which kernels are kept."""
+    return cache_folder() / "kernels"
+
+
 def configure(*, keep_compiled: bool = True) -> None:
     """Set jax up for simulation; call it once, before the first computation.
 
@@ -175,7 +181,7 @@ def configure(*, keep_compiled: bool = True) -> None:
     if keep_compiled:
         from lanes import keep_code_in  # noqa: PLC0415 (imports jax)
 
-        keep_code_in(cache_folder() / "kernels")
+        keep_code_in(kernel_folder())
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", True)
     if keep_compiled and jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]

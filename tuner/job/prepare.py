@@ -15,12 +15,15 @@ from typing import get_args
 
 import numpy as np
 
+from lanes import Program
 from sim_jax.constants import GRAVITY
 from sim_jax.control.mixer import ROTORS
 from tuner.config import Settings
 from tuner.core.errors import ConfigError
 from tuner.core.numerics import Z95, Array, symmetric_eigen, unit_diagonal
+from tuner.core.runtime import configure
 from tuner.core.spans import span
+from tuner.engine.beside import do_beside
 from tuner.equation_error.estimate import TORQUE_GAINS, Estimate, estimate
 from tuner.equation_error.model_accelerations import moves_rotors
 from tuner.equation_error.recorded_accelerations import (
@@ -42,7 +45,8 @@ from tuner.search.problem import Job, job_of
 from tuner.search.progress import plain_criterion
 from tuner.search.recorded_rotors import cut_at_rotor_changes, with_input_lags
 from tuner.terms.candidates import candidate_groups, neutral_values
-from tuner.terms.selection import with_first_terms
+from tuner.terms.selection import candidates_of, with_first_terms
+from tuner.uncertainty.model_error import in_half_steps
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, with_values
 
 HORIZON_S = 12.0
@@ -88,6 +92,33 @@ def prepare(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
             *regressed,
             *check_recordings(job),
         )
+
+
+def build_ahead(job: Job) -> None:
+    """Have the process beside this one build the kernels that the job flies after its first.
+
+    They come in the order in which the job asks for them; what is not begun by then it builds.
+    """
+    problems = [problem for problem in (job.windows, job.objective) if problem is not None]
+    has_terms = job.objective.has_terms
+    kinds = [(has_terms, True), (False, False)]
+    if has_terms or candidates_of(job):
+        kinds.insert(1, (not has_terms, True))
+    if has_terms:
+        kinds.append((True, False))
+    programs = [
+        problem.program(with_terms=with_terms, moves=moves)
+        for with_terms, moves in kinds
+        for problem in problems
+    ]
+    finer, first = in_half_steps(job.objective), job.objective.program(with_terms=has_terms)
+    if finer is not None:
+        programs.append(finer.program(with_terms=has_terms, moves=False))
+    missing = [p for p in dict.fromkeys(programs) if p is not first and not p.is_kept]
+    if missing:
+        do_beside(configure)
+    for program in missing:
+        do_beside(Program.build, program)
 
 
 def check_recordings(job: Job) -> tuple[Finding, ...]:

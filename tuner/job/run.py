@@ -33,7 +33,7 @@ from tuner.exporters.effective import Effective, find_effective
 from tuner.exporters.export import export_formats_of_job
 from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.findings.findings import Finding, merge_alike, remedy, sentence
-from tuner.job.prepare import check_information, prepare
+from tuner.job.prepare import build_ahead, check_information, prepare
 from tuner.job.results import result_of, write_folder, write_next_flight
 from tuner.options import Options
 from tuner.report import render, write_search, write_traces
@@ -106,6 +106,7 @@ def run(
     reporter = Reporter(listener)
     _check(findings, reporter, force=options.force)
     with span("check"):
+        build_ahead(job)
         at_start = tuple(check_information(job))
     _check(at_start, reporter, force=options.force)
     with result_folder(out) as folder:

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
 
+from lanes import Program
 from sim_jax.schedule import Schedule
 from sim_jax.state import Limits
 from tuner.core.numerics import Array
@@ -37,7 +38,7 @@ from tuner.objective.criterion import (
 from tuner.objective.initial_conditions import eliminate_states
 from tuner.objective.residuals import Block, Reading, gauss_newton, huber_loss, residuals
 from tuner.objective.segments import OFFSETS, Segments
-from tuner.objective.simulation import Flown, fly
+from tuner.objective.simulation import EFFECTS, Flown, flight_program, fly
 from tuner.objective.space import Space
 from tuner.vehicle.model import Model, with_coefficients
 
@@ -144,6 +145,22 @@ class Objective(eqx.Module):
             conditions={name: values[self.flight] for name, values in conditions.items()},
             tangents=self._directions(point, moving) or None,
             differentiated=self.differentiated and np.ndim(point.coefficients) == 1,
+        )
+
+    @property
+    def has_terms(self) -> bool:
+        """Whether terms beyond the base model are among what is fitted."""
+        return bool(self.conditions or {*EFFECTS} & {*self.space.names})
+
+    def program(self, *, with_terms: bool, moves: bool = True) -> Program:
+        """Return the program by which the segments fly, with derivatives if it ``moves``."""
+        return flight_program(
+            self.model,
+            self.segments,
+            self.schedule,
+            limits=self.limits,
+            with_terms=with_terms,
+            moves=moves,
         )
 
     def compare(

@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
-from lanes import Argument, program_of
+from lanes import Argument, Program, program_of
 from sim_jax import terms
 from sim_jax.environment import Air, Disturbance, Environment
 from sim_jax.frames import gyro_of, markers_of
@@ -132,7 +132,66 @@ def fly(
     differentiated
         Whether the program with derivatives flies without tangents, too: a fit has built it.
     """
-    moves = differentiated or tangents is not None
+    given, program, logged = _prepared(
+        model,
+        segments,
+        schedule,
+        limits=limits,
+        coefficients=coefficients,
+        states=states,
+        conditions=conditions,
+        channels=channels,
+        moves=differentiated or tangents is not None,
+    )
+    names = tuple(segments.measured) if channels is None else channels
+    asked = {name: name in names for name in logged}
+    run = program(
+        given,
+        None if tangents is None else _directions(given, tangents),
+        lanes=given.segments.count,
+        turns=samples,
+        wanted=(asked, True) if tangents is None else ((asked, True), (asked, False)),
+    )
+    found, crash_time = run.values
+    still: dict[str, Array | None] = dict.fromkeys(names)
+    return Flown(
+        {name: found[name] for name in names},
+        still if run.columns is None else run.columns[0],
+        crash_time,
+    )
+
+
+def flight_program(
+    model: Model,
+    segments: Segments,
+    schedule: Schedule,
+    *,
+    limits: Limits,
+    with_terms: bool,
+    moves: bool,
+) -> Program:
+    """Return the program by which `fly` flies, with derivatives if it ``moves``.
+
+    It is that of the base model or, ``with_terms``, the one of any terms beyond it.
+    """
+    model = replace(model, vehicle=replace(model.vehicle, effects={}))
+    calm = {"wind_x": np.zeros(segments.count)} if with_terms else {}
+    return _prepared(model, segments, schedule, limits=limits, conditions=calm, moves=moves)[1]
+
+
+def _prepared(
+    model: Model,
+    segments: Segments,
+    schedule: Schedule,
+    *,
+    limits: Limits,
+    coefficients: Mapping[str, Any] = MappingProxyType({}),
+    states: Array | None = None,
+    conditions: Mapping[str, Any] = MappingProxyType({}),
+    channels: tuple[str, ...] | None = None,
+    moves: bool,
+) -> tuple[_Given, Program, tuple[str, ...]]:
+    """Return the input of a program, the program, and the channels that it logs."""
     if conditions or {*model.vehicle.effects, *coefficients}.intersection(EFFECTS):
         model, segments, conditions = _with_all_terms(model, segments, conditions)
         if not moves and segments.disturbance is None:
@@ -176,21 +235,7 @@ def fly(
         made_of=(static, moves, terms.TERMS),
         packages=CODE,
     )
-    asked = {name: name in names for name in logged}
-    run = program(
-        given,
-        None if tangents is None else _directions(given, tangents),
-        lanes=segments.count,
-        turns=samples,
-        wanted=(asked, True) if tangents is None else ((asked, True), (asked, False)),
-    )
-    found, crash_time = run.values
-    still: dict[str, Array | None] = dict.fromkeys(names)
-    return Flown(
-        {name: found[name] for name in names},
-        still if run.columns is None else run.columns[0],
-        crash_time,
-    )
+    return given, program, logged
 
 
 def _with_all_terms(

@@ -12,8 +12,6 @@ import io
 import json
 import logging
 import math
-import os
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -173,33 +171,6 @@ def load_flights(
     if not content.missions:
         raise mission_error(path, content.series)
     return flights_of(content, options, keep=cache)
-
-
-@contextlib.contextmanager
-def read_beside(
-    paths: Sequence[Path], *, topics: str | Path | None = None, namespace: str = ""
-) -> Iterator[None]:
-    """Have another process read recordings into the user's cache, the last one first.
-
-    `load_flights` then finds those that were read, and reads the others and those with errors.
-    Where jax is imported, whose threads allow no fork, or the system has none, nothing is read. The
-    process has ended when the block ends.
-    """
-    if "jax" in sys.modules or sys.platform != "linux":
-        yield
-        return
-    child = os.fork()
-    if not child:
-        try:
-            for path in reversed(paths):
-                with contextlib.suppress(Exception):
-                    load_flights(path, topics=topics, namespace=namespace)
-        finally:
-            os._exit(0)  # whatever happened, it is the other's to report
-    try:
-        yield
-    finally:
-        os.waitpid(child, 0)
 
 
 def flights_of(content: Content, options: ReadOptions, *, keep: bool) -> tuple[Flight, ...]:

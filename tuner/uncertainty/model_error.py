@@ -251,16 +251,19 @@ def alternatives_of(
         Whole flights, whose voltmeter readings are drawn again if the fit has a battery; none to
         leave that out.
     """
-    limited = _with_lower_limit(objective)
-    if not isinstance(objective.segments.inlet, ReferenceInlet):
+    limited, finer = _with_lower_limit(objective), in_half_steps(objective)
+    if finer is None:
         return limited | _with_recorded_rotors(objective, flights)
+    return {STEP: finer, **limited, **with_other_readings(objective, point, flights)}
+
+
+def in_half_steps(objective: Objective) -> Objective | None:
+    """Return the problem simulated in steps half as long; None where a recording is fed in."""
+    if not isinstance(objective.segments.inlet, ReferenceInlet):
+        return None
     schedule = objective.schedule
     finer = replace(schedule, physics_rate=2 * schedule.physics_rate)
-    return {
-        STEP: replace(objective, schedule=finer, differentiated=False),
-        **limited,
-        **with_other_readings(objective, point, flights),
-    }
+    return replace(objective, schedule=finer, differentiated=False)
 
 
 def _with_lower_limit(objective: Objective) -> dict[str, Objective]:

@@ -115,15 +115,21 @@ def test_concurrent_runs_agree(bag: Path) -> None:
     assert not names[0].startswith(".")
 
 
-def test_another_process_reads_while_a_command_imports(bag: Path) -> None:
-    code = (  # the imports of `tune` before jax
-        "import sys; import tuner.cli.progress, tuner.cli.results, tuner.config; "
-        "from tuner.recordings import loader; path = loader.Path(sys.argv[1])\n"
-        "with loader.read_beside([path.with_name('missing.bag'), path]): pass\n"
+def test_another_process_reads_beside_a_command(bag: Path) -> None:
+    code = (
+        "import sys, time; from tuner.engine import beside as module; module.cores = lambda: 2\n"
+        "from tuner.engine.beside import beside, do_beside\n"
+        "from tuner.recordings import loader; path, done = map(loader.Path, sys.argv[1:])\n"
+        "with beside():\n"
+        "    do_beside(loader.load_flights, path.with_name('missing.bag'))\n"
+        "    do_beside(loader.load_flights, path)\n"
+        "    do_beside(loader.Path.touch, done)\n"
+        "    while not done.exists(): time.sleep(0.01)\n"
         "loader.read_content = None; print(loader.load_flight(path).name)"
     )
-    run = [sys.executable, "-c", code, str(bag)]
-    assert subprocess.run(run, capture_output=True, text=True, check=True).stdout == "flight\n"
+    run = [sys.executable, "-c", code, str(bag), str(bag.with_name("done"))]
+    output = subprocess.run(run, capture_output=True, text=True, check=True, timeout=60).stdout
+    assert output == "flight\n"
 
 
 def test_folder_digest_sees_names_and_contents(tmp_path: Path) -> None:
