@@ -4,10 +4,10 @@ from collections.abc import Iterable
 
 from tuner.config import Settings
 from tuner.recordings.flight import Flight
-from tuner.search.job_flights import Recording, recording_of
+from tuner.search.job_flights import JobFlight, recording_of
 
 
-def recordings_of(settings: Settings, flights: Iterable[Flight]) -> tuple[Recording, ...]:
+def recordings_of(settings: Settings, flights: Iterable[Flight]) -> tuple[JobFlight, ...]:
     """Return flights with the inlet, clock offset and holdout of a job's settings."""
     held_out = settings.job.holdout
     return tuple(recording_of(settings, f, holdout=f.name in held_out) for f in flights)

@@ -36,7 +36,7 @@ from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.trajectory import Published, at_speed, published
 from tuner.recordings.flight import Series
-from tuner.search.job_flights import Recording
+from tuner.search.job_flights import JobFlight
 from tuner.search.problem import SPIN_CHANNELS, Job, job_of
 from tuner.search.progress import Fitted, plain_criterion
 from tuner.uncertainty.covariance import PRIOR_WIDENING
@@ -476,7 +476,7 @@ def _loss(fitted: Fitted, objective: Objective) -> float:
     return float(np.sum(np.asarray(sums.loss)))
 
 
-def _thin(recording: Recording, signal: str, every: int) -> Recording:
+def _thin(recording: JobFlight, signal: str, every: int) -> JobFlight:
     """Return a recording with one of `every` samples of a signal."""
     flight = recording.flight
     series = flight.series[signal]

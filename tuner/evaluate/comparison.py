@@ -50,7 +50,7 @@ from tuner.objective.space import Space
 from tuner.objective.windows import Window
 from tuner.options import RecordingOptions
 from tuner.recordings.flight import Flight
-from tuner.search.job_flights import Recording, read_recordings, with_logged_parameters
+from tuner.search.job_flights import JobFlight, read_recordings, with_logged_parameters
 from tuner.search.optimisers import MAX_STATE_SD
 from tuner.search.problem import limits_of
 from tuner.search.progress import plain_criterion
@@ -199,13 +199,13 @@ class Comparison:
 
     def __init__(
         self,
-        recordings: Sequence[Recording],
+        recordings: Sequence[JobFlight],
         controller: ControllerFile,
         *,
         window: float | None = None,
     ) -> None:
         self._names = [recording.flight.name for recording in recordings]
-        by_inlet: dict[InletName, list[Recording]] = {}
+        by_inlet: dict[InletName, list[JobFlight]] = {}
         for recording in recordings:
             by_inlet.setdefault(recording.inlet, []).append(recording)
         self._groups = [
@@ -252,7 +252,7 @@ class _Group:
 
     def __init__(
         self,
-        recordings: Sequence[Recording],
+        recordings: Sequence[JobFlight],
         controller: ControllerFile,
         inlet: InletName,
         seconds: float,

@@ -31,7 +31,7 @@ from tuner.objective.criterion import Point, units_of
 from tuner.result import EFFECTIVE, EffectiveResult, LostTerm, PoseRmse, Run, RunResult
 from tuner.search.estimation import BOTH_POLISHES, polished
 from tuner.search.job_flights import (
-    Recording,
+    JobFlight,
     read_recordings,
     with_known,
 )
@@ -60,7 +60,7 @@ quarter off: a model without a term has a long valley, in which each step gains 
 OTHER_LAWS = "other laws"
 """The group of differences that have no coefficient."""
 
-RunInputs = tuple[Settings, Sequence[Recording]]
+RunInputs = tuple[Settings, Sequence[JobFlight]]
 """A run's settings, with the fitted controller, and its recordings. Clocks and conditions of each
 flight are in its result."""
 

@@ -44,7 +44,7 @@ from tuner.result import (
     SearchResult,
     Status,
 )
-from tuner.search.job_flights import Recording
+from tuner.search.job_flights import JobFlight
 from tuner.search.problem import Job
 from tuner.search.progress import (
     Fitted,
@@ -257,7 +257,7 @@ def _regressed(
     )
 
 
-def _flight(job: Job, fitted: Fitted, recording: Recording, validation: Validation) -> FlightResult:
+def _flight(job: Job, fitted: Fitted, recording: JobFlight, validation: Validation) -> FlightResult:
     flight, name = recording.flight, recording.flight.name
     met = validation.fitted_starts.get(name)
     horizon = None
@@ -284,7 +284,7 @@ def _flight(job: Job, fitted: Fitted, recording: Recording, validation: Validati
     )
 
 
-def _clock(job: Job, fitted: Fitted, recording: Recording) -> Literal["given", "fitted", "assumed"]:
+def _clock(job: Job, fitted: Fitted, recording: JobFlight) -> Literal["given", "fitted", "assumed"]:
     """Return where a flight's clock offset comes from."""
     if recording.time_offset is not None:
         return "given"

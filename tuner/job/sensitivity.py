@@ -20,7 +20,7 @@ from tuner.job.results import settings_record, write_next_flight
 from tuner.objective.normal_equations import Objective, misfit, root_mean_squares, sums_at
 from tuner.options import ExaminationOptions
 from tuner.report import render
-from tuner.report.contents import About, Recording, write_traces
+from tuner.report.contents import About, ExaminedFlight, write_traces
 from tuner.result import RunResult, forget, place_for
 from tuner.search.continuation import SWITCH_GAIN
 from tuner.search.findings import UNMATCHED_RATIO, loop_findings
@@ -142,7 +142,7 @@ def examine_vehicle(
             settings=settings_record(settings, settings.controller, fitted),
             findings=list(fitted.findings),
             flights=[
-                Recording(name=f.name, path=str(f.path), sha256=f.sha256, duration=f.duration)
+                ExaminedFlight(name=f.name, path=str(f.path), sha256=f.sha256, duration=f.duration)
                 for f in job.flights
             ],
         )

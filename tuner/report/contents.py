@@ -106,7 +106,7 @@ def _about_run(run: Run) -> About:
         settings=result.settings,
         findings=list(result.findings),
         flights=[
-            Recording(name=f.name, path=f.path, sha256=f.sha256, duration=f.duration)
+            ExaminedFlight(name=f.name, path=f.path, sha256=f.sha256, duration=f.duration)
             for f in result.flights
         ],
     )
@@ -128,7 +128,7 @@ class SearchRecord(ResultFile):
     starts: list[Outcome]
 
 
-class Recording(Part):
+class ExaminedFlight(Part):
     """A flight that an examination read."""
 
     name: str
@@ -147,7 +147,7 @@ class About(ResultFile):
     versions: dict[str, str]
     settings: dict[str, JsonValue]
     findings: list[Finding]
-    flights: list[Recording]
+    flights: list[ExaminedFlight]
 
 
 def write_search(folder: Path, fitted: Fitted) -> None:

@@ -45,7 +45,7 @@ from tuner.vehicle.controller import PARAMETER_OF, with_parameters
 
 
 @dataclass(frozen=True)
-class Recording:
+class JobFlight:
     """A flight with its settings in a job.
 
     Attributes
@@ -99,7 +99,7 @@ def with_logged_parameters(settings: Settings) -> tuple[Settings, tuple[Finding,
 
 def read_recordings(
     settings: Settings, *, holdout: Sequence[str] | None = None, fits: bool = True
-) -> tuple[tuple[Recording, ...], tuple[Finding, ...]]:
+) -> tuple[tuple[JobFlight, ...], tuple[Finding, ...]]:
     """Read every mission of a job's files that can be simulated, with findings on the others.
 
     Parameters
@@ -139,7 +139,7 @@ def read_recordings(
     for name in job.holdout:
         if name not in names:
             raise InputError("--holdout", f"there is no flight '{name}'", did_you_mean(name, names))
-    recordings: list[Recording] = []
+    recordings: list[JobFlight] = []
     held_out = job.holdout if holdout is None else holdout
     for flight in flights:
         try:
@@ -190,16 +190,16 @@ def left_out_finding(name: str, error: RecordingError) -> Finding:
 
 
 def with_known(
-    recordings: Sequence[Recording], **known: Mapping[str, Any]
-) -> tuple[Recording, ...]:
-    """Return recordings with fields replaced: a `Recording`'s field = flight name -> value."""
+    recordings: Sequence[JobFlight], **known: Mapping[str, Any]
+) -> tuple[JobFlight, ...]:
+    """Return recordings with fields replaced: a `JobFlight`'s field = flight name -> value."""
     return tuple(
         replace(r, **{field: of_flight[r.flight.name] for field, of_flight in known.items()})
         for r in recordings
     )
 
 
-def recording_of(settings: Settings, flight: Flight, *, holdout: bool) -> Recording:
+def recording_of(settings: Settings, flight: Flight, *, holdout: bool) -> JobFlight:
     """Return a flight with the inlet and clock offset of a job's settings.
 
     Raises
@@ -235,12 +235,12 @@ def recording_of(settings: Settings, flight: Flight, *, holdout: bool) -> Record
         seconds = window_seconds([chosen], job.search.window)
         require_windows(flight, seconds, INLETS[chosen].fed(flight))
     late = None if offset == "free" else float(offset)
-    return Recording(flight, chosen, late, holdout, finding=finding)
+    return JobFlight(flight, chosen, late, holdout, finding=finding)
 
 
 def _with_fitted_inlet(
-    recording: Recording, recordings: Sequence[Recording], settings: Settings
-) -> Recording:
+    recording: JobFlight, recordings: Sequence[JobFlight], settings: Settings
+) -> JobFlight:
     """Return a held-out flight with the attitude inlet where all fitted ones have it.
 
     Otherwise its turning would be simulated with coefficients that nothing was fitted to.

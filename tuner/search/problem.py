@@ -26,7 +26,7 @@ from tuner.objective.segments import (
 )
 from tuner.objective.space import Space, space_of
 from tuner.recordings.flight import Flight
-from tuner.search.job_flights import Recording
+from tuner.search.job_flights import JobFlight
 from tuner.vehicle import condition_rows, initial_values
 from tuner.vehicle.model import model_of, schedule_of
 
@@ -71,7 +71,7 @@ class Job:
     """
 
     settings: Settings
-    recordings: tuple[Recording, ...]
+    recordings: tuple[JobFlight, ...]
     noise: Mapping[str, float]
     space: Space
     objective: Objective
@@ -124,7 +124,7 @@ class Job:
         }
 
 
-def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
+def job_of(settings: Settings, recordings: Sequence[JobFlight]) -> Job:
     """Build the problem of some recordings.
 
     Raises

@@ -36,7 +36,7 @@ from tuner.objective.inlets import INLETS, linear_interpolation
 from tuner.objective.rotor_signals import Source, squared_speed
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import local_parabolas, states_at
-from tuner.search.job_flights import Recording, regressors
+from tuner.search.job_flights import JobFlight, regressors
 from tuner.vehicle import VehicleFile
 
 BAND_HZ = (0.7, 8.0)
@@ -66,7 +66,7 @@ class Lag:
     sd: float
 
 
-def with_input_lags(recordings: Sequence[Recording], vehicle: VehicleFile) -> tuple[Recording, ...]:
+def with_input_lags(recordings: Sequence[JobFlight], vehicle: VehicleFile) -> tuple[JobFlight, ...]:
     """Return recordings with the lags of their inputs, where they can be estimated.
 
     Rotor speeds have the lag itself, if it is significant and no response of the loop. Commands
@@ -298,8 +298,8 @@ class RotorChange:
 
 
 def cut_at_rotor_changes(
-    recordings: Sequence[Recording], vehicle: VehicleFile
-) -> tuple[tuple[Recording, ...], tuple[Finding, ...]]:
+    recordings: Sequence[JobFlight], vehicle: VehicleFile
+) -> tuple[tuple[JobFlight, ...], tuple[Finding, ...]]:
     """Return recordings cut off before a rotor changes, and findings on those changes."""
     kept, findings = [], []
     for recording in recordings:

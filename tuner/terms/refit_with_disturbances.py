@@ -25,15 +25,10 @@ from tuner.search.listener import Reporter
 from tuner.search.problem import Job
 from tuner.search.progress import Fitted
 from tuner.terms.candidates import (
-    NEGLIGIBLE_SIZE,
-    Evidence,
     Selected,
     is_lumped,
     names_of,
     prior_presence_of,
-    selection_shifts,
-    substitutes_of,
-    values_instead,
     with_free,
     with_groups,
 )
@@ -43,6 +38,13 @@ from tuner.terms.linearisation import (
     linearised_from,
     neutral_of,
     vector_after,
+)
+from tuner.terms.model_averaging import (
+    NEGLIGIBLE_SIZE,
+    Evidence,
+    selection_shifts,
+    substitutes_of,
+    values_instead,
 )
 from tuner.terms.score import ACCEPTED, backward_elimination, score
 from tuner.terms.selection import (

@@ -45,22 +45,20 @@ from tuner.search.progress import Fitted, Progress, loop_of, point_estimates, wi
 from tuner.terms.candidates import (
     Selected,
     candidate_groups,
-    coefficients_of,
+    coefficient_names,
     condition_groups,
-    conditions_of,
+    condition_names,
     groups_named,
     is_lumped,
     names_of,
     neutral_values,
-    offsets_of,
+    offsets_for,
     prior_presence_of,
-    selection_shifts,
-    substitutes_of,
-    values_instead,
     with_groups,
     with_terms,
 )
 from tuner.terms.linearisation import LinearisedFit, linearise, predicted_losses, vector_after
+from tuner.terms.model_averaging import selection_shifts, substitutes_of, values_instead
 from tuner.terms.score import Score, backward_elimination, row_of, score
 from tuner.uncertainty.model_error import (
     GAIN_AXES,
@@ -136,7 +134,7 @@ class Selection:
             linear, state.fitted.objective.space, model, kept, (columns for columns, _ in outside)
         )
         moves = selection_shifts(linear, model, outside, substitutes)
-        coefficients = [name for name in names if name not in conditions_of(self.candidates)]
+        coefficients = [name for name in names if name not in condition_names(self.candidates)]
         own = linear.columns_of(coefficients)
         shifts = dict(zip(coefficients, moves[own].tolist(), strict=True))
         return replace(selected, selection_shifts=shifts, substitutes=values_instead(substitutes))
@@ -222,7 +220,7 @@ class Selection:
         change = linear.step(free, from_=linear.to_neutral(gone))
         of_flight, offsets = state.fitted.objective.of_flight, np.array(state.fitted.point.offsets)
         for name, unit in zip(of_flight, units_of(of_flight), strict=True):
-            if name in conditions_of(kept):
+            if name in condition_names(kept):
                 offsets[of_flight.index(name)] += change[linear.columns_of([name])] / unit
         moved = vector_after(
             space, state.fitted.point.coefficients, change[linear.columns_of(space.names)]
@@ -240,8 +238,8 @@ class Selection:
         self, state: LinearisedFit, groups: Groups, *, anew: bool = False, roughly: bool = True
     ) -> Fitted:
         """Return the fit with exactly these groups, from the last fit's end or from the start."""
-        wanted, around = coefficients_of(groups), conditions_of(self.candidates)
-        idle = tuple(name for name in around if name not in conditions_of(groups))
+        wanted, around = coefficient_names(groups), condition_names(self.candidates)
+        idle = tuple(name for name in around if name not in condition_names(groups))
         objective, vector = self._problem(state.fitted, wanted)
         new = [group for group in groups if group not in state.added]
         new_ones = [name for group in new for name in groups[group] if name in wanted]
@@ -250,7 +248,7 @@ class Selection:
             objective=objective,
             point=Point(
                 with_start_values(objective.space, vector, new_ones),
-                offsets_of(state.fitted, objective, reset=idle),
+                offsets_for(state.fitted, objective, reset=idle),
             ),
         )
         offsets = free_parameters(self.job).offsets
@@ -281,14 +279,14 @@ class Selection:
 
     def linearised(self, fitted: Fitted, added: Groups) -> LinearisedFit:
         """Return a fit linearised by all candidates."""
-        objective, vector = self._problem(fitted, coefficients_of(self.candidates))
-        at = Point(vector, offsets_of(fitted, objective))
+        objective, vector = self._problem(fitted, coefficient_names(self.candidates))
+        at = Point(vector, offsets_for(fitted, objective))
         linear = linearise(
             objective,
             at,
             fitted.criterion,
             offsets_fitted=np.asarray(at.offsets) != 0.0,
-            conditions=conditions_of(self.candidates),
+            conditions=condition_names(self.candidates),
             readings=with_other_readings(objective, at, self.job.fitted).values(),
         )
         return LinearisedFit(fitted, added, linear)
@@ -299,11 +297,11 @@ class Selection:
         The model has all candidate terms and conditions, at their neutral values.
         """
         objective = with_loop(self.fitted.objective, loop_of(fitted.objective))
-        neutral = neutral_values(coefficients_of(self.candidates))
+        neutral = neutral_values(coefficient_names(self.candidates))
         values = {name: np.asarray(value) for name, value in neutral.items()}
         objective = replace(objective, model=with_coefficients(objective.model, values))
         objective, point = with_terms(objective, self.fitted.point, names, self.job.settings.job)
-        objective, point = with_conditions(objective, point, conditions_of(self.candidates))
+        objective, point = with_conditions(objective, point, condition_names(self.candidates))
         own, pairs = fitted.vector, zip(objective.space.names, point.coefficients, strict=True)
         return objective, np.array([own.get(name, neutral) for name, neutral in pairs])
 

@@ -12,7 +12,7 @@ from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.comparison import Comparison, compare, table_of, write_table
 from tuner.options import Options
-from tuner.search.job_flights import Recording
+from tuner.search.job_flights import JobFlight
 from tuner.vehicle import ControllerFile
 
 LAPS = np.array([20.0, 40.0])
@@ -172,10 +172,10 @@ def test_wrong_input_is_one_line_and_status_2(bag, arguments, expected, capsys):
 def test_a_vehicle_that_the_mixer_cannot_fly_is_refused(flight, updated):
     six = updated.model_copy(update={"rotors": (*updated.rotors, *updated.rotors[:2])})
     with pytest.raises(ConfigError, match="has 6 rotors"):
-        Comparison([Recording(flight)], ControllerFile()).fly(six)
+        Comparison([JobFlight(flight)], ControllerFile()).fly(six)
 
 
 def test_a_recording_without_reference_is_refused(flight):
     bare = replace(flight, signals={"position": flight.signals["position"]})
     with pytest.raises(InputError, match="no reference"):
-        Comparison([Recording(bare)], ControllerFile())
+        Comparison([JobFlight(bare)], ControllerFile())

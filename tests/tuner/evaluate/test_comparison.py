@@ -26,7 +26,7 @@ from tuner.objective.trajectory import with_named_reference
 from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.recordings.loader import load_flight
-from tuner.search.job_flights import Recording, read_recordings
+from tuner.search.job_flights import JobFlight, read_recordings
 from tuner.search.problem import limits_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, read_vehicle, with_values
 
@@ -66,7 +66,7 @@ def test_a_stretch_is_cut_by_each_clock():
 
 
 def test_the_vehicle_that_flew_meets_its_recording(flight, updated):
-    comparison = Comparison([Recording(flight)], ControllerFile())
+    comparison = Comparison([JobFlight(flight)], ControllerFile())
     flown = comparison.fly(updated, forces=True)["small_circle"]
     assert flown.crash_time is None
     for axis in ("x", "y", "z"):
@@ -99,15 +99,15 @@ def test_a_late_clock_is_taken_back(flight, updated):
             for name, data in flight.series.items()
         },
     )
-    as_is = Comparison([Recording(late)], ControllerFile()).fly(updated)["small_circle"].rmse
-    known = Comparison([Recording(late, time_offset=0.05)], ControllerFile()).fly(updated)
+    as_is = Comparison([JobFlight(late)], ControllerFile()).fly(updated)["small_circle"].rmse
+    known = Comparison([JobFlight(late, time_offset=0.05)], ControllerFile()).fly(updated)
     assert known["small_circle"].rmse.x < 3e-4
     assert as_is.x > 0.02
 
 
 def test_a_vehicle_that_cannot_fly_crashes(flight, updated):
     heavy = with_values(updated, {"mass": 9.0})
-    crash = Comparison([Recording(flight)], ControllerFile()).fly(heavy, forces=True)[
+    crash = Comparison([JobFlight(flight)], ControllerFile()).fly(heavy, forces=True)[
         "small_circle"
     ]
     assert 0 < crash.crash_time < 12
@@ -122,7 +122,7 @@ def test_flights_of_different_length_fly_side_by_side(flight, updated):
         time=flight.time[:600],
         signals={name: values[:600] for name, values in flight.signals.items()},
     )
-    both = Comparison([Recording(flight), Recording(half)], ControllerFile()).fly(updated)
+    both = Comparison([JobFlight(flight), JobFlight(half)], ControllerFile()).fly(updated)
     assert both["half"].position.time[-1] <= half.duration
     assert both["half"].rmse.x < 2e-4
     assert both["small_circle"].rmse.x < 2e-4
@@ -170,7 +170,7 @@ def met():
     shipped = ControllerFile()
     controller = shipped.replace(mixer=shipped.mixer.replace(saturation_feedback=False))
     flights = [load_flight(FLIGHTS / f"{name}.bag") for name in NAMES]
-    return noise_of(flights), Comparison([Recording(flight) for flight in flights], controller).fly(
+    return noise_of(flights), Comparison([JobFlight(flight) for flight in flights], controller).fly(
         vehicle
     )
 

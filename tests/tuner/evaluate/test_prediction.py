@@ -27,7 +27,7 @@ from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.recordings.loader import InertialFlight
 from tuner.recordings.states import MIN_HALF_WIDTH_S
-from tuner.search.job_flights import Recording, read_recordings
+from tuner.search.job_flights import JobFlight, read_recordings
 from tuner.vehicle import ControllerFile, with_values
 
 
@@ -115,7 +115,7 @@ def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
     wrong = with_values(updated, {"motor_constant": 0.98 * updated.aerodynamics.motor_constant})
 
     def errors(flight):
-        comparison = Comparison([Recording(flight, inlet)], ControllerFile())
+        comparison = Comparison([JobFlight(flight, inlet)], ControllerFile())
         name, predicted = (
             flight.name,
             predict(wrong, flight, inlet, stride=1.0),
@@ -149,7 +149,7 @@ def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
 
 def test_a_comparison_of_windows_predicts_and_names_what_is_fitted_otherwise(full_flight, updated):
     wrong = with_values(updated, {"torque_trim_x": 0.02})
-    comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
+    comparison = Comparison([JobFlight(full_flight, "rotor_speed")], ControllerFile())
     predicted = comparison.fly(wrong)[full_flight.name].rmse
     met = comparison.fly(wrong, fitted_starts=True)[full_flight.name].rmse
     assert predicted.roll > 3 * met.roll  # a trim in each window hides what is wrong
@@ -159,7 +159,7 @@ def test_a_comparison_of_windows_predicts_and_names_what_is_fitted_otherwise(ful
 def test_fitted_starts_meet_a_flight_no_worse_than_recorded_ones(full_flight, updated):
     # rotors that lift half as much: steps towards the likeliest start overshoot
     wrong = with_values(updated, {"angular_drag_x": -0.2, "torque_trim_x": 0.3})
-    comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
+    comparison = Comparison([JobFlight(full_flight, "rotor_speed")], ControllerFile())
     predicted = comparison.fly(wrong)[full_flight.name]
     met = comparison.fly(wrong, fitted_starts=True)[full_flight.name]
     assert met.rmse.norm("attitude") < predicted.rmse.norm("attitude")
@@ -222,8 +222,8 @@ def test_rotors_of_a_window_followed_the_commands_at_their_corrected_times(full_
     plain, corrected = (
         Comparison([recording], ControllerFile()).fly(updated)[flight.name].attitude.error
         for recording in (
-            Recording(flight, "actuator"),
-            Recording(late, "actuator", input_late=0.05),
+            JobFlight(flight, "actuator"),
+            JobFlight(late, "actuator", input_late=0.05),
         )
     )
     apart = np.abs(corrected - plain).max(axis=1)

@@ -7,7 +7,7 @@ from tuner.core.shipped import configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.records import AxesRmse
 from tuner.result import CoefficientResult, FlightResult, RunResult, SearchResult, read_run
-from tuner.search.job_flights import Recording
+from tuner.search.job_flights import JobFlight
 from tuner.vehicle import (
     COEFFICIENTS,
     ControllerFile,
@@ -119,7 +119,7 @@ def make_run(tmp_path):
 def run(bag, flight, updated, tmp_path):
     """A result folder that is true of one recording, which it held out."""
     start = with_values(updated, {"rotor_drag_coefficient": 4e-4})
-    comparison = Comparison([Recording(flight)], ControllerFile())
+    comparison = Comparison([JobFlight(flight)], ControllerFile())
     coefficients = {
         name: CoefficientResult(
             unit=COEFFICIENTS[name].unit,

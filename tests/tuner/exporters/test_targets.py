@@ -19,7 +19,7 @@ from tuner.exporters.target import target_of, write
 from tuner.exporters.targets.mujoco import MUJOCO
 from tuner.options import ExportOptions
 from tuner.recordings.loader import load_flight
-from tuner.search.job_flights import Recording
+from tuner.search.job_flights import JobFlight
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, write_vehicle
 
 TODAY = date(2024, 5, 6)
@@ -142,7 +142,7 @@ def test_another_simulators_body_is_what_moves(updated, tmp_path):
     flights = tuner.simulate("circle", vehicle=updated, radius=0.3, speed=1.2, duration=4.0)
     write_flights(flights, tmp_path / "short.bag")
     flight = load_flight(tmp_path / "short.bag")
-    errors = Comparison([Recording(flight)], ControllerFile()).fly(updated, flier=flier_of(Gliding))
+    errors = Comparison([JobFlight(flight)], ControllerFile()).fly(updated, flier=flier_of(Gliding))
     (missed,) = errors.values()
     start = flight.signals["position"][0]
     flown = missed.position.recorded + missed.position.error
@@ -155,7 +155,7 @@ def test_mujoco_itself_flies_what_is_written_for_it(flight, updated):
     pytest.importorskip("mujoco", reason="MuJoCo is not installed: the extra simulators")
 
     draft = target_of("mujoco").draft(updated, "by a test", MUJOCO, None)
-    comparison = Comparison([Recording(flight)], ControllerFile())
+    comparison = Comparison([JobFlight(flight)], ControllerFile())
     own = comparison.fly(draft.vehicle)["small_circle"].rmse
     there = comparison.fly(draft.vehicle, flier=draft.flier)["small_circle"].rmse
     for axis in ("x", "y", "z"):

@@ -25,7 +25,7 @@ from tuner.recordings.notes import Cause
 from tuner.report import render
 from tuner.report.contents import SearchRecord
 from tuner.result import OF_A_RUN, read_run
-from tuner.search.job_flights import Recording
+from tuner.search.job_flights import JobFlight
 from tuner.search.listener import Listener, PointEstimate
 from tuner.vehicle import ControllerFile, read_controller, read_vehicle, values_of
 
@@ -159,7 +159,7 @@ def test_a_run_started_from_best_fit_starts_where_the_fit_ended(finished):
     folder, result = finished
     controller = ControllerFile.model_validate(result.settings["controller"])
     recordings = [
-        Recording(load_flight(flight.path), time_offset=flight.time_offset)
+        JobFlight(load_flight(flight.path), time_offset=flight.time_offset)
         for flight in result.flights
     ]
     flown = Comparison(recordings, controller).fly(read_vehicle(folder / "best_fit.yaml"))

@@ -16,7 +16,7 @@ from tuner.objective.rotor_signals import motor_order, order_findings
 from tuner.options import Options
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
-from tuner.search.job_flights import Recording, read_recordings
+from tuner.search.job_flights import JobFlight, read_recordings
 from tuner.search.recorded_rotors import Lag, _is_late, input_lag, with_input_lags
 
 RATE = 500.0
@@ -98,11 +98,11 @@ def test_noise_alone_shows_no_lag(broadband, updated):
 
 def test_each_fitted_flight_has_its_own_lateness_and_a_held_out_one_the_mean(broadband, updated):
     recordings = [
-        Recording(late_by(broadband, 0.015, name="a"), "rotor_speed", None),
-        Recording(late_by(broadband, -0.005, name="b"), "rotor_speed", None),
-        Recording(late_by(broadband, 0.02, name="c"), "rotor_speed", None, holdout=True),
-        Recording(late_by(broadband, 0.02, name="d"), "rotor_speed", 0.0),
-        Recording(replace(broadband, name="e"), "reference", None),
+        JobFlight(late_by(broadband, 0.015, name="a"), "rotor_speed", None),
+        JobFlight(late_by(broadband, -0.005, name="b"), "rotor_speed", None),
+        JobFlight(late_by(broadband, 0.02, name="c"), "rotor_speed", None, holdout=True),
+        JobFlight(late_by(broadband, 0.02, name="d"), "rotor_speed", 0.0),
+        JobFlight(replace(broadband, name="e"), "reference", None),
     ]
     late = [r.input_late for r in with_input_lags(recordings, updated)]
     assert late[0] == pytest.approx(0.015, abs=0.002)
@@ -118,7 +118,7 @@ def test_the_mean_lateness_of_commands_is_the_vehicles_own_lag(broadband, update
         series = dict(broadband.series) | {
             "command": Series(command.time + seconds, command.values)
         }
-        return Recording(replace(broadband, series=series, name=name), "actuator", None)
+        return JobFlight(replace(broadband, series=series, name=name), "actuator", None)
 
     first, second = with_input_lags([moved(0.0, "a"), moved(0.012, "b")], updated)
     assert first.input_late == pytest.approx(-second.input_late)
@@ -232,5 +232,5 @@ def test_where_gaps_are_everywhere_no_lateness_is_believed(broadband, updated):
     speed = flight.series["rotor_speed"]
     there = np.arange(len(speed.time)) % 8 < 5
     series = dict(flight.series) | {"rotor_speed": Series(speed.time[there], speed.values[there])}
-    recordings = [Recording(replace(flight, series=series), "rotor_speed", None)]
+    recordings = [JobFlight(replace(flight, series=series), "rotor_speed", None)]
     assert [r.input_late for r in with_input_lags(recordings, updated)] == [0.0]

@@ -14,7 +14,7 @@ from tuner.job.prepare import prepare
 from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import (
-    Recording,
+    JobFlight,
     read_recordings,
     with_known,
 )
@@ -98,8 +98,8 @@ def test_recordings_of_which_no_flight_can_be_made_are_left_out_by_name(tmp_path
 
 
 def test_a_flight_alone_enters_as_reference_on_time(flights):
-    assert Recording(flights[0]).inlet == "reference"
-    assert Recording(flights[0]).time_offset == 0.0
+    assert JobFlight(flights[0]).inlet == "reference"
+    assert JobFlight(flights[0]).time_offset == 0.0
 
 
 @pytest.mark.parametrize(

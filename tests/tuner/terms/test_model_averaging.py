@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.terms.candidates import Evidence, prior_presence_of, selection_shifts
+from tuner.terms.candidates import prior_presence_of
 from tuner.terms.linearisation import LinearisedLoss
+from tuner.terms.model_averaging import Evidence, selection_shifts
 
 MODEL, TERM = np.array([0]), np.array([1])
 PRESENT = (TERM, 1.0)

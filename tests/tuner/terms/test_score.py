@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.terms.candidates import selection_shifts
 from tuner.terms.linearisation import LinearisedLoss, section_loss_ratio
+from tuner.terms.model_averaging import selection_shifts
 from tuner.terms.score import Score, _Gain, backward_elimination, chance_of_gusts, row_of, score
 from tuner.vehicle.selection_table import SelectionCode
 
