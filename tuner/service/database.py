@@ -24,6 +24,7 @@ from sqlalchemy import (
     Text,
     create_engine,
     event,
+    inspect,
     make_url,
 )
 from sqlalchemy.exc import (
@@ -246,21 +247,25 @@ class Database:
         self._turn = Lock() if one_writer else None
 
     def migrate(self) -> None:
-        """Bring the tables to this version of the program.
+        """Make the tables, or bring those that are there to this version of the program.
 
         Raises
         ------
         InputError
-            The database cannot be reached, or is of a newer version.
+            The database cannot be reached, or is of a version that this one does not know.
         """
         config = Config()
         config.set_main_option("script_location", "tuner.service:migrations")
         try:
             with _outages(), self._writer.begin() as connection:
                 config.attributes["connection"] = connection
-                command.upgrade(config, "head")
+                if inspect(connection).has_table(JobRow.__tablename__):
+                    command.upgrade(config, "head")
+                else:
+                    Base.metadata.create_all(connection)
+                    command.stamp(config, "head")
         except CommandError:
-            what = "was made by a newer version of tune"
+            what = "was made by another version of tune"
             raise InputError("the database", what, "use that version, or another --data") from None
 
     @contextmanager

@@ -225,9 +225,11 @@ def test_the_migrations_make_the_tables_of_this_program(idle):
     from alembic.autogenerate import compare_metadata  # noqa: PLC0415
     from alembic.migration import MigrationContext  # noqa: PLC0415
 
+    idle.database.migrate()  # as a server that is started again
     with idle.database.reading() as session:
         context = MigrationContext.configure(session.connection())
         assert compare_metadata(context, Base.metadata) == []
+        assert context.get_current_revision() == "0003"
 
 
 @pytest.mark.parametrize(
@@ -237,7 +239,7 @@ def test_the_migrations_make_the_tables_of_this_program(idle):
             lambda file: sqlite3.connect(file, isolation_level=None).execute(
                 "UPDATE alembic_version SET version_num = '9999'"
             ),
-            "the database: was made by a newer version of tune; use that version",
+            "the database: was made by another version of tune; use that version",
         ),
         (lambda file: file.write_bytes(b"no table" * 999), "the database: is damaged, or no data"),
     ],
