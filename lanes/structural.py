@@ -132,6 +132,10 @@ def _iota(lower: Lowering, eqn: JaxprEqn, _: list[Value]) -> Value:
     return array_of(numbers, shape)
 
 
+def _empty(_: Lowering, eqn: JaxprEqn, __: list[Value]) -> Value:
+    return array_of([constant(type_of(eqn.params["dtype"]), 0)], ())  # as XLA has it
+
+
 def _reduce(name: str) -> Rule:
     def rule(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
         given, axes = lower.elements(operands[0]), eqn.params["axes"]
@@ -239,6 +243,7 @@ STRUCTURAL.update(
         ),
         "pad": _pad,
         "iota": _iota,
+        "empty2": _empty,
         "reduce_sum": _reduce("add"),
         "reduce_max": _reduce("max"),
         "reduce_min": _reduce("min"),

@@ -218,6 +218,13 @@ def test_long_arrays_are_joined_and_cut_without_being_laid_out():
     agree(read, RANDOM.normal(size=(3, 9)), numbers)
 
 
+def test_what_one_branch_alone_remembers_for_its_derivative():
+    def branched(x):
+        return lax.cond(x > 0.3, lambda x: jnp.sin(x) * x, jnp.exp, x)
+
+    agree({"cond": jax.grad(branched)}, RANDOM.normal(size=9), rtol=8e-15)
+
+
 def test_functions_that_move_elements():
     agree(ARRAYS, RANDOM.normal(size=(6, 11)), rtol=8e-15)
 

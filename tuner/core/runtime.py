@@ -127,6 +127,8 @@ def release_of(distribution: str) -> str:
 def set_environment() -> None:
     """Set what jax and NumPy read from the environment when they are imported."""
     os.environ.setdefault("NPROC", "1")
+    # of a GPU, jax would take three quarters of the memory, for what is a processor's work
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
     for (
         name
     ) in THREAD_VARIABLES:  # matrices are small: more threads spin for longer than they compute

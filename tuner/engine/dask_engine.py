@@ -84,6 +84,8 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
             pin({self.pool[(first + i) % len(self.pool)] for i in range(self.cores)})
         if self.gpus:
             os.environ["CUDA_VISIBLE_DEVICES"] = str(int(worker.name) % self.gpus)
+            os.environ["JAX_PLATFORMS"] = ""  # what there is: who started it has the processor's
+            os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # others share it
         configure()
 
 

@@ -108,6 +108,16 @@ def test_an_unknown_release_gets_no_flags(monkeypatch: pytest.MonkeyPatch) -> No
         os.environ.pop("XLA_FLAGS", None)
 
 
+def test_a_gpu_is_left_alone_unless_the_user_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for given, used in {None: "cpu", "cuda,cpu": "cuda,cpu", "": ""}.items():
+        others = {name: v for name, v in os.environ.items() if name != "JAX_PLATFORMS"}
+        monkeypatch.setattr(
+            os, "environ", others if given is None else others | {"JAX_PLATFORMS": given}
+        )
+        runtime.set_environment()
+        assert os.environ["JAX_PLATFORMS"] == used
+
+
 def test_a_program_that_has_already_computed_goes_on(tmp_path: Path) -> None:
     report = in_fresh_python(tmp_path, before="import jax.numpy as jnp; jnp.ones(3).sum()")
     assert report["dtype"] == "float64"

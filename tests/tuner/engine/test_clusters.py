@@ -1,12 +1,15 @@
 import contextlib
+import os
 import socket
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 from tuner.cli import main
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
+from tuner.engine import dask_engine
 from tuner.engine.dask_engine import dask, pod_specification
 from tuner.engine.engine import ClusterFile, job_script_for, read_cluster
 
@@ -115,3 +118,13 @@ def test_a_missing_extra_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "dask.config", None)
     with pytest.raises(InputError, match=r"need dask.*pip install 'multirotor-tune\[cluster\]'"):
         job_script_for(str(FOLDER / "slurm.yaml"))
+
+
+def test_workers_take_gpus_in_turn_though_their_starter_keeps_to_the_processor(monkeypatch):
+    monkeypatch.setattr(dask_engine, "configure", lambda: None)
+    for name, gpu in {0: "0", 1: "1", 4: "1"}.items():
+        monkeypatch.setattr(os, "environ", {"JAX_PLATFORMS": "cpu"})
+        dask_engine.SetUp(gpus=3).setup(SimpleNamespace(name=name))
+        assert os.environ["CUDA_VISIBLE_DEVICES"] == gpu
+        assert os.environ["JAX_PLATFORMS"] == ""
+        assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"
