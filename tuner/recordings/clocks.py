@@ -20,6 +20,7 @@ from tuner.recordings.interpolation import (
     RATE_HZ,
     body_rate_of,
     correlation,
+    correlations,
     middle_clock,
     resample,
     rms,
@@ -262,29 +263,25 @@ def lag_between(one: Array, other: Array) -> float | None:
     None if they are not alike; 0 if another delay makes them hardly more so.
     """
     # The best whole lag first, then a parabola through the three highest points.
-    max_lag = round(MAX_POSE_OFFSET_S * RATE_HZ)
-    lags = np.arange(-max_lag, max_lag + 1)
+    furthest = round(MAX_POSE_OFFSET_S * RATE_HZ)
     count = len(one)
-    score = np.array(
-        [  # of the one moved back by a lag
-            correlation(
-                one[max(0, lag) : count + min(0, lag)], other[max(0, -lag) : count - max(0, lag)]
-            )
-            for lag in lags.tolist()
-        ]
-    )
-    best = int(np.argmax(score))
-    mismatch = 1 - score
+
+    def score(lag: int) -> float:
+        """Return the correlation with the one signal moved back by a lag."""
+        moved = one[max(0, lag) : count + min(0, lag)]
+        return correlation(moved, other[max(0, -lag) : count - max(0, lag)])
+
+    best, on_time = int(np.argmax(correlations(one, other, furthest))) - furthest, score(0)
+    left, peak, right = (score(best + side) for side in (-1, 0, 1))
     if (
-        score[best] < MIN_CORRELATION
-        or best in (0, len(lags) - 1)
-        or mismatch[best] > MAX_MISMATCH_RATIO * mismatch[max_lag]
+        peak < MIN_CORRELATION
+        or abs(best) == furthest
+        or 1 - peak > MAX_MISMATCH_RATIO * (1 - on_time)
     ):
-        return 0.0 if score[max_lag] > MIN_CORRELATION else None
-    left, peak, right = score[best - 1 : best + 2]
+        return 0.0 if on_time > MIN_CORRELATION else None
     curvature = left - 2 * peak + right
     fine = 0.5 * (left - right) / curvature if curvature < 0 else 0.0
-    return float((lags[best] + fine) / RATE_HZ)
+    return float((best + fine) / RATE_HZ)
 
 
 def align_pose(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -191,6 +192,41 @@ def correlation(a: Array, b: Array) -> float:
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     size = float(np.sqrt((a * a).sum() * (b * b).sum()))
     return float((a * b).sum() / size) if size > 0 else 0.0
+
+
+def correlations(a: Array, b: Array, furthest: int) -> Array:
+    """Return `correlation` with `a` moved back by each lag, but for rounding.
+
+    Parameters
+    ----------
+    a, b
+        Signals (n, k).
+    furthest
+        The lags, in rows, are -furthest, ..., furthest.
+    """
+    spectra = list[Any]()
+    for values in (a, b):
+        known = np.asarray(np.isfinite(values).all(axis=1))
+        about = np.where(
+            known[:, None], values - values[known].sum(axis=0) / max(known.sum(), 1), 0
+        )
+        held = np.column_stack([known, (about**2).sum(axis=1), about])
+        spectra.append(np.fft.rfft(held, 2 ** (len(a) + furthest).bit_length(), axis=0))
+    left, right = spectra[0], spectra[1].conj()
+
+    def summed(product: Any) -> Array:
+        """Return sums over the rows that both have at a lag, (lags, ...)."""
+        return np.asarray(np.fft.irfft(product, axis=0)[np.arange(-furthest, furthest + 1)])
+
+    count = np.maximum(np.rint(summed(left[:, 0] * right[:, 0])), 1)
+    of_a, of_b = summed(left[:, 2:] * right[:, :1]), summed(left[:, :1] * right[:, 2:])
+    squares = (
+        np.column_stack([summed(left[:, 1] * right[:, 0]), summed(left[:, 0] * right[:, 1])])
+        - np.column_stack([(of_a**2).sum(axis=1), (of_b**2).sum(axis=1)]) / count[:, None]
+    )
+    both = summed((left[:, 2:] * right[:, 2:]).sum(axis=1)) - (of_a * of_b).sum(axis=1) / count
+    certain = (count >= 20) & (squares > 1e-9 * squares.max(axis=0)).all(axis=1)
+    return np.where(certain, both / np.sqrt(np.where(certain, squares.prod(axis=1), 1.0)), 0.0)
 
 
 def rms(values: Array) -> float:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from tuner.recordings.flight import Series
-from tuner.recordings.interpolation import resample
+from tuner.recordings.interpolation import correlation, correlations, resample
 
 CLOCK = np.arange(0, 1.001, 0.01)
 
@@ -60,3 +60,22 @@ def test_rotors_without_tachometer_stay_unknown() -> None:
     got = resample("rotor_speed", Series(CLOCK, values), CLOCK)
     assert np.isnan(got[:, :3]).all()
     assert (got[:, 3] == 600).all()
+
+
+def test_correlations_of_all_lags_are_those_of_each() -> None:
+    """Also where values are missing, few rows are left, or a signal rests in all of them."""
+    random, count, furthest = np.random.default_rng(0), 300, 60
+    one = np.cumsum(random.normal(size=(count, 2)), axis=0) + 50.0
+    late = np.roll(one, 7, axis=0)
+    rests, few = late.copy(), late.copy()
+    one[random.random(count) < 0.1, 1], few[:270], rests[:270] = np.nan, np.nan, 3.0
+    for other in (late, rests, few):
+        each = [
+            correlation(
+                one[max(0, lag) : count + min(0, lag)], other[max(0, -lag) : count - max(0, lag)]
+            )
+            for lag in range(-furthest, furthest + 1)
+        ]
+        np.testing.assert_allclose(correlations(one, other, furthest), each, atol=1e-9)
+        assert np.ptp(each) > 0.1
+        assert (0.0 in each) == (other is not late)
