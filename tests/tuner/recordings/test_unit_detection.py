@@ -180,20 +180,21 @@ def lengths_and_attitude(flown: Flight) -> dict[str, RawSeries]:
     return {name: RawSeries(flown.series[name].time, flown.series[name].values) for name in names}
 
 
-@UNITS
 @pytest.mark.parametrize(
     "name", ["circle_3mps", "circle_4mps", "diagonal_3mps", "lemniscate_4mps", "yaw_spin_3rps"]
 )
-def test_the_shipped_flights_in_other_units(name: str, unit: str) -> None:
+def test_the_shipped_flights_in_other_units(name: str) -> None:
     """All but the yaw spin, which holds still to a hundredth of a degree, and is left as it is."""
-    signals = in_unit(lengths_and_attitude(load_flight(making.FLIGHTS / f"{name}.bag")), unit)
-    assert units(signals) == {"si" if name == "yaw_spin_3rps" else unit}
+    signals = lengths_and_attitude(load_flight(making.FLIGHTS / f"{name}.bag"))
+    for unit in PER_METRE:
+        assert units(in_unit(signals, unit)) == {"si" if name == "yaw_spin_3rps" else unit}
 
 
-@UNITS
 @pytest.mark.skipif(not FILES, reason=f"no real flights in {REAL}")
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_real_flights_in_other_units(path: Path, unit: str) -> None:
+def test_real_flights_in_other_units(path: Path) -> None:
     flown = load_flight(path)
     assert not [note for note in flown.notes if note.code in ("unit_read", "unit_doubted")]
-    assert units(in_unit(lengths_and_attitude(flown), unit)) == {unit}
+    signals = lengths_and_attitude(flown)
+    for unit in PER_METRE:
+        assert units(in_unit(signals, unit)) == {unit}
