@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
 from itertools import compress, pairwise
 from math import lcm, prod
+from threading import Lock
 from typing import Any, TypeAlias
 
 import jax
@@ -172,6 +173,7 @@ class Program:
         names = {length for a in leaves for length in a.shape if isinstance(length, str)}
         self.names = tuple(sorted(names))
         self._kernels: dict[int, _Compiled | None] = {}
+        self._builds = Lock()
         #: Of `program_of`: what makes it again in another process, and its arguments.
         self.made_by: tuple[Callable[..., Program], tuple[Any, ...]] | None = None
         self.key: str | None = None
@@ -257,15 +259,16 @@ class Program:
     def _kernel(self, steps: int = 1) -> _Compiled | None:
         """Return the kernel for so many lanes times turns; None where something has no rule."""
         vectors = 2 if steps >= MIN_STEPS_OF_TWO_VECTORS and not self.moving and optimises() else 1
-        if vectors not in self._kernels:
-            self._kernels[vectors] = None
-            try:
-                self._kernels[vectors] = _Compiled(self, vectors)
-            except UnsupportedError as missing:
-                logger.debug("%s runs through XLA: no rule for %s", self.name, missing)
-                what = f"{self.name}: no rule for {missing}"
-                jax.monitoring.record_event_duration_secs(FALLBACK_EVENT, 0.0, fun_name=what)
-        return self._kernels[vectors]
+        with self._builds:
+            if vectors not in self._kernels:
+                self._kernels[vectors] = None
+                try:
+                    self._kernels[vectors] = _Compiled(self, vectors)
+                except UnsupportedError as missing:
+                    logger.debug("%s runs through XLA: no rule for %s", self.name, missing)
+                    what = f"{self.name}: no rule for {missing}"
+                    jax.monitoring.record_event_duration_secs(FALLBACK_EVENT, 0.0, fun_name=what)
+            return self._kernels[vectors]
 
     @property
     def is_kernel(self) -> bool:

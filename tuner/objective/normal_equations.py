@@ -9,10 +9,14 @@ flight follows from its residuals.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import replace
+from functools import cache
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -24,6 +28,7 @@ from lanes import Program
 from sim_jax.schedule import Schedule
 from sim_jax.state import Limits
 from tuner.core.numerics import Array
+from tuner.core.runtime import cores
 from tuner.engine import Report, current
 from tuner.objective.criterion import (
     OFFSET_SD,
@@ -41,6 +46,8 @@ from tuner.objective.segments import OFFSETS, Segments
 from tuner.objective.simulation import EFFECTS, Flown, flight_program, fly
 from tuner.objective.space import Space
 from tuner.vehicle.model import Model, with_coefficients
+
+R = TypeVar("R")
 
 MEMORY = 2**30
 """Default largest size of derivatives in memory, bytes."""
@@ -165,10 +172,11 @@ class Objective(eqx.Module):
 
     def compare(
         self, point: Point, criterion: Criterion, moving: Mapping[str, int] = MappingProxyType({})
-    ) -> tuple[Array, Iterator[tuple[str, Block]]]:
-        """Fly the segments; return (F,) times of crashes, and channels with blocks of residuals.
+    ) -> tuple[Array, Iterator[tuple[str, Callable[[], Block]]]]:
+        """Fly the segments; return (F,) times of crashes, and what returns blocks of residuals.
 
-        The arguments are those of `fly`. Where conditions move, so do the offsets.
+        The arguments are those of `fly`. Where conditions move, so do the offsets. Each block
+        comes with its channel.
         """
         flown = self.fly(point, criterion, moving)
         reading = Reading(
@@ -268,20 +276,30 @@ class Objective(eqx.Module):
         squares, counts = ({n: np.zeros(segments) for n in self.channels} for _ in range(2))
         slope = {name: np.zeros((segments, starts)) for name in self.channels}
         bend = {name: np.zeros((segments, starts, starts)) for name in self.channels}
-        for name, block in blocks:
-            some, scale = block.segments, criterion.scale[name][self.flight[block.segments]]
-            squares[name][some] += np.einsum("fnk,fnk->f", block.errors, block.errors)
-            counts[name][some] += block.counts.sum(axis=(1, 2))
+
+        def summed(name: str, block: Block) -> _BlockSums:
+            scale = criterion.scale[name][self.flight[block.segments]]
             scaled = block.errors / scale[:, None, None]
-            loss[some] += 0.5 * huber_loss(scaled, huber).sum(axis=(1, 2))
-            if total:
-                along, across = gauss_newton(block.columns, scaled, scale, huber)
-                gradient[some] += along
-                hessian[some] += across
-            if starts:
-                own = block.columns[..., -starts:]
-                slope[name][some] += np.einsum("fnk,fnkl->fl", block.errors, own)
-                bend[name][some] += np.einsum("fnkl,fnkm->flm", own, own)
+            own = block.columns[..., total - starts :]
+            return _BlockSums(
+                name,
+                block.segments,
+                np.einsum("fnk,fnk->f", block.errors, block.errors),
+                block.counts.sum(axis=(1, 2)),
+                0.5 * huber_loss(scaled, huber).sum(axis=(1, 2)),
+                gauss_newton(block.columns, scaled, scale, huber) if total else (0.0, 0.0),
+                np.einsum("fnk,fnkl->fl", block.errors, own) if starts else 0.0,
+                np.einsum("fnkl,fnkm->flm", own, own) if starts else 0.0,
+            )
+
+        for of in side_by_side(summed, blocks):
+            squares[of.name][of.some] += of.squares
+            counts[of.name][of.some] += of.counts
+            loss[of.some] += of.loss
+            gradient[of.some] += of.normal[0]
+            hessian[of.some] += of.normal[1]
+            slope[of.name][of.some] += of.slope
+            bend[of.name][of.some] += of.bend
         best = None
         if criterion.states is not None:
             loss, gradient, hessian, best = eliminate_states(
@@ -318,15 +336,50 @@ class Objective(eqx.Module):
             columns[name] = np.zeros((segments, n, k, _columns(moving)))
         for some, part, of_part in self._in_turn(criterion, moving, self.memory // LOG_SHARE):
             crash_time[some], blocks = part.compare(point, of_part, moving)
-            for name, block in blocks:
-                place = np.arange(part.segments.count)[block.segments, None], block.stamps
+
+            def lay(
+                name: str, block: Block, some: slice = some, count: int = part.segments.count
+            ) -> None:
+                place = np.arange(count)[block.segments, None], block.stamps
                 errors[name][some][place] = block.errors
                 columns[name][some][place] = block.columns
+
+            deque(side_by_side(lay, blocks), maxlen=0)
         return (
             {name: np.moveaxis(error, 0, -1) for name, error in errors.items()},
             {name: np.moveaxis(column, (-1, 0), (0, -1)) for name, column in columns.items()},
             crash_time,
         )
+
+
+class _BlockSums(NamedTuple):
+    """What a block of residuals adds to the sums of its segments, as `SegmentSums` has them."""
+
+    name: str
+    some: slice
+    squares: Array
+    counts: NDArray[np.intp]
+    loss: Array
+    normal: tuple[Array | float, Array | float]
+    slope: Array | float
+    bend: Array | float
+
+
+def side_by_side(
+    work: Callable[[str, Block], R], blocks: Iterable[tuple[str, Callable[[], Block]]]
+) -> Iterator[R]:
+    """Return what is made of each block of residuals, in their order, made by several threads."""
+    context = copy_context()
+
+    def one(named: tuple[str, Callable[[], Block]]) -> R:
+        return context.copy().run(lambda: work(named[0], named[1]()))
+
+    return _threads().map(one, blocks)
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(cores(), thread_name_prefix="residuals")
 
 
 def _columns(moving: Mapping[str, int]) -> int:
@@ -552,11 +605,16 @@ def _evaluated(
         name: np.zeros((len(together), np.shape(measured.weight)[1]))
         for name, measured in objective.segments.measured.items()
     }
-    for name, block in blocks:
+
+    def summed(name: str, block: Block) -> tuple[str, slice, Array, Array]:
         scale = criterion.scale[name][objective.flight[block.segments]]
-        scaled = block.errors / scale[:, None, None]
-        loss[block.segments] += 0.5 * huber_loss(scaled, criterion.huber).sum(axis=(1, 2))
-        squares[name][block.segments] += np.einsum("fnk,fnk->fk", block.errors, block.errors)
+        own = huber_loss(block.errors / scale[:, None, None], criterion.huber).sum(axis=(1, 2))
+        squares = np.einsum("fnk,fnk->fk", block.errors, block.errors)
+        return name, block.segments, 0.5 * own, squares
+
+    for name, some, own_loss, own_squares in side_by_side(summed, blocks):
+        loss[some] += own_loss
+        squares[name][some] += own_squares
     by_axis = {n: np.moveaxis(s.reshape(count, segments, -1), -1, 1) for n, s in squares.items()}
     return Batch(loss.reshape(count, segments), by_axis, crash_time.reshape(count, segments))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,8 +88,13 @@ class Reading:
         return self.columns + (0 if self.coefficients is None else len(self.offsets))
 
 
-def residuals(flown: Flown, segments: Segments, name: str, reading: Reading) -> Iterator[Block]:
-    """Return one channel's residuals up to the horizon, some stamps at a time."""
+def residuals(
+    flown: Flown, segments: Segments, name: str, reading: Reading
+) -> Iterator[Callable[[], Block]]:
+    """Yield functions that return one channel's residuals up to the horizon, of some stamps each.
+
+    They may be called side by side.
+    """
     measured = segments.measured[name]
     time, values, weight = (
         np.ascontiguousarray(np.moveaxis(np.asarray(part), -1, 0))
@@ -101,21 +106,25 @@ def residuals(flown: Flown, segments: Segments, name: str, reading: Reading) -> 
     log, moved_log = _Series(flown.channels[name]), flown.columns[name]
     columns = None if moved_log is None else _Series(moved_log, moved=True)
     together = max(STAMPS_AT_ONCE // max(most, 1), 1)
-    for first in range(0, len(time), together):
+
+    def block(first: int, begin: int) -> Block:
         some = slice(first, first + together)
+        stamps = order[some, begin : begin + STAMPS_AT_ONCE]
+        owners = np.arange(first, first + len(stamps))
+
+        def at(rows: NDArray[Any]) -> NDArray[Any]:
+            return rows[owners[:, None], stamps]
+
+        weights = at(weight) * at(used)[..., None]
+        place = _Place(owners, at(time), name, reading)
+        errors, moved = _compared(name, log, columns, place, at(values))
+        errors = errors * weights
+        moved *= weights[..., None]
+        return Block(some, stamps, weights != 0.0, errors, moved)
+
+    for first in range(0, len(time), together):
         for begin in range(0, most, STAMPS_AT_ONCE):
-            stamps = order[some, begin : begin + STAMPS_AT_ONCE]
-            real = np.take_along_axis(used[some], stamps, axis=1)
-
-            def at(rows: NDArray[Any], stamps: NDArray[np.intp] = stamps) -> NDArray[Any]:
-                return rows[np.arange(first, first + len(stamps))[:, None], stamps]  # noqa: B023
-
-            weights = at(weight) * real[..., None]
-            place = _Place(np.arange(first, first + len(stamps)), at(time), name, reading)
-            errors, moved = _compared(name, log, columns, place, at(values))
-            errors = errors * weights
-            moved *= weights[..., None]
-            yield Block(some, stamps, weights != 0.0, errors, moved)
+            yield partial(block, first, begin)
 
 
 def _compared(

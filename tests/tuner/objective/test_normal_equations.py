@@ -79,6 +79,31 @@ def test_hessian_is_symmetric_and_positive(fit):
     assert np.linalg.eigvalsh(np.asarray(hessian)).min() > 0
 
 
+class _InTurn:
+    """One thread, which begins with a block as the one before has ended."""
+
+    map = staticmethod(map)
+
+
+class _LastFirst:
+    """Threads of which those that are given work last end first."""
+
+    @staticmethod
+    def map(work, blocks):
+        return [work(block) for block in list(blocks)[::-1]][::-1]
+
+
+def test_sums_are_the_same_in_whatever_order_threads_end(fit, monkeypatch):
+    monkeypatch.setattr("tuner.objective.residuals.STAMPS_AT_ONCE", 100)  # several blocks a flight
+    at = Point(np.asarray(fit.space.initial) + 0.1, np.full((5, 2), 0.05))
+
+    def computed(threads):
+        monkeypatch.setattr("tuner.objective.normal_equations._threads", threads)
+        return fit.sums(at, criterion_of(fit)), fit.jacobian(at, criterion_of(fit))
+
+    assert eqx.tree_equal(computed(_InTurn), computed(_LastFirst))
+
+
 def test_a_horizon_cuts_the_compared_samples(fit):
     criterion = criterion_of(fit)
     short = replace(criterion, horizon=400)
@@ -204,7 +229,8 @@ def test_a_jump_that_a_clock_passes_is_seen_and_has_a_slope():
     )
     segments = Segments(None, None, {"command": measured}, np.zeros(1, int))
     flown = Flown({"command": series[None, :, None]}, {"command": None}, np.full(1, np.inf))
-    (block,) = residuals(flown, segments, "command", reading_of(late, coefficients=0))
+    (block_of,) = residuals(flown, segments, "command", reading_of(late, coefficients=0))
+    block = block_of()
     slope = block.columns[0, :, 0, CLOCK_OF["command"]] / OFFSET_UNIT
     assert np.abs(slope).max() > 1.0
     assert slope == pytest.approx((there - here) / (2.0 * step), rel=1e-6, abs=1e-6)
