@@ -26,6 +26,7 @@ from lanes.rules import (
     CONTRACT,
     ELEMENTWISE,
     LINEAR,
+    SIGNLESS,
     Emitter,
     constant,
     converted,
@@ -205,6 +206,8 @@ class Lowering:
                 if outer in bound and not isinstance(into, Literal)
             }
             return self.run(jaxpr, consts, operands, inner)
+        if name not in SIGNLESS and any(map(_is_unsigned, (*eqn.invars, *eqn.outvars))):
+            raise UnsupportedError(f"{name} of numbers without a sign")
         if name in CONTROL:
             return CONTROL[name](self, eqn, operands, bound)
         if name == "optimization_barrier":
@@ -1023,6 +1026,10 @@ def shape_of(var: Any) -> tuple[int, ...]:
 def dtype_of(var: Any) -> Any:
     """Return the type of a variable's numbers."""
     return var.aval.dtype
+
+
+def _is_unsigned(var: Any) -> bool:
+    return str(getattr(var.aval, "dtype", "")).startswith("uint")
 
 
 def _type_in(elements: Elements) -> ir.Type:

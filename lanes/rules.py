@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, reduce
 from typing import Any, TypeAlias
 
 import jax
@@ -31,9 +31,15 @@ TYPES: Mapping[np.dtype[Any], ir.Type] = {
     np.dtype(np.float32): ir.FloatType(),
     np.dtype(np.int64): ir.IntType(64),
     np.dtype(np.int32): ir.IntType(32),
+    np.dtype(np.uint64): ir.IntType(64),
+    np.dtype(np.uint32): ir.IntType(32),
     np.dtype(np.bool_): BOOL,
     np.dtype(jax.dtypes.float0): BOOL,  # the tangent of an integer: never read
 }
+
+
+SIGNLESS = frozenset({"and", "or", "xor", "not", "bitcast_convert_type"})
+"""Primitives that do the same to whole numbers without a sign; other rules have those with one."""
 
 
 def type_of(dtype: Any) -> ir.Type:
@@ -400,6 +406,26 @@ def _reduce_precision(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
     return converted(e, converted(e, x, ir.FloatType()), ir.DoubleType())
 
 
+def _bits(kind: ir.Type) -> int:
+    return {ir.DoubleType(): 64, ir.FloatType(): 32}.get(kind) or int(kind.width)
+
+
+def _same_bits(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
+    to = type_of(p["new_dtype"])
+    if _bits(to) != _bits(base(x.type)):
+        raise UnsupportedError(f"bits of {base(x.type)} as {p['new_dtype']}")
+    return e.b.bitcast(x, e.vector(to) if is_vector(x) else to)
+
+
+def _polynomial(e: Emitter, _: Parameters, x: ir.Value, *coefficients: ir.Value) -> ir.Value:
+    """Sum up powers, their coefficients from the lowest."""
+
+    def higher(total: ir.Value, coefficient: ir.Value) -> ir.Value:
+        return e.b.fadd(e.b.fmul(total, x, flags=CONTRACT), coefficient, flags=CONTRACT)
+
+    return reduce(higher, reversed(coefficients))
+
+
 ELEMENTWISE: dict[str, Rule] = {
     "add": _arithmetic("fadd", "add"),
     "add_any": _arithmetic("fadd", "add"),
@@ -457,6 +483,8 @@ ELEMENTWISE: dict[str, Rule] = {
     "clamp": lambda e, p, lower, x, upper: _smaller(e, p, _larger(e, p, x, lower), upper),
     "select_n": _select_n,
     "convert_element_type": lambda e, p, x: converted(e, x, type_of(p["new_dtype"])),
+    "bitcast_convert_type": _same_bits,
+    "polynomial": _polynomial,
     "reduce_precision": _reduce_precision,
     **dict.fromkeys(
         ("copy", "copy_p", "stop_gradient", "real", "optimization_barrier"), lambda _, __, x: x

@@ -176,6 +176,30 @@ def test_functions_of_truth_values():
     agree({"select": lambda x: lax.select_n(x % 3, x, 2 * x, 3 * x)}, np.arange(9))
 
 
+def test_bits_of_numbers():
+    def half(x):
+        whole = np.uint64 if x.dtype == np.float64 else np.uint32
+        mask = whole((2 ** (4 * x.dtype.itemsize) - 1) << 4 * x.dtype.itemsize)
+        return lax.bitcast_convert_type(lax.bitcast_convert_type(x, whole) & mask, x.dtype)
+
+    agree({"upper half": half}, FLOATS)
+    agree({"upper half": half}, FLOATS[np.abs(FLOATS) < 1e30].astype(np.float32))
+    # rules for what has a sign would be wrong for what has none
+    for name, shown in {"max": lax.max, "lt": lax.lt}.items():
+        program = Program(
+            lambda x, _, shown=shown: shown(lax.bitcast_convert_type(x, np.uint64), np.uint64(1)),
+            Argument((), np.float64, lanes=True),
+            name=name,
+        )
+        assert not program.is_kernel
+
+
+def test_derivatives_of_error_functions():
+    of = {f.__name__: jax.grad(f) for f in (lax.erf, lax.erfc)}
+    slopes = {f"{name}'s": jax.grad(f) for name, f in of.items()}
+    agree(of | slopes, np.linspace(-30.0, 30.0, 41), rtol=1e-12)
+
+
 def conversions(*types):
     return {f"to {to.__name__}": lambda x, to=to: lax.convert_element_type(x, to) for to in types}
 
