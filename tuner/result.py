@@ -403,7 +403,7 @@ def forget(folder: Path) -> None:
         remove_file(folder / name)
 
 
-def result_folder(folder: str | Path) -> Path:
+def finished_folder(folder: str | Path) -> Path:
     """Return a folder of results that is there, and out of which no link leads.
 
     Raises
@@ -427,7 +427,7 @@ def read_run(folder: str | Path) -> Run:
         It is no result folder, or is of another schema version, its two files disagree, or a link
         leads out of it.
     """
-    folder = result_folder(folder)
+    folder = finished_folder(folder)
     result = RunResult.read(folder, REMEDY)
     effective = result.effective
     for name in (*result.coefficients, *(effective.coefficients if effective else ())):

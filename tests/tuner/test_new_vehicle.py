@@ -8,7 +8,7 @@ from tuner.cli import main
 from tuner.config import read_job
 from tuner.core.shipped import configs_folder
 from tuner.vehicle import read_vehicle, values_of
-from tuner.vehicle.scaling_laws import KNOWN_AIRFRAMES, coefficients_of
+from tuner.vehicle.scaling_laws import KNOWN_AIRFRAMES, scaled_coefficients
 
 QUAD = ["--mass", "2.243", "--wheelbase", "0.5", "--propeller", "11x4.7"]
 PALM = ["--mass", "0.03", "--wheelbase", "0.092", "--propeller", "1.85x1.0"]
@@ -33,7 +33,7 @@ def test_the_laws_are_within_a_factor_of_two_of_known_vehicles(tmp_path, options
     out = tmp_path / "quad.yaml"
     assert main(["new-vehicle", *options, "--out", str(out), "--quiet"]) == 0
     estimated, truth = values_of(read_vehicle(out)), known(name)
-    for coefficient in coefficients_of(KNOWN_AIRFRAMES[name]):
+    for coefficient in scaled_coefficients(KNOWN_AIRFRAMES[name]):
         ratio = estimated[coefficient] / truth[coefficient]
         assert 0.499 < ratio < 2.001, coefficient
 
@@ -43,7 +43,7 @@ def test_a_vehicle_like_itself_is_itself(tmp_path, name):
     out = tmp_path / "quad.yaml"
     assert main(["new-vehicle", "--like", name, "--out", str(out), "--quiet"]) == 0
     estimated, truth = values_of(read_vehicle(out)), known(name)
-    for coefficient in coefficients_of(KNOWN_AIRFRAMES[name]):
+    for coefficient in scaled_coefficients(KNOWN_AIRFRAMES[name]):
         assert estimated[coefficient] == pytest.approx(truth[coefficient], rel=1e-3)
 
 

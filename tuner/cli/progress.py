@@ -26,7 +26,7 @@ from tuner.core.spans import (
     Span,
     beside_of,
     recording,
-    table_of,
+    stage_table,
     watching,
 )
 from tuner.report.section import Table
@@ -203,7 +203,7 @@ def profiling(wanted: bool, *, quiet: bool) -> Iterator[Callable[[Path], None]]:
     with recording() as recorder:
         yield folders.append
     seconds, processor = recorder.now(), time.process_time()
-    rows = table_of(recorder.spans, seconds, processor)
+    rows = stage_table(recorder.spans, seconds, processor)
     for folder in folders:
         cells = (
             (row.stage, *(f"{value:.3f}" for value in _seconds(row)), row.programs) for row in rows

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from tuner.result import ExportRecord, RunResult
     from tuner.search.listener import PointEstimate
     from tuner.uncertainty.records import Refit
-    from tuner.vehicle.scaling_laws import Estimate
+    from tuner.vehicle.scaling_laws import ScaledEstimate
 
 
 #: Columns that a table may take, if need be beyond the terminal's, so that no number is cut.
@@ -122,7 +122,7 @@ def print_export(done: Exported) -> None:
     screen.print(f"written to {done.path} and read back")
 
 
-def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
+def print_estimates(estimates: Mapping[str, ScaledEstimate], path: Path) -> None:
     """Print a vehicle's coefficients by scaling laws, how crude each is, and where they lie."""
     from tuner.vehicle import COEFFICIENTS
 

@@ -109,7 +109,7 @@ def scaled_inverse(matrix: Array, ridge: float = 0.0) -> Array:
     return scaled_solve(matrix, np.eye(len(matrix)), ridge)
 
 
-def errors_of(information: Array) -> Array:
+def std_errors_of(information: Array) -> Array:
     """Return the standard errors (K,) that an information (K, K) leaves."""
     return np.asarray(np.sqrt(np.diag(scaled_inverse(information))))
 

@@ -174,7 +174,7 @@ class Row:
         return self.seconds - sum(self.jax.values())
 
 
-def table_of(spans: Sequence[Span], seconds: float, processor: float) -> tuple[Row, ...]:
+def stage_table(spans: Sequence[Span], seconds: float, processor: float) -> tuple[Row, ...]:
     """Return a row for every stage in the order of their begins.
 
     Every instant counts for the innermost span that holds it, so that the rows' seconds, and

@@ -27,7 +27,7 @@ from sim_jax.state import hover, hover_speed
 from sim_jax.trajectory import Shape, shapes
 from tuner.config import InletName, TrajectorySettings
 from tuner.core.errors import InputError
-from tuner.core.numerics import Array, errors_of, log_determinant, scaled_inverse
+from tuner.core.numerics import Array, log_determinant, scaled_inverse, std_errors_of
 from tuner.design.proposals import MAX_WORTHWHILE_SHARE, LogProposal, Proposal, Proposals
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_at
@@ -370,9 +370,9 @@ def signals_to_add(
     fed = {name for inlet in inlets for name in INLETS[inlet].needs}
     noise = {"rotor_speed": TACHOMETER_NOISE * float(hover_speed(vehicle_of(vehicle))), **NOISE}
     missing = [n for n in noise if n not in objective.segments.measured and n not in silent | fed]
-    before, proposals = errors_of(known), []
+    before, proposals = std_errors_of(known), []
     for signal in missing:
-        shares = errors_of(known + _information(fitted, signal, noise[signal])) / before
+        shares = std_errors_of(known + _information(fitted, signal, noise[signal])) / before
         shrinks = dict(zip(objective.space.names, shares.tolist(), strict=True))
         proposals.append(
             LogProposal(
@@ -506,7 +506,7 @@ def _fed_inputs(job: Job, fitted: Fitted) -> list[LogProposal]:
     scales = {name: np.full(objective.flights, beyond) for name in objective.segments.measured}
     criterion = plain_criterion(objective, objective.samples, scales)
     information = information_at(objective, objective.start(vector), criterion)
-    shares = errors_of(information.total) / errors_of(information.prior)
+    shares = std_errors_of(information.total) / std_errors_of(information.prior)
     shrinks = {name: float(shares[fed.space.names.index(name)]) for name in names}
     return [
         LogProposal(signal="command", change="fed", rate=INPUT_RATE_HZ, shrinks=shrinks)

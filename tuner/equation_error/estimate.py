@@ -38,7 +38,7 @@ TILTING = slice(3, 5)
 
 
 @dataclass(frozen=True)
-class Estimate:
+class RegressionEstimate:
     """Estimates from recorded accelerations.
 
     Attributes
@@ -72,7 +72,7 @@ def estimate(
     candidates: Groups,
     flights: Sequence[Steps],
     commands: Sequence[Commands] = (),
-) -> Estimate:
+) -> RegressionEstimate:
     """Return the estimates from some flights' accelerations.
 
     Parameters
@@ -133,7 +133,7 @@ def estimate(
         return {name: float(x) for p, x, is_in in rows if is_in for name in p.ratios}
 
     values, kept = values_at(space.parameters, predicted), named(errors, free | is_gain)
-    return Estimate(
+    return RegressionEstimate(
         values={name: values[name] for name in kept},
         errors=named(errors, free),
         rows=rows,

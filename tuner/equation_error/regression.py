@@ -64,7 +64,7 @@ Filter = Callable[[LinearisedAccelerations], Sequence[Array]]
 
 
 @dataclass(frozen=True)
-class NormalEquations:
+class UnitEquations:
     """Normal equations of U units, flights or parts of them, about a point.
 
     Attributes
@@ -134,7 +134,7 @@ class Regression:
 
     point: Array
     ordinary: Array
-    sums: NormalEquations
+    sums: UnitEquations
     covariance: Array
 
 
@@ -240,7 +240,7 @@ def _sums_at(
     mean: Array,
     free: Mask,
     delays: Delays,
-) -> NormalEquations:
+) -> UnitEquations:
     """Return the normal equations about a point (K,), with priors about a mean (K,).
 
     Columns are replaced by their predictions from instruments (two-stage least squares).
@@ -259,7 +259,7 @@ def _sums_at(
         _embedded(len(free), by, sums)
         for sums in (shares @ information, slope @ shares.T, shares[None])
     )
-    return NormalEquations(information, slope, loss, prior, prior * (mean - point), shares)
+    return UnitEquations(information, slope, loss, prior, prior * (mean - point), shares)
 
 
 def _embedded(count: int, by: NDArray[np.intp], sums: Array) -> Array:
@@ -366,7 +366,7 @@ def _windows(errors: Array, known: Mask, count: int) -> Array:
     return view(errors, count)[view(known, count).all(axis=1)]
 
 
-def _covariance(sums: NormalEquations, free: Mask) -> Array:
+def _covariance(sums: UnitEquations, free: Mask) -> Array:
     """Return the coordinates' covariance: by innovations, or by the scatter of units if larger.
 
     Errors that violate the noise model scatter from flight to flight; a few flights show that

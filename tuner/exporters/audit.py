@@ -20,11 +20,11 @@ from tuner.exporters.effective import MARK
 from tuner.exporters.sdf.model import (
     MAX_ROTORS,
     Inertial,
-    Model,
+    SdfModel,
     composite,
     inertials,
     motor_number,
-    read_model,
+    read_sdf,
 )
 from tuner.exporters.targets.px4 import outside_range, read_parameters
 from tuner.result import Run
@@ -104,7 +104,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     ExportError
         A file cannot be read, or is no model of a multirotor.
     """
-    model = read_model(path, MAX_ROTORS)
+    model = read_sdf(path, MAX_ROTORS)
     rotors = _rotors(model)
     if not rotors:
         raise ExportError(path, "has no motor with a link and a number", "give each motor its own")
@@ -128,7 +128,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     return Audit(path, whole.mass, tuple(dict.fromkeys(faults)), differences, tuple(model.included))
 
 
-def _rotors(model: Model) -> list[Rotor]:
+def _rotors(model: SdfModel) -> list[Rotor]:
     links = model.rotor_links()
     motors = {motor_number(motor): motor for motor in model.motors()}
     rotors = []
@@ -140,7 +140,7 @@ def _rotors(model: Model) -> list[Rotor]:
     return rotors
 
 
-def _body_faults(model: Model) -> Iterator[str]:
+def _body_faults(model: SdfModel) -> Iterator[str]:
     """Yield faults of links: an impossible mass or inertia."""
     for link, body in inertials(model):
         name = link.attributes.get("name", "")
@@ -171,7 +171,7 @@ def _inertia_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
         )
 
 
-def _rotor_faults(rotors: list[Rotor], model: Model) -> Iterator[str]:
+def _rotor_faults(rotors: list[Rotor], model: SdfModel) -> Iterator[str]:
     """Yield faults of motors, and differences between them."""
     has_effective = MARK in model.root.source.raw
     for rotor in rotors:
@@ -234,7 +234,7 @@ def _layout_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
 
 
 def _speeds(
-    model: Model, rotors: list[Rotor], parameters: Mapping[str, float]
+    model: SdfModel, rotors: list[Rotor], parameters: Mapping[str, float]
 ) -> tuple[float, float] | None:
     """Return the rotor speeds in rad/s at zero and at full command; None if unknown."""
     limit = min((r.numbers.get("maxRotVelocity", math.inf) for r in rotors), default=math.inf)

@@ -29,8 +29,8 @@ from tuner.exporters.target import (
     Target,
     check_every_coefficient,
     not_carried,
-    quantity,
     target_of,
+    with_unit,
     write,
 )
 from tuner.options import ExportOptions
@@ -346,7 +346,7 @@ def provenance_of_file(
     line = f"{file.name}: {how}; no flight was compared; {today.isoformat()}"
     values = values_of(vehicle)
     sources = tuple(
-        f"{name} {quantity(values[name], COEFFICIENTS[name])}: {text}"
+        f"{name} {with_unit(values[name], COEFFICIENTS[name])}: {text}"
         for name, text in vehicle.source.items()
         if name in values
     )

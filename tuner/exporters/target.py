@@ -267,8 +267,8 @@ def check_every_coefficient(vehicle: VehicleFile, target: Target) -> None:
         if target.simulator.entry(row) is None and value != row.neutral:
             raise ExportError(
                 vehicle.name,
-                f"{name} is {quantity(value, row)}, which --format {target.name} can neither write "
-                "nor name as not exportable",
+                f"{name} is {with_unit(value, row)}, which --format {target.name} can neither "
+                "write nor name as not exportable",
                 f"give {name} an entry for {target.name} in the registry of coefficients",
             )
 
@@ -283,9 +283,9 @@ def not_carried(vehicle: VehicleFile, target: Target) -> Iterator[str]:
         same = (at for at in (row.neutral, entry.built_in) if at is not None)
         # a bound may differ in the last digits
         if not any(math.isclose(value, at, abs_tol=1e-9 * row.step) for at in same):
-            yield f"{name} {quantity(value, row)} is not exported: {entry.reason}"
+            yield f"{name} {with_unit(value, row)} is not exported: {entry.reason}"
 
 
-def quantity(value: float, row: Coefficient) -> str:
+def with_unit(value: float, row: Coefficient) -> str:
     """Return a coefficient's value with its unit."""
     return f"{value:g} {row.unit}".strip()

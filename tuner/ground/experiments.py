@@ -26,7 +26,7 @@ from tuner.vehicle import VehicleFile
 from tuner.vehicle.vehicle import REFERENCE_ARM, size_of
 
 
-def names_of(experiments: Sequence[Experiment]) -> tuple[str, ...]:
+def experiment_names(experiments: Sequence[Experiment]) -> tuple[str, ...]:
     """Return a unique name of each experiment: its kind and axis, and a number if needed."""
     plain = [" ".join((e.kind, getattr(e, "axis", ""))).strip() for e in experiments]
     counts, seen, names = Counter(plain), Counter[str](), []

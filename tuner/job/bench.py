@@ -16,7 +16,7 @@ from tuner.core.numerics import Z95
 from tuner.core.runtime import PROGRAM, versions
 from tuner.core.shipped import find_config
 from tuner.findings.findings import Code, Finding
-from tuner.ground.experiments import measure, names_of
+from tuner.ground.experiments import experiment_names, measure
 from tuner.ground.measurement import (
     BenchRecord,
     Combination,
@@ -171,7 +171,7 @@ def _measure_all(
     path: Path, plan: BenchFile, start: VehicleFile
 ) -> tuple[tuple[Measurement, ...], Combination, VehicleFile]:
     """Return each measurement, their combination, and the measured vehicle."""
-    experiments = dict(zip(names_of(plan.experiments), plan.experiments, strict=True))
+    experiments = dict(zip(experiment_names(plan.experiments), plan.experiments, strict=True))
     spins = {name: spin for name, spin in experiments.items() if isinstance(spin, YawSpin)}
     nominal, base, vehicle = known_of(start), path.parent, start
     measured = {
@@ -181,11 +181,11 @@ def _measure_all(
     }
     for _ in range(MAX_RELINEARISATIONS if spins else 1):
         if measured:
-            vehicle = vehicle_of(path, start, combine(tuple(measured.values()), nominal))
+            vehicle = measured_vehicle(path, start, combine(tuple(measured.values()), nominal))
         measured |= {name: measure(name, spin, vehicle, base) for name, spin in spins.items()}
     measurements = tuple(measured[name] for name in experiments)
     combination = combine(measurements, nominal)
-    return measurements, combination, vehicle_of(path, start, combination)
+    return measurements, combination, measured_vehicle(path, start, combination)
 
 
 def known_of(vehicle: VehicleFile) -> dict[str, float]:
@@ -199,7 +199,7 @@ def known_of(vehicle: VehicleFile) -> dict[str, float]:
     }
 
 
-def vehicle_of(path: Path, start: VehicleFile, combination: Combination) -> VehicleFile:
+def measured_vehicle(path: Path, start: VehicleFile, combination: Combination) -> VehicleFile:
     """Return the vehicle with the measured coefficients.
 
     A lag is at least zero, even if experiments combine to less.

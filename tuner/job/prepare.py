@@ -24,7 +24,7 @@ from tuner.core.numerics import Z95, Array, symmetric_eigen, unit_diagonal
 from tuner.core.runtime import configure
 from tuner.core.spans import span
 from tuner.engine.beside import do_beside
-from tuner.equation_error.estimate import TORQUE_GAINS, Estimate, estimate
+from tuner.equation_error.estimate import TORQUE_GAINS, RegressionEstimate, estimate
 from tuner.equation_error.model_accelerations import moves_rotors
 from tuner.equation_error.recorded_accelerations import (
     MIN_SAMPLES,
@@ -495,7 +495,7 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     return (job, ()) if regressed is None else (regressed, (_finding(regression),))
 
 
-def _regressed_job(job: Job, regression: Estimate) -> Job | None:
+def _regressed_job(job: Job, regression: RegressionEstimate) -> Job | None:
     """Return the job with its search's coefficients, start and windows; None for no rigid body."""
     settings, regression = job.settings, of_rigid_body(regression)
     moving = tuple(n for n in regression.values if n not in BY_REGRESSION and not moves_rotors(n))
@@ -511,7 +511,7 @@ def _regressed_job(job: Job, regression: Estimate) -> Job | None:
     return replace(regressed, user_settings=job.settings, accelerations=regression)
 
 
-def of_rigid_body(regression: Estimate) -> Estimate:
+def of_rigid_body(regression: RegressionEstimate) -> RegressionEstimate:
     """Return an estimate whose inertia about z is at most a rigid body's, if its error allows that.
 
     Turning about z determines the ratios of the other yaw moments to it; they stay.
@@ -526,7 +526,7 @@ def of_rigid_body(regression: Estimate) -> Estimate:
     return replace(regression, values={**values, **within})
 
 
-def _finding(regression: Estimate) -> Finding:
+def _finding(regression: RegressionEstimate) -> Finding:
     """Return the finding on the explained share of turning, and the horizon of its prediction."""
     shares = np.clip(regression.explained[3:], 0.0, 1.0).tolist()
     numbers = {f"explained_{axis}": share for axis, share in zip("xyz", shares, strict=True)}

@@ -18,7 +18,7 @@ from tuner.vehicle import COEFFICIENTS
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RecordingVerdict:
     """The decision of `tune` on a recording.
 
     Attributes
@@ -55,7 +55,7 @@ def verdict_of(
     topics: str | None = None,
     namespace: str | None = None,
     vehicle: str | None = None,
-) -> Verdict:
+) -> RecordingVerdict:
     """Return the decision of `tune` on a recording, by the job file beside it.
 
     Raises
@@ -78,7 +78,7 @@ def verdict_of(
     return replace(decided, logging=logging, settings=words)
 
 
-def _cached_verdict(path: Path, settings: Settings) -> Verdict:
+def _cached_verdict(path: Path, settings: Settings) -> RecordingVerdict:
     """Return the decision, from the cache if it is known."""
     job = settings.job
     inputs = settings.vehicle, settings.controller, job, read_sidecar(path)
@@ -86,12 +86,12 @@ def _cached_verdict(path: Path, settings: Settings) -> Verdict:
     key = (digest(path), path.name, source_version(), *map(repr, (*inputs, *maps)))
 
     verdict = load_or_compute(
-        Verdict, cache_file("verdict", *key), lambda: _computed_verdict(path, settings)
+        RecordingVerdict, cache_file("verdict", *key), lambda: _computed_verdict(path, settings)
     )
     return replace(verdict, path=str(path))
 
 
-def _computed_verdict(path: Path, settings: Settings) -> Verdict:
+def _computed_verdict(path: Path, settings: Settings) -> RecordingVerdict:
     """Return whether and how the only recording of some settings would be fitted, and why."""
     from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
 
@@ -113,18 +113,18 @@ def _computed_verdict(path: Path, settings: Settings) -> Verdict:
                 f"No pose was recorded: body rate and specific force of {seconds:.0f} s in the air "
                 "are fitted, from the motor commands."
             )
-            return Verdict(str(path), True, ("none",), (seen,))
+            return RecordingVerdict(str(path), True, ("none",), (seen,))
         recordings, findings = read_recordings(settings, holdout=(), fits=False)
     except InputError as error:
-        return Verdict(str(path), False, why=(f"{error.what}; {error.remedy}",))
+        return RecordingVerdict(str(path), False, why=(f"{error.what}; {error.remedy}",))
     inlets = [recording.inlet for recording in recordings]
     bypassed = bypassed_by(inlets, [recording.flight for recording in recordings])
     why = tuple(dict.fromkeys(map(sentence, findings)))
     hidden = tuple(n for n in COEFFICIENTS if n in bypassed and not COEFFICIENTS[n].is_effect)
-    return Verdict(str(path), True, tuple(inlets), why, hidden, gains)
+    return RecordingVerdict(str(path), True, tuple(inlets), why, hidden, gains)
 
 
-def with_verdict(inspection: Inspection, verdict: Verdict) -> Inspection:
+def with_verdict(inspection: Inspection, verdict: RecordingVerdict) -> Inspection:
     """Return an inspection that counts on no coefficient above the chosen inlets."""
     coefficients = (
         replace(of, how="no", why=f"acts above the inlet {' and '.join(verdict.inlets)}")
@@ -135,7 +135,7 @@ def with_verdict(inspection: Inspection, verdict: Verdict) -> Inspection:
     return replace(inspection, coefficients=tuple(coefficients))
 
 
-def in_words(verdict: Verdict) -> list[str]:
+def in_words(verdict: RecordingVerdict) -> list[str]:
     """Return a verdict as lines: the decision, its reasons, and advice on logging."""
     if not verdict.fits:
         return [f"cannot be fitted: {verdict.why[0]}", *_logger_in_words(verdict)]
@@ -153,7 +153,7 @@ def in_words(verdict: Verdict) -> list[str]:
     return [*lines, *_logger_in_words(verdict)]
 
 
-def _logger_in_words(verdict: Verdict) -> list[str]:
+def _logger_in_words(verdict: RecordingVerdict) -> list[str]:
     """Return the advice on logging, a line for each message."""
     lines = []
     for advice in verdict.logging:

@@ -75,7 +75,7 @@ METRICS_FILE = "metrics.csv"
 CONTROLLER_FILE = "controller.yaml"
 
 
-def result_of(
+def run_result(
     selected: Selected,
     validation: Validation,
     uncertainty: Uncertainty | None,

@@ -34,7 +34,7 @@ from tuner.exporters.export import export_formats_of_job
 from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.findings.findings import Finding, merge_alike, remedy, sentence
 from tuner.job.prepare import build_ahead, check_information, prepare
-from tuner.job.results import result_of, write_folder, write_next_flight
+from tuner.job.results import run_result, write_folder, write_next_flight
 from tuner.options import Options
 from tuner.report import render, write_search, write_traces
 from tuner.report.outcome import WRONG_INPUT_CODES
@@ -226,8 +226,8 @@ class _Run:
         effective: Effective | None = None,
         **more: Any,
     ) -> RunResult:
-        """Write the result into the folder, and return it; ``more`` is of `result_of`."""
-        result = result_of(
+        """Write the result into the folder, and return it; ``more`` is of `run_result`."""
+        result = run_result(
             selected,
             validation,
             None if examination is None else examination.uncertainty,

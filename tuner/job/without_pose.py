@@ -16,7 +16,13 @@ from tuner.findings.findings import Code, Finding, Level
 from tuner.ground.measurement import Combination, Measurement, combine
 from tuner.inertial.measurement import measure_inertial, widen_to_agree
 from tuner.inertial.signals import RateErrors, rate_errors, stretches_of
-from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, write_measurements
+from tuner.job.bench import (
+    BenchResult,
+    conflicts_of,
+    known_of,
+    measured_vehicle,
+    write_measurements,
+)
 from tuner.recordings.loader import InertialFlight
 from tuner.result import place_for
 from tuner.search.job_flights import left_out_finding
@@ -72,11 +78,11 @@ def fit_without_pose(
     combination = _combined(measurements, nominal)
     path = Path(used[0].path)
     try:
-        vehicle = vehicle_of(path, start, combination)
+        vehicle = measured_vehicle(path, start, combination)
     except ConfigError:  # an impossible inertia_zz, by moment_constant over inertia_zz
         measurements = tuple(_without_yaw(m) for m in measurements)
         combination = _combined(measurements, nominal)
-        vehicle = vehicle_of(path, _resized(start, combination), combination)
+        vehicle = measured_vehicle(path, _resized(start, combination), combination)
     return write_measurements(
         out,
         start,

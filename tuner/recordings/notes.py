@@ -317,7 +317,7 @@ class Damage:
 REJECTED_SOURCE_CODES = (NoteCode.LAYOUT_UNKNOWN, NoteCode.FIELD_MISSING)
 
 
-def reason_in_words(note: Note) -> str:
+def note_text(note: Note) -> str:
     """Return the text of a note."""
     first, second, alike, *_ = (*note.names, "", "", "")
     return str(note.code.text).format(
@@ -340,7 +340,7 @@ def reason_in_words(note: Note) -> str:
 
 def note_in_words(note: Note) -> str:
     """Return the text of a note, which says if a source was passed over."""
-    reason = reason_in_words(note)
+    reason = note_text(note)
     return f"passed over: {reason}" if note.code in REJECTED_SOURCE_CODES else reason
 
 

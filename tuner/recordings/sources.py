@@ -16,7 +16,7 @@ from fnmatch import fnmatchcase
 from tuner.core.errors import RecordingError
 from tuner.recordings.flight import SIGNALS
 from tuner.recordings.formats import is_tabular
-from tuner.recordings.notes import Note, NoteCode, reason_in_words
+from tuner.recordings.notes import Note, NoteCode, note_text
 from tuner.recordings.recording import Clock, Recording
 from tuner.recordings.topics import Source, TopicMap
 
@@ -328,7 +328,7 @@ def locate(
                 break
             refusal = next((found for found in attempts if isinstance(found, Note)), None)
             if refusal and strict:
-                what = reason_in_words(refusal)
+                what = note_text(refusal)
                 raise RecordingError(recording.path, what, "correct the topic map")
             if refusal:
                 notes.append(refusal)

@@ -22,8 +22,8 @@ from tuner.result import (
     ExportRecords,
     Run,
     RunResult,
+    finished_folder,
     read_run,
-    result_folder,
 )
 from tuner.search.listener import Iteration, Outcome
 from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles
@@ -74,7 +74,7 @@ def read_contents(folder: str | Path) -> Contents:
     InputError
         It is neither, or one of its files cannot be used.
     """
-    folder = result_folder(folder)
+    folder = finished_folder(folder)
     run, about = None, About.read_if_any(folder)
     if about is None or (folder / RunResult.FILE).exists():
         run = read_run(folder)

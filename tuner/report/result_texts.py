@@ -121,7 +121,7 @@ _REASONS = {
 }
 
 
-def reason_in_words(row: SelectionRow) -> str:
+def selection_reason(row: SelectionRow) -> str:
     """Return why a group is in the model or not, as a clause."""
     return _REASONS[row.reason]
 

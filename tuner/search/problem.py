@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sim_jax.state import AIRBORNE, Limits
 from tuner.config import CHANNELS, ErrorKind, FlightSettings, InletName, JobFile, Settings
 from tuner.core.errors import ConfigError, RecordingError
-from tuner.equation_error.estimate import Estimate
+from tuner.equation_error.estimate import RegressionEstimate
 from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
 from tuner.objective.initial_conditions import begins_gently
 from tuner.objective.inlets import INLETS, also_free_by, bypassed_by, window_seconds
@@ -78,7 +78,7 @@ class Job:
     user_settings: Settings
     windows: Objective | None = None
     first_terms: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    accelerations: Estimate | None = None
+    accelerations: RegressionEstimate | None = None
 
     @property
     def flights(self) -> tuple[Flight, ...]:

@@ -87,7 +87,7 @@ class Stage:
     rough: bool = False
 
 
-def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:
+def horizon_stages(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:
     """Return the stages for flights of at most so many samples at a rate in Hz."""
     stages = [
         Stage(
@@ -179,7 +179,7 @@ def plan(
     steps
         How many iterations a stage takes at most.
     """
-    schedule = window_schedule if windows else schedule_of
+    schedule = window_schedule if windows else horizon_stages
     stages = schedule(samples, rate, robust=robust, steps=steps)
     if method not in ("hybrid", "cma"):
         return tuple(replace(stage, optimiser=method) for stage in stages)

@@ -36,7 +36,7 @@ from tuner.report.outcome import outcome
 from tuner.result import CHECKPOINTS, ExportRecords, RunResult
 from tuner.service.database import State
 from tuner.service.errors import NoSpaceError, UnavailableError, full_disk
-from tuner.service.jobs import Claim, JobQueue, Outcome
+from tuner.service.jobs import AttemptOutcome, Claim, JobQueue
 from tuner.service.request import FLIGHTS, CheckedRequest
 from tuner.service.settings import Limits, ServiceSettings
 from tuner.service.worker import RESULT_FOLDER, Assignment
@@ -97,7 +97,7 @@ def attempt(
     report: Report,
     cores: Sequence[int] = (),
     is_unwanted: Callable[[], bool] = lambda: False,
-) -> Outcome:
+) -> AttemptOutcome:
     """Run the worker's process to its end, store its files, and return the outcome.
 
     Parameters
@@ -221,16 +221,16 @@ def _cause_of_death(status: int) -> str:
     return f"it was ended by {name}{hint}"
 
 
-def _outcome(last: Mapping[str, Any], folder: Path, store: ContentStore) -> Outcome:
+def _outcome(last: Mapping[str, Any], folder: Path, store: ContentStore) -> AttemptOutcome:
     """Return the outcome of an attempt, after storing the result's files."""
     if last["kind"] == "refused":
-        return Outcome(State.FAILED, error=str(last["error"]), exit_status=2)
+        return AttemptOutcome(State.FAILED, error=str(last["error"]), exit_status=2)
     if last["kind"] == "fault":
         error = f"internal error ({last['error']}); please report it"
-        return Outcome(State.FAILED, error=error, exit_status=1)
+        return AttemptOutcome(State.FAILED, error=error, exit_status=1)
     result = RunResult.read(folder / RESULT_FOLDER)
     exports = ExportRecords.read_if_any(folder / RESULT_FOLDER) or ExportRecords()
-    return Outcome(
+    return AttemptOutcome(
         State.DONE,
         exit_status=0,
         usability=outcome(result, exports=tuple(exports.exports.values())).usability,
@@ -285,7 +285,7 @@ RemoteTask = tuple[Claim, str, Limits]
 """The task of a machine of the cluster: the claim on a job, the store's URL, and its limits."""
 
 
-def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
+def fit_remotely(task: RemoteTask, report: Channel) -> AttemptOutcome:
     """Work on a job, on the machine that an engine has chosen for it.
 
     Raises
@@ -314,7 +314,7 @@ def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
 
 def run_remotely(
     task: RemoteTask, engine: Engine, report: Report, is_unwanted: Callable[[], bool]
-) -> Outcome:
+) -> AttemptOutcome:
     """Fit a job on a machine of a cluster, and return its outcome.
 
     Raises
@@ -420,7 +420,7 @@ class Dispatcher:
         except Exception as error:
             logger.exception("job %s", claim.id)
             what = f"internal error ({type(error).__name__}); please report it"
-            self._commit(claim, Outcome(State.FAILED, what, exit_status=1))
+            self._commit(claim, AttemptOutcome(State.FAILED, what, exit_status=1))
         finally:
             del self._held[claim.word]
             self._slots.put(slot)
@@ -439,13 +439,13 @@ class Dispatcher:
             self._on_worker_death(claim, death)
             return
         except NoSpaceError as error:
-            outcome = Outcome(State.FAILED, f"{error}; then retry the job", exit_status=2)
+            outcome = AttemptOutcome(State.FAILED, f"{error}; then retry the job", exit_status=2)
         except (InputError, OSError) as error:
-            outcome = Outcome(State.FAILED, str(error), exit_status=2)
+            outcome = AttemptOutcome(State.FAILED, str(error), exit_status=2)
         if self._commit(claim, outcome) and outcome.state == State.DONE:
             shutil.rmtree(folder, ignore_errors=True)
 
-    def _worked_on(self, claim: Claim, slot: int, folder: Path) -> Outcome:
+    def _worked_on(self, claim: Claim, slot: int, folder: Path) -> AttemptOutcome:
         """Return the outcome of an attempt, on this machine or another."""
         limits, lease = self._settings.limits, self._settings.lease_seconds
         report = Reporter(self._jobs, claim, lease)
@@ -474,7 +474,7 @@ class Dispatcher:
             return
         what = f"its worker died {deaths} times; the last time {death}"
         remedy = "look for memory and disk of the machine, then retry the job"
-        self._commit(claim, Outcome(State.FAILED, f"{what}; {remedy}", exit_status=1))
+        self._commit(claim, AttemptOutcome(State.FAILED, f"{what}; {remedy}", exit_status=1))
 
     def _put_back(self, claim: Claim, message: str, *, died: bool = False) -> None:
         """Put a job back; where the table cannot be reached, its lease will run out instead."""
@@ -483,7 +483,7 @@ class Dispatcher:
         except UnavailableError as error:
             logger.warning("job %s: %s", claim.id, error)
 
-    def _commit(self, claim: Claim, outcome: Outcome) -> bool:
+    def _commit(self, claim: Claim, outcome: AttemptOutcome) -> bool:
         """Enter an outcome, however long the table cannot be reached."""
         while True:
             try:

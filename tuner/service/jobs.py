@@ -66,7 +66,7 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class AttemptOutcome:
     """The outcome of an attempt.
 
     Attributes
@@ -142,7 +142,7 @@ class JobQueue:
                     add_event(session, claim.number, kind, content)
             return True
 
-    def finish(self, claim: Claim, outcome: Outcome) -> bool:
+    def finish(self, claim: Claim, outcome: AttemptOutcome) -> bool:
         """Let the job end with an outcome; False if the attempt holds it no more."""
         with self._database.writing() as session:
             ending = {

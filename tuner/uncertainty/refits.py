@@ -100,7 +100,7 @@ def _counted(objective: Objective, counts: NDArray[np.float64]) -> Objective:
     return changed if counts.max() <= 1.0 else replace(changed, multiplicity=counts)
 
 
-def coefficients_of(refits: Sequence[Refit]) -> dict[str, NDArray[np.float64]]:
+def refit_values(refits: Sequence[Refit]) -> dict[str, NDArray[np.float64]]:
     """Return coefficient -> its value in each refit."""
     names = refits[0].coefficients
     return {name: np.array([refit.coefficients[name] for refit in refits]) for name in names}
@@ -132,7 +132,7 @@ def bootstrap(
     counts = [np.bincount(row, minlength=len(names)) for row in drawn]
     draws = [Draw(f"draw {n}", row.astype(float)) for n, row in enumerate(counts, 1)]
     outcomes = refits(job, fitted, draws, on_iteration)
-    by_name = coefficients_of(outcomes)
+    by_name = refit_values(outcomes)
     rows = (
         [number, *row.tolist(), *refit.coefficients.values()]
         for number, (row, refit) in enumerate(zip(counts, outcomes, strict=True), 1)
@@ -193,5 +193,5 @@ def jackknife_errors(folds: Sequence[Refit]) -> dict[str, float]:
     share = (len(folds) - 1) / len(folds)
     return {
         name: float(np.sqrt(share * np.sum((values - values.mean()) ** 2)))
-        for name, values in coefficients_of(folds).items()
+        for name, values in refit_values(folds).items()
     }

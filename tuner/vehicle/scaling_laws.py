@@ -72,7 +72,7 @@ class Airframe:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ScaledEstimate:
     """A coefficient by a law: its value, the standard deviation of its logarithm, its source."""
 
     value: float
@@ -87,7 +87,7 @@ KNOWN_AIRFRAMES: Mapping[str, Airframe] = {
 """Shipped vehicle -> its airframe."""
 
 
-def coefficients_of(airframe: Airframe) -> dict[str, Estimate]:
+def scaled_coefficients(airframe: Airframe) -> dict[str, ScaledEstimate]:
     """Return name -> estimate of the coefficients that the laws know."""
     arm, radius = 0.5 * airframe.wheelbase, 0.5 * airframe.diameter
     ratio = airframe.pitch / airframe.diameter
@@ -102,24 +102,24 @@ def coefficients_of(airframe: Airframe) -> dict[str, Estimate]:
     lag = "between a palm-sized coreless motor (0.05 s) and an 11 inch brushless one"
     flapping = "the thrust tilts by the advance ratio v/(ΩR): k/R"
     return {
-        "inertia_xx": Estimate(0.19 * gyration, 0.4, f"0.19 m r²: {mass_law}"),
-        "inertia_yy": Estimate(0.19 * gyration, 0.4, f"0.19 m r²: {mass_law}"),
-        "inertia_zz": Estimate(0.33 * gyration, 0.4, f"0.33 m r²: {mass_law}"),
-        "input_scaling": Estimate(scaling, scaling_error, scaling_source),
-        "zero_position_armed": Estimate(
+        "inertia_xx": ScaledEstimate(0.19 * gyration, 0.4, f"0.19 m r²: {mass_law}"),
+        "inertia_yy": ScaledEstimate(0.19 * gyration, 0.4, f"0.19 m r²: {mass_law}"),
+        "inertia_zz": ScaledEstimate(0.33 * gyration, 0.4, f"0.33 m r²: {mass_law}"),
+        "input_scaling": ScaledEstimate(scaling, scaling_error, scaling_source),
+        "zero_position_armed": ScaledEstimate(
             IDLE_SPEED_RATIO * scaling, 0.6, f"{IDLE_SPEED_RATIO:g} of input_scaling, idling"
         ),
-        "time_constant_up": Estimate(0.025, 0.7, lag),
-        "time_constant_down": Estimate(0.035, 0.7, lag),
-        "motor_constant": Estimate(
+        "time_constant_up": ScaledEstimate(0.025, 0.7, lag),
+        "time_constant_down": ScaledEstimate(0.035, 0.7, lag),
+        "motor_constant": ScaledEstimate(
             motor_constant, 0.4, f"C_T ρ D⁴/(2π)² with C_T = 0.05 + 0.14 pitch/diameter: {tables}"
         ),
-        "moment_constant": Estimate(
+        "moment_constant": ScaledEstimate(
             moment_constant, 0.5, "C_P D/(2π C_T) with C_P = 0.0135 + 0.115 pitch/diameter: the "
             "same tables, a third higher as on vehicles",
         ),
-        "rotor_drag_coefficient": Estimate(motor_constant / radius, 0.7, flapping),
-        "rolling_moment_coefficient": Estimate(
+        "rotor_drag_coefficient": ScaledEstimate(motor_constant / radius, 0.7, flapping),
+        "rolling_moment_coefficient": ScaledEstimate(
             0.05 * motor_constant, 1.5, "0.05 of the motor constant, as of the HoverGames quad"
         ),
     }  # fmt: skip
@@ -127,7 +127,7 @@ def coefficients_of(airframe: Airframe) -> dict[str, Estimate]:
 
 def scaled_to_known(
     airframe: Airframe, like: str, known: Mapping[str, float]
-) -> dict[str, Estimate]:
+) -> dict[str, ScaledEstimate]:
     """Return the laws' estimates, scaled so that they hold for a vehicle whose values are known.
 
     Parameters
@@ -137,14 +137,14 @@ def scaled_to_known(
     known
         Coefficient -> value of that one.
     """
-    there = coefficients_of(KNOWN_AIRFRAMES[like])
+    there = scaled_coefficients(KNOWN_AIRFRAMES[like])
     return {
-        name: Estimate(
+        name: ScaledEstimate(
             estimate.value * known[name] / there[name].value,
             estimate.error / math.sqrt(2),
             f"{like}'s, scaled by: {estimate.source}",
         )
-        for name, estimate in coefficients_of(airframe).items()
+        for name, estimate in scaled_coefficients(airframe).items()
     }
 
 
@@ -173,7 +173,9 @@ HEADER = """By scaling laws from what can be read off the vehicle: where a fit s
 tune --flights lab/*.bag --config {priors}"""
 
 
-def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> dict[str, Estimate]:
+def new_vehicle(
+    airframe: Airframe, out: Path, *, like: str | None = None
+) -> dict[str, ScaledEstimate]:
     """Write a vehicle file and, beside it, a job file with priors; return the estimates.
 
     Parameters
@@ -196,7 +198,7 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
             raise OutputError(path, "is there already", "remove it, or give another --out")
     template = read_vehicle(configs_folder() / "vehicles" / "hovergames_updated.yaml")
     if like is None:
-        estimates = coefficients_of(airframe)
+        estimates = scaled_coefficients(airframe)
     else:
         name = {"hovergames": "hovergames_updated"}.get(like, like)
         known = read_vehicle(configs_folder() / "vehicles" / f"{name}.yaml")
@@ -209,7 +211,7 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
 
 
 def _vehicle(
-    template: VehicleFile, airframe: Airframe, estimates: dict[str, Estimate], name: str
+    template: VehicleFile, airframe: Airframe, estimates: dict[str, ScaledEstimate], name: str
 ) -> VehicleFile:
     side = airframe.wheelbase / 2 / math.sqrt(2)
     rotors = [
@@ -226,7 +228,7 @@ def _vehicle(
     return with_values(vehicle, {n: _rounded(e.value) for n, e in estimates.items()})
 
 
-def _job(out: Path, airframe: Airframe, estimates: dict[str, Estimate]) -> dict[str, object]:
+def _job(out: Path, airframe: Airframe, estimates: dict[str, ScaledEstimate]) -> dict[str, object]:
     """Return the content of the job file: the vehicle, its mass, bounds and priors."""
     settings: dict[str, object] = {}
     for name, estimate in estimates.items():

@@ -11,12 +11,12 @@ from scipy.special import ndtri
 from tuner.core.numerics import (
     Z95,
     Inverse,
-    errors_of,
     huber_weights,
     log_determinant,
     robust_sd,
     scaled_inverse,
     scaled_solve,
+    std_errors_of,
     symmetric_eigen,
     unit_diagonal,
 )
@@ -60,9 +60,9 @@ def test_what_nothing_is_known_of_has_a_large_error_and_the_rest_its_own(
         matrix[index] = matrix[:, index] = 0.0
         matrix[index, index] = noise
     known = np.setdiff1d(np.arange(size), lost)
-    alone = errors_of(matrix[np.ix_(known, known)])
-    assert np.all(np.isfinite(errors_of(matrix)))
-    assert errors_of(matrix)[known] == pytest.approx(alone, rel=1e-3)
+    alone = std_errors_of(matrix[np.ix_(known, known)])
+    assert np.all(np.isfinite(std_errors_of(matrix)))
+    assert std_errors_of(matrix)[known] == pytest.approx(alone, rel=1e-3)
     inverse = Inverse.of(matrix, np.zeros_like(matrix))
     assert np.isfinite(inverse.matrix).all()
     assert np.isfinite(log_determinant(matrix))

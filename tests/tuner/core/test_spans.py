@@ -22,7 +22,7 @@ from tuner.core.spans import (
     Span,
     recording,
     span,
-    table_of,
+    stage_table,
 )
 
 
@@ -44,7 +44,7 @@ def test_every_instant_counts_for_the_innermost_stage_that_holds_it():
         Span("search", 0.5, 5.0, processor=8.0),
         Span("figures", 5.5, 8.5, beside=True),
     ]
-    rows = {row.stage: row for row in table_of(spans, 10.0, 12.0)}
+    rows = {row.stage: row for row in stage_table(spans, 10.0, 12.0)}
     assert [*rows] == ["search", "page", "figures", OUTSIDE]
     assert [row.seconds for row in rows.values()] == [4.5, 2.0, 2.0, 1.5]
     assert [row.processor for row in rows.values()] == [8.0, 1.0, 2.0, 1.0]
@@ -62,7 +62,9 @@ def test_what_jax_traces_and_compiles_counts_within_the_stage_that_asks_for_it()
         with span("again"):
             jnp.zeros(3)
             time.sleep(0.02)
-    rows = {row.stage: row for row in table_of(recorder.spans, recorder.now(), time.process_time())}
+    rows = {
+        row.stage: row for row in stage_table(recorder.spans, recorder.now(), time.process_time())
+    }
     assert rows["square"].programs >= 1
     assert rows["square"].jax[TRACING] > 0.0
     assert 0.02 <= rows["again"].seconds < 1.0
@@ -81,7 +83,7 @@ def test_what_another_thread_compiles_goes_on_beside_the_stages():
     compiled = [row for row in recorder.spans if row.name == COMPILING]
     assert compiled
     assert all(row.beside for row in compiled)
-    (row, *_) = (r for r in table_of(recorder.spans, recorder.now(), 1.0) if r.stage == "check")
+    (row, *_) = (r for r in stage_table(recorder.spans, recorder.now(), 1.0) if r.stage == "check")
     assert row.programs == 0
 
 
@@ -146,6 +148,8 @@ def test_building_a_kernel_counts_in_the_stage_that_asks_for_it_and_has_a_name()
     double = Program(lambda x, _: 2.0 * x, Argument((), float, lanes=True), name="doubled")
     with recording() as recorder, span("twice"):
         assert double(np.arange(3.0), lanes=3).values.tolist() == [0.0, 2.0, 4.0]
-    (row,) = (row for row in table_of(recorder.spans, recorder.now(), 1.0) if row.stage == "twice")
+    (row,) = (
+        row for row in stage_table(recorder.spans, recorder.now(), 1.0) if row.stage == "twice"
+    )
     assert row.jax[BUILDING] > 0.0
     assert [each.detail for each in recorder.spans if each.name == BUILDING] == ["doubled"]

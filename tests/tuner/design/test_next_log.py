@@ -10,7 +10,7 @@ from tests.tuner.job.test_windows import job_through
 from tests.tuner.recorded import recordings_of
 from tests.tuner.uncertainty.making import ended
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import errors_of
+from tuner.core.numerics import std_errors_of
 from tuner.design import ranking
 from tuner.design.proposals import LogProposal, log_in_words
 from tuner.design.ranking import propose_logs
@@ -78,7 +78,7 @@ def test_what_is_foreseen_is_what_comes_of_it(full_flight, full_bag, updated, mo
     monkeypatch.setattr(ranking, "TACHOMETER_NOISE", 1e-6)
     (exact,) = (p for p in propose_logs(job, fitted, known, updated) if p.change == "added")
     rest = [job.space.names.index(name) for name in ("motor_constant", "inertia_xx")]
-    alone = errors_of(known[np.ix_(rest, rest)]) / errors_of(known)[rest]
+    alone = std_errors_of(known[np.ix_(rest, rest)]) / std_errors_of(known)[rest]
     shares = np.array(list(exact.shrinks.values()))
     np.testing.assert_allclose(shares[rest], alone, rtol=1e-3)
     assert max(exact.shrinks["input_scaling"], exact.shrinks["zero_position_armed"]) < 0.05

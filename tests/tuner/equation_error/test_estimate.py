@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 import tuner
 from benchmarks import fast_flights
 from tuner.config import Search, resolve_settings
-from tuner.equation_error.estimate import TORQUE_GAINS, Estimate
+from tuner.equation_error.estimate import TORQUE_GAINS, RegressionEstimate
 from tuner.equation_error.model_accelerations import (
     LinearisedAccelerations,
     ModelAccelerations,
@@ -29,8 +29,8 @@ from tuner.equation_error.regression import (
     BIAS_LAGS,
     DELAYS,
     NO_DELAYS,
-    NormalEquations,
     Regression,
+    UnitEquations,
     _plain,
     feedback_bias,
     filtered_sums,
@@ -184,7 +184,7 @@ def test_a_response_a_step_late_is_in_the_errors(lags):
         SimpleNamespace(step=0.01, known=np.ones(size, bool)), left, columns
     )
     sums = filtered_sums(linear, whitening(linear), 1)[:3]
-    equations = NormalEquations(*sums, 1e-6 * one, 0.0 * one, np.eye(1))
+    equations = UnitEquations(*sums, 1e-6 * one, 0.0 * one, np.eye(1))
     found = Regression(one, one, equations, np.eye(1))
     made = SimpleNamespace(at=lambda _: (linear,))
     (error,) = feedback_bias(made, found, free=np.ones(1, bool))
@@ -275,7 +275,7 @@ def test_a_response_within_a_step_biases_no_gain_of_a_moment(responding, monkeyp
 def test_inertia_about_z_is_that_of_a_rigid_body_where_it_may_be(ratio, share):
     values = {"inertia_xx": 1.0, "inertia_yy": 2.0, "inertia_zz": 3.0 * ratio}
     values["moment_constant"] = 0.02
-    found = Estimate(values, {"inertia_zz": 0.1}, (), np.zeros(6), 0.0, None)
+    found = RegressionEstimate(values, {"inertia_zz": 0.1}, (), np.zeros(6), 0.0, None)
     of_body = of_rigid_body(found).values
     assert of_body["inertia_zz"] == pytest.approx(3.0 * ratio / share)
     assert of_body["moment_constant"] == pytest.approx(0.02 / share)

@@ -18,8 +18,8 @@ from tuner.exporters.sdf.model import (
     base_for,
     composite,
     join_bodies,
-    model_of,
     pose_from,
+    sdf_of,
 )
 from tuner.exporters.sdf.spans import (
     Edit,
@@ -124,7 +124,7 @@ def test_a_variable_that_several_rotors_use_is_set_once(vehicle, tmp_path):
 @ALL
 def test_links_together_weigh_and_turn_like_the_vehicle(path, vehicle):
     draft = sdf_draft(path, vehicle, "by a test")
-    whole = composite(model_of(parse(render(draft.text, path), path), 4))
+    whole = composite(sdf_of(parse(render(draft.text, path), path), 4))
     assert whole.mass == pytest.approx(2.243, rel=1e-11)
     np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
     assert any("'base_link' gets 2.204 kg" in note and "rotor_3" in note for note in draft.notes)
@@ -228,7 +228,7 @@ def test_poses_of_links_and_inertials_count(vehicle, tmp_path):
         "<pose degrees='true'>0 0.01 0 0 0 30</pose>",
     ).replace("<pose>0 0 0 0 0 0</pose>", "<pose>0 0 0.2 0 0 0.3</pose>", 1)
     draft = patched(tmp_path, vehicle, text)
-    whole = composite(model_of(parse(draft.text, CLASSIC), 4))
+    whole = composite(sdf_of(parse(draft.text, CLASSIC), 4))
     np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
     assert any("rotor_0 sits" in objection for objection in draft.gates[0].objections)
 
@@ -330,7 +330,7 @@ def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
     model = f"<model><link name='base_link'>{draft.text}</link></model>"
     classic = simulator is GAZEBO_CLASSIC
     if classic:
-        assert read_values(model_of(parse(model, path), 4), vehicle) == numbers_of(
+        assert read_values(sdf_of(parse(model, path), 4), vehicle) == numbers_of(
             vehicle, channels=True
         )
     flown = simulator.flown(vehicle)
@@ -352,9 +352,9 @@ def uneven(vehicle, **effects):
 @pytest.mark.parametrize("path", [CLASSIC, GZ], ids=lambda path: path.name)
 def test_centre_of_mass_and_uneven_rotors_are_in_the_model(path, vehicle, tmp_path):
     draft = sdf_draft(path, uneven(vehicle), "by a test")
-    whole = composite(model_of(parse(draft.text, path), 4))
+    whole = composite(sdf_of(parse(draft.text, path), 4))
     rotors = np.array([rotor.position for rotor in vehicle.rotors])
-    model = model_of(parse(draft.text, path), 4)
+    model = sdf_of(parse(draft.text, path), 4)
     links = {link.attributes.get("name"): link for link in model.links}
     places = np.array([model.pose_of(links[f"rotor_{n}"]).position for n in range(4)])
     arms = places - whole.pose.position

@@ -11,7 +11,7 @@ import pytest
 
 from tests.tuner.exporters.conftest import MODELS
 from tuner.core.errors import ExportError
-from tuner.exporters.sdf.model import composite, read_model
+from tuner.exporters.sdf.model import composite, read_sdf
 from tuner.exporters.simulators import GZ_SIM
 from tuner.exporters.target import write
 from tuner.exporters.targets.sdf import sdf_draft
@@ -52,7 +52,7 @@ def split(folder):
 
 
 def whole_of(path, rotors=4):
-    return read_model(path, rotors)
+    return read_sdf(path, rotors)
 
 
 def test_numbers_are_written_where_they_live(vehicle, tmp_path):

@@ -15,7 +15,7 @@ from tuner.findings.findings import Code, one_line
 from tuner.ground.measurement import Combination, joint_prior
 from tuner.inertial.measurement import measure_inertial
 from tuner.inertial.signals import rate_errors, stretches_of
-from tuner.job.bench import resolution_of, vehicle_of
+from tuner.job.bench import measured_vehicle, resolution_of
 from tuner.job.without_pose import fit_without_pose
 from tuner.options import Options, SimulationOptions
 from tuner.recordings.inspection import inspect_recordings
@@ -209,7 +209,7 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
 def test_a_fit_that_foretells_worse_says_so(simulation, flown, measured, tmp_path, monkeypatch):
     settings = settings_for(log_file(simulation, tmp_path / "log00"), flown)
     wrong = with_values(flown, {"inertia_xx": 2.0 * values_of(flown)["inertia_xx"]})
-    monkeypatch.setattr("tuner.job.without_pose.vehicle_of", lambda *_: wrong)
+    monkeypatch.setattr("tuner.job.without_pose.measured_vehicle", lambda *_: wrong)
     monkeypatch.setattr("tuner.job.without_pose.measure_inertial", lambda *_: measured)
     fitted = fit_without_pose(settings, read_inertial_flights(settings)[0], out=tmp_path / "run")
     (worse,) = [f for f in fitted.result.findings if f.code is Code.RATE_WORSE]
@@ -222,7 +222,7 @@ def test_a_moment_that_commands_do_not_say_adds_up_until_holding_is_better(
 ):
     wrong = with_values(flown, {"torque_trim_x": 5.0 * values_of(flown)["inertia_xx"]})
     settings = settings_for(log_file(simulation, tmp_path / "log00"), wrong)
-    monkeypatch.setattr("tuner.job.without_pose.vehicle_of", lambda *_: wrong)
+    monkeypatch.setattr("tuner.job.without_pose.measured_vehicle", lambda *_: wrong)
     monkeypatch.setattr("tuner.job.without_pose.measure_inertial", lambda *_: measured)
     ((flight,), _) = read_inertial_flights(settings)
     fitted = fit_without_pose(settings, [flight], out=tmp_path / "run")
@@ -344,7 +344,7 @@ def test_lags_near_zero_that_combine_to_less_are_zero(tmp_path):
         p_value=1.0,
         conflicts=(),
     )
-    vehicle = vehicle_of(
+    vehicle = measured_vehicle(
         tmp_path / "a.ulg",
         read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml"),
         combination,

@@ -13,7 +13,7 @@ from tests.tuner.recordings import making
 from tuner.config import resolve_settings
 from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
-from tuner.job.recording_verdict import Verdict, in_words, verdict_of
+from tuner.job.recording_verdict import RecordingVerdict, in_words, verdict_of
 from tuner.options import Options
 from tuner.recordings.flight import Flight
 from tuner.recordings.inspection import inspect_recordings
@@ -141,7 +141,7 @@ def test_motors_are_in_the_order_of_the_logs_geometry(messages, tmp_path: Path) 
     assert note.names == ("betaflight",)
 
 
-def verdict(path: Path) -> Verdict:
+def verdict(path: Path) -> RecordingVerdict:
     (inspection,), _ = inspect_recordings([path])
     return verdict_of(inspection)
 

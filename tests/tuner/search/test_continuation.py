@@ -21,7 +21,7 @@ from tuner.search import continuation, optimisers
 from tuner.search.continuation import OPTIMISERS, _clocks_that_differ, run_stages
 from tuner.search.optimisers import MAX_STATE_SD, estimated_states, need_relinearising
 from tuner.search.progress import Loop, criterion_of, initial_progress, loop_of, with_loop
-from tuner.search.stages import WHOLE_LENGTH, Stage, plan, schedule_of
+from tuner.search.stages import WHOLE_LENGTH, Stage, horizon_stages, plan
 
 FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input_scaling")
 
@@ -32,7 +32,7 @@ def fit():
 
 
 def searched(fit, vectors, *, offsets=False):
-    stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=30)
+    stages = horizon_stages(fit.samples, fit.schedule.log_rate, robust=True, steps=30)
     reports = []
     free = Point(np.ones(len(fit.space), bool), np.full((len(OFFSETS), 2), offsets))
     progress = initial_progress(fit, np.asarray(vectors))
@@ -85,7 +85,7 @@ def test_the_same_search_twice_gives_the_same_numbers(fit):
 
 
 def test_the_search_ends_within_a_tenth_of_a_standard_error_of_the_minimum(fit):
-    stage, reports = schedule_of(fit.samples, 1.0, robust=True, steps=30)[-1], []
+    stage, reports = horizon_stages(fit.samples, 1.0, robust=True, steps=30)[-1], []
     free = Point(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool))
     start = initial_progress(fit, np.asarray(fit.space.initial)[None] + 0.02)
     progress = run_stages(fit, (stage,), start, free=free, undecided={}, on_progress=reports.append)
@@ -237,7 +237,7 @@ def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, 
     fit = with_loop(recorded, Loop(sees_markers=written))
     progress = run_stages(
         fit,
-        schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=10),
+        horizon_stages(fit.samples, fit.schedule.log_rate, robust=True, steps=10),
         initial_progress(fit, np.asarray(fit.space.initial)[None]),
         free=Point(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided={"sees_markers": np.ones(2, bool)},
@@ -253,7 +253,7 @@ def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, 
 def test_who_sees_the_markers_is_tried_from_where_the_search_began():
     """By another choice the first seconds lead the markers to where none of them flies."""
     fit = problem(tuple(FRAME))
-    stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=2)
+    stages = horizon_stages(fit.samples, fit.schedule.log_rate, robust=True, steps=2)
     at = next(number for number, stage in enumerate(stages) if stage.tries_choices)
     start = initial_progress(fit, np.asarray(fit.space.initial)[None])
     astray = start.points.coefficients + 3.0
@@ -287,7 +287,7 @@ def test_saturation_feedback_is_decided_by_the_flights_that_clip(flown):
     fit = eqx.tree_at(
         lambda o: o.segments.measured["position"].values, recorded, replace_fn=lambda p: p + away
     )
-    stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=4)
+    stages = horizon_stages(fit.samples, fit.schedule.log_rate, robust=True, steps=4)
     stages = [stage for stage in stages if stage.tries_choices]
     progress = run_stages(
         fit,

@@ -26,7 +26,7 @@ from tuner.core.errors import InputError
 from tuner.service import database as database_module
 from tuner.service import dispatcher, jobs
 from tuner.service.database import Base, Database, RecordingRow, State
-from tuner.service.jobs import Claim, JobQueue, Outcome
+from tuner.service.jobs import AttemptOutcome, Claim, JobQueue
 from tuner.service.request import JobRequest
 from tuner.service.service import Service
 
@@ -173,10 +173,10 @@ def test_only_the_attempt_that_the_table_names_can_commit(idle):
     new = second.claim()
     points = [{"coefficient": "mass", "unit": "kg", "best": 1.0}]
     assert not first.report(old, [("message", {"text": "late"})])
-    assert not first.finish(old, Outcome(State.DONE, exit_status=0, points=points))
+    assert not first.finish(old, AttemptOutcome(State.DONE, exit_status=0, points=points))
     assert not first.give_back(old, message="late")
-    assert second.finish(new, Outcome(State.DONE, exit_status=0, points=points))
-    assert not second.finish(new, Outcome(State.FAILED, "again"))
+    assert second.finish(new, AttemptOutcome(State.DONE, exit_status=0, points=points))
+    assert not second.finish(new, AttemptOutcome(State.FAILED, "again"))
     row = jobs.job(idle.database, job)
     assert (row.state, row.iteration, row.error) == ("done", None, None)
     assert [e.content for e in jobs.events(idle.database, row) if e.kind == "message"] == [

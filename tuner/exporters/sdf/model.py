@@ -133,7 +133,7 @@ _NAME = re.compile(r"(?:model://)?([A-Za-z0-9_][A-Za-z0-9._-]{0,99})/?")
 
 
 @dataclass(frozen=True)
-class Model:
+class SdfModel:
     """A parsed model.
 
     Attributes
@@ -280,13 +280,13 @@ def _pose_numbers(element: Element) -> list[float]:
     return numbers
 
 
-def read_model(
+def read_sdf(
     path: Path,
     rotors: int,
     *,
     texts: Mapping[Path, str] = MappingProxyType({}),
     prepare: Callable[[str, Path], str] = render,
-) -> Model:
+) -> SdfModel:
     """Return the model of a file and of those that it includes.
 
     Parameters
@@ -299,7 +299,7 @@ def read_model(
     Raises
     ------
     ExportError
-        A file cannot be read, or is included twice, as in itself; or as of `model_of`.
+        A file cannot be read, or is included twice, as in itself; or as of `sdf_of`.
     """
     files: list[Path] = []
 
@@ -321,7 +321,7 @@ def read_model(
                     include.tag, include.children, include.at = MERGED, [model], at
         return root
 
-    return model_of(read(path), rotors)
+    return sdf_of(read(path), rotors)
 
 
 def _model_in(root: Element) -> Element:
@@ -358,7 +358,7 @@ def _pose_of_include(element: Element) -> list[float]:
     return numbers
 
 
-def model_of(root: Element, rotors: int) -> Model:
+def sdf_of(root: Element, rotors: int) -> SdfModel:
     """Return the model of a parsed file.
 
     Raises
@@ -377,7 +377,7 @@ def model_of(root: Element, rotors: int) -> Model:
     by_name = {link.attributes.get("name", ""): link for link in links}
     named = (element.attributes.get("canonical_link", ""), "base_link")
     base = next((by_name[name] for name in named if name in by_name), links[0])
-    model = Model(element, members, base, rotors)
+    model = SdfModel(element, members, base, rotors)
     if not model.motors():
         raise ExportError(
             path,
@@ -398,7 +398,7 @@ def _members(parent: Element, frame: Pose) -> Iterator[tuple[Element, Pose]]:
             yield child, frame
 
 
-def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
+def inertials(model: SdfModel) -> Iterator[tuple[Element, Inertial]]:
     """Yield each link with mass, and its body in the model's frame."""
     for link in model.links:
         inertial = link.find("inertial")
@@ -419,6 +419,6 @@ def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
         yield link, Inertial(mass, model.pose_of_inertial(link), matrix)
 
 
-def composite(model: Model) -> Inertial:
+def composite(model: SdfModel) -> Inertial:
     """Return all links of a model as one body."""
     return join_bodies([body for _, body in inertials(model)])

@@ -19,13 +19,13 @@ from tuner.exporters.sdf.model import (
     MAX_ROTORS,
     MERGED,
     Inertial,
-    Model,
+    SdfModel,
     base_for,
     composite,
     inertials,
-    model_of,
     motor_number,
-    read_model,
+    read_sdf,
+    sdf_of,
 )
 from tuner.exporters.sdf.spans import Edit, Element, parse, without_jinja
 from tuner.exporters.simulators import (
@@ -82,7 +82,7 @@ def channel_tags() -> dict[str, str]:
     return {entry.tag: name for name, entry in _entries().items() if entry.parent == "channel"}
 
 
-def _tagged(model: Model, vehicle: VehicleFile) -> Iterator[tuple[Element, dict[str, str]]]:
+def _tagged(model: SdfModel, vehicle: VehicleFile) -> Iterator[tuple[Element, dict[str, str]]]:
     """Yield each motor plugin and control channel, with tag -> name of the numbers in it."""
     for motor in model.motors():
         yield motor, motor_tags(vehicle, motor_number(motor))
@@ -134,7 +134,7 @@ def numbers_of(vehicle: VehicleFile, *, channels: bool = True) -> dict[str, floa
     return numbers | center_of_mass(vehicle) | uneven
 
 
-def read_values(model: Model, vehicle: VehicleFile) -> dict[str, float]:
+def read_values(model: SdfModel, vehicle: VehicleFile) -> dict[str, float]:
     """Return name -> value of the numbers in a model.
 
     Parameters
@@ -168,7 +168,7 @@ def read_values(model: Model, vehicle: VehicleFile) -> dict[str, float]:
     return known | body | {"mass": whole.mass}
 
 
-def rotor_origin(model: Model, vehicle: VehicleFile) -> Array | None:
+def rotor_origin(model: SdfModel, vehicle: VehicleFile) -> Array | None:
     """Return the origin (3,) m of the vehicle file's rotor positions in a model.
 
     None unless every rotor is a link, ``rotor_0`` and on.
@@ -205,7 +205,7 @@ def sdf_or_snippet(
 
     def faults(path: Path, _: object) -> list[str]:
         text = f"<model><link name='base_link'>{read_file(path)}</link></model>"
-        model = model_of(parse(text, path), len(scaled.rotors))
+        model = sdf_of(parse(text, path), len(scaled.rotors))
         return differences(wanted, read_values(model, scaled))
 
     return Draft(_snippet(scaled, simulator, provenance), flown, _deviations(vehicle), faults)
@@ -254,8 +254,8 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
         The model is not understood, or would not hold the wanted numbers.
     """
     rotors = len(vehicle.rotors)
-    model = read_model(path, rotors, prepare=lambda text, _: without_jinja(text))
-    whole = read_model(path, rotors)
+    model = read_sdf(path, rotors, prepare=lambda text, _: without_jinja(text))
+    whole = read_sdf(path, rotors)
     flown = (GZ_SIM if whole.is_gz else GAZEBO_CLASSIC).flown(vehicle)
     unit = gz_speed_unit(flown) if whole.is_gz else 1.0
     scaled = with_speed_unit(flown, unit)
@@ -271,13 +271,13 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
             "give each rotor's plugin a number of its own",
         )
     patched = _patched(model, edits, provenance)
-    final = read_model(path, rotors, texts=patched)
+    final = read_sdf(path, rotors, texts=patched)
     if wrong := differences(wanted, read_values(final, scaled)):
         raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
 
     def faults(file: Path, instead: Mapping[Path, Path]) -> list[str]:
         texts = {at: read_file(written) for at, written in {**instead, path: file}.items()}
-        return differences(wanted, read_values(read_model(path, rotors, texts=texts), scaled))
+        return differences(wanted, read_values(read_sdf(path, rotors, texts=texts), scaled))
 
     there, geometry = _rotors_there(final, flown)
     return Draft(
@@ -298,10 +298,10 @@ def simulator_of(path: Path) -> str:
     ExportError
         It is no model of a multirotor.
     """
-    return (GZ_SIM if read_model(path, MAX_ROTORS).is_gz else GAZEBO_CLASSIC).name
+    return (GZ_SIM if read_sdf(path, MAX_ROTORS).is_gz else GAZEBO_CLASSIC).name
 
 
-def _patched(model: Model, edits: Sequence[Edit], provenance: str) -> dict[Path, str]:
+def _patched(model: SdfModel, edits: Sequence[Edit], provenance: str) -> dict[Path, str]:
     """Return changed file -> its new text, with a comment on the origin in its model."""
     merged = (include.children[0] for include in model.root.all(MERGED))
     begins = {element.source: element for element in (*merged, model.root)}
@@ -314,7 +314,7 @@ def _patched(model: Model, edits: Sequence[Edit], provenance: str) -> dict[Path,
     return patched
 
 
-def _base_body(model: Model, vehicle: VehicleFile) -> Inertial:
+def _base_body(model: SdfModel, vehicle: VehicleFile) -> Inertial:
     """Return the base link's body with which the model has the vehicle's mass and inertia.
 
     It moves only if the centre of mass is not the origin of rotor positions.
@@ -345,7 +345,9 @@ def _base_body(model: Model, vehicle: VehicleFile) -> Inertial:
         raise ExportError(model.path, what, remedy) from None
 
 
-def _edits(model: Model, whole: Model, vehicle: VehicleFile, base: Inertial) -> Iterator[Edit]:
+def _edits(
+    model: SdfModel, whole: SdfModel, vehicle: VehicleFile, base: Inertial
+) -> Iterator[Edit]:
     """Yield the edits that put a vehicle's numbers into a model.
 
     ``model`` is the text to edit, ``whole`` the rendered model.
@@ -420,7 +422,7 @@ def _provenance_edit(model: Element, provenance: str) -> Edit:
 
 
 def _notes(
-    model: Model, asked: VehicleFile, vehicle: VehicleFile, base: Inertial, unit: float
+    model: SdfModel, asked: VehicleFile, vehicle: VehicleFile, base: Inertial, unit: float
 ) -> Iterator[str]:
     """Yield remarks on the patched model, and on properties that the format lacks."""
     name = model.base.attributes.get("name", "")
@@ -453,13 +455,13 @@ def _notes(
     yield from _deviations(asked)
 
 
-def _more_rotors(model: Model, vehicle: VehicleFile) -> str:
+def _more_rotors(model: SdfModel, vehicle: VehicleFile) -> str:
     """Return a clause if a model has more rotors than a vehicle; else an empty text."""
     count, own = len(replace(model, rotors=MAX_ROTORS).rotor_links()), len(vehicle.rotors)
     return f"the model has {count} rotors, the vehicle {own}" if count > own else ""
 
 
-def _rotors_there(model: Model, vehicle: VehicleFile) -> tuple[VehicleFile, tuple[str, ...]]:
+def _rotors_there(model: SdfModel, vehicle: VehicleFile) -> tuple[VehicleFile, tuple[str, ...]]:
     """Return a vehicle with a model's rotors, and a clause for each difference of its own."""
     more = _more_rotors(model, vehicle)
     clauses, rotors = [more] if more else [], list(vehicle.rotors)

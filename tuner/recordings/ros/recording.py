@@ -74,7 +74,7 @@ class Folder(Container):
             path = self.path / Path(name).name
             try:
                 self._files.append(
-                    open_file(self._unpack(path) if path.suffix == ".zstd" else path)
+                    open_data_file(self._unpack(path) if path.suffix == ".zstd" else path)
                 )
             except (RecordingError, DamagedError, OSError) as err:
                 errors.append(str(err))
@@ -160,7 +160,7 @@ def unpacked_block(block: Block) -> Block:
     return block_of(block.time.tolist(), payloads)
 
 
-def open_file(path: Path) -> Container:
+def open_data_file(path: Path) -> Container:
     """Open one data file of a ROS 2 recording by its first bytes."""
     if not path.is_file():
         raise DamagedError(f"{path.name} is no file")
@@ -178,7 +178,7 @@ def open_container(path: Path) -> Container:
         return Folder(path)
     with path.open("rb") as stream:
         magic = stream.read(7)
-    return Bag1(path) if magic in (b"#ROSBAG", b"") else open_file(path)
+    return Bag1(path) if magic in (b"#ROSBAG", b"") else open_data_file(path)
 
 
 class RosRecording(Recording):
