@@ -103,7 +103,7 @@ def inspect_recording(
                 started=None,
                 duration=0.0,
                 topic_map="",
-                problem=f"{err.what}; {err.remedy}",
+                problem=_in_words(err),
                 topics=tuple(_topic(topic, None, ()) for topic in recording.topics),
                 inlets=inlet_reports({}, trajectory=False),
             )
@@ -121,7 +121,7 @@ def _without_pose(signals: Signals) -> Inspection:
     fitted = () if error else (NoteCode.WITHOUT_POSE.note(kind="info", seconds=seconds),)
     return replace(
         _with_signals(signals),
-        problem=f"{error.what}; {error.remedy}" if error else None,
+        problem=_in_words(error),
         inlets=inlet_reports(_measured_columns(signals.series), trajectory=False),
         notes=(*fitted, *signals.notes),
     )
@@ -136,13 +136,17 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
     error = None if missions else mission_error(content.recording.path, content.series)
     return replace(
         _with_signals(content),
-        problem=None if error is None else error.what,
+        problem=_in_words(error),
         missions=missions,
         inlets=inlet_reports(measured, trajectory=sidecar.trajectory is not None),
         coefficients=() if unusable else coefficient_reports(content.series, measured, missions),
         clock=_clock(content),
         notes=content.notes,
     )
+
+
+def _in_words(error: RecordingError | None) -> str | None:
+    return None if error is None else f"{error.what}; {error.remedy}"
 
 
 def _with_signals(read: Signals) -> Inspection:

@@ -22,6 +22,7 @@ from tuner.options import Options
 from tuner.recordings.consistency import _axis_doubts
 from tuner.recordings.content import ReadOptions, read_content
 from tuner.recordings.flight import Flight, Series
+from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.inspection_rules import suggested_map
 from tuner.recordings.interpolation import rotate
 from tuner.recordings.loader import load_flight, read_inertial
@@ -694,6 +695,15 @@ def _in_ned_from_the_ground() -> str:
         turned = making.ned(np.column_stack([table[axis] for axis in axes]))
         table |= dict(zip(axes, turned.T, strict=True))
     return ways.text(table)
+
+
+def test_an_inspection_says_what_to_do_where_nothing_flies(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    path.write_text(_in_ned_from_the_ground())
+    ((seen,), errors) = inspect_recordings([path], cache=False)
+    assert not errors
+    assert seen.problem.startswith("flies only if z of its position points down")
+    assert seen.problem.endswith("frame: ned_frd in a topic map (--topics FILE)")
 
 
 @pytest.mark.parametrize(
