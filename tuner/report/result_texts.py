@@ -11,7 +11,7 @@ from tuner.core.phrases import listed, percent
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.result import EffectiveResult, Ending, FlightResult, RunResult
 from tuner.uncertainty.records import Calibration
-from tuner.vehicle.selection_table import SelectionCode, SelectionRow
+from tuner.vehicle.selection_table import SelectionRow
 
 MIN_NEARLY_KEPT_GAIN = 0.01
 """A rejected term with a larger gain, as a share of the loss, is mentioned."""
@@ -95,35 +95,6 @@ def simulator_lacks(effective: EffectiveResult) -> str:
         f"Gazebo lacks {listed([term.group for term in effective.lost])}, and with effective "
         f"coefficients misses them by {effective.rmse_effective.words}."
     )
-
-
-_REASONS = {
-    SelectionCode.PREDICTS_FLIGHTS: "flights left out of the fit are predicted better with it",
-    SelectionCode.PREDICTS_SECTIONS: "sections of flights left out of the fit are predicted better "
-    "with it, where no flight is by others",
-    SelectionCode.SIGNIFICANT: "chance does not explain what it is worth, and no flight left out "
-    "of the fit contradicts it",
-    SelectionCode.PREDICTS_SAMPLES: "once disturbances are estimated, samples are "
-    "predicted better with it by more than chance",
-    SelectionCode.ASKED_FOR: "the job file names it",
-    SelectionCode.OPEN_LOOP: "it is from the beginning: inputs are fed in below the loop that "
-    "would hide it",
-    SelectionCode.HOVERS_TILTED: "every recording shows a hover that is not level",
-    SelectionCode.NOT_SIGNIFICANT: "residuals that are correlated in time gain as much from chance",
-    SelectionCode.IMMATERIAL: "it lowers the loss by less than simulators of one vehicle differ",
-    SelectionCode.NOT_PREDICTED: "flights left out of the fit are not predicted better by more "
-    "than the scatter",
-    SelectionCode.NO_INFORMATION: "the flights do not distinguish it from the coefficients in the "
-    "model",
-    SelectionCode.WORSE_AFTER_REFIT: "fitted again with it, flights left out of the fit are not "
-    "predicted better",
-    SelectionCode.REFUTED: "recorded commands have the gains of the controller file",
-}
-
-
-def selection_reason(row: SelectionRow) -> str:
-    """Return why a group is in the model or not, as a clause."""
-    return _REASONS[row.reason]
 
 
 def nearly_kept(row: SelectionRow) -> bool:

@@ -1,48 +1,73 @@
-"""The table of a selection, as ``result.json`` holds it: codes and numbers, no prose.
-
-Sentences are made from them in `tuner.report.result_texts`.
-"""
+"""The table of a selection, as ``result.json`` holds it: codes and numbers, no prose."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import StrEnum
 
 from tuner.core.files import Part
+from tuner.core.phrases import Worded
 
 Groups = Mapping[str, tuple[str, ...]]
 """Group -> its coefficients."""
 
 
-class SelectionCode(StrEnum):
-    """Why a group of coefficients is in the model, or is not."""
+class SelectionCode(Worded):
+    """Why a group of coefficients is in the model, or is not; texts are clauses on the group."""
 
-    PREDICTS_FLIGHTS = "predicts_flights"
-    """Kept: each flight is predicted better by a fit to the others that holds it."""
-    PREDICTS_SECTIONS = "predicts_sections"
-    """Kept: sections of the flights are, where one flight alone shows it."""
-    SIGNIFICANT = "significant"
-    """Kept: it is significant, and no data left out contradict it."""
-    PREDICTS_SAMPLES = "predicts_samples"
-    """Kept: once disturbances are estimated, each sample is predicted better with it."""
-    ASKED_FOR = "asked_for"
-    """Kept: the job file names it."""
-    OPEN_LOOP = "open_loop"
-    """Kept: inputs are fed in below the loop that would hide it."""
-    HOVERS_TILTED = "hovers_tilted"
-    """Kept: every recording shows a hover that is not level, so the markers sit at an angle."""
-    NOT_SIGNIFICANT = "not_significant"
-    """It lowers the loss by no more than chance, with correlated residuals."""
-    IMMATERIAL = "immaterial"
-    """It lowers the loss by less than simulators that agree differ."""
-    NOT_PREDICTED = "not_predicted"
-    """Data left out of the fit are not predicted significantly better."""
-    NO_INFORMATION = "no_information"
-    """It is confounded with the coefficients in the model."""
-    WORSE_AFTER_REFIT = "worse_after_refit"
-    """Refitted with it, the flights left out are not predicted better."""
-    REFUTED = "refuted"
-    """Recorded commands answer the recorded rates with the gains of the controller file."""
+    # kept
+    PREDICTS_FLIGHTS = (
+        "predicts_flights",
+        "flights left out of the fit are predicted better with it",
+    )
+    PREDICTS_SECTIONS = (
+        "predicts_sections",
+        (
+            "sections of flights left out of the fit are predicted better with it, where no flight "
+            "is by others"
+        ),
+    )
+    SIGNIFICANT = (
+        "significant",
+        (
+            "chance does not explain what it is worth, and no flight left out of the fit "
+            "contradicts it"
+        ),
+    )
+    PREDICTS_SAMPLES = (
+        "predicts_samples",
+        (
+            "once disturbances are estimated, samples are predicted better with it by more than "
+            "chance"
+        ),
+    )
+    ASKED_FOR = "asked_for", "the job file names it"
+    OPEN_LOOP = (
+        "open_loop",
+        "it is from the beginning: inputs are fed in below the loop that would hide it",
+    )
+    HOVERS_TILTED = "hovers_tilted", "every recording shows a hover that is not level"
+    # not kept
+    NOT_SIGNIFICANT = (
+        "not_significant",
+        "residuals that are correlated in time gain as much from chance",
+    )
+    IMMATERIAL = (
+        "immaterial",
+        "it lowers the loss by less than simulators of one vehicle differ",
+    )
+    NOT_PREDICTED = (
+        "not_predicted",
+        "flights left out of the fit are not predicted better by more than the scatter",
+    )
+    NO_INFORMATION = (
+        "no_information",
+        "the flights do not distinguish it from the coefficients in the model",
+    )
+    WORSE_AFTER_REFIT = (
+        "worse_after_refit",
+        "fitted again with it, flights left out of the fit are not predicted better",
+    )
+    REFUTED = "refuted", "recorded commands have the gains of the controller file"
 
 
 class SelectionRow(Part):

@@ -9,7 +9,6 @@ from tuner.report.result_texts import (
     effective_in_words,
     gain_in_words,
     selection_in_words,
-    selection_reason,
 )
 from tuner.result import PoseRmse
 from tuner.uncertainty.records import COVERAGE_LEVELS, Calibration, CoverageRecord, calibration
@@ -38,7 +37,7 @@ def row(code, *, kept=False):
 
 @pytest.mark.parametrize("code", SelectionCode)
 def test_every_reason_is_a_clause(code):
-    clause = selection_reason(row(code))
+    clause = row(code).reason.text
     assert clause
     assert not clause.endswith(".")
 

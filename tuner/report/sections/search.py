@@ -14,7 +14,6 @@ from tuner.report.result_texts import (
     gain_in_words,
     nearly_kept,
     selection_in_words,
-    selection_reason,
 )
 from tuner.report.section import (
     FITTED,
@@ -135,7 +134,7 @@ def selection(rows: Sequence[SelectionRow]) -> Section:
             gain_in_words(row.scatter),
             Cell(
                 "in the model" if row.kept else "left out",
-                small=selection_reason(row),
+                small=row.reason.text,
                 look="well" if row.kept else "kept",
             ),
         )
@@ -167,7 +166,7 @@ def _figure(rows: Sequence[SelectionRow]) -> list[Chart]:
             [row.group for row in scored],
             [100 * (row.gain_holdout or 0.0) if row.kept == kept else None for row in scored],
             colour,
-            [f"{row.group}: {selection_reason(row)}" for row in scored],
+            [f"{row.group}: {row.reason.text}" for row in scored],
         )
         for name, kept, colour in (("in the model", True, FITTED.colour), ("left out", False, GREY))
     ]
