@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from tuner.core.files import FiniteOrNone, Part
 from tuner.core.numerics import Z95
-from tuner.core.phrases import listed, percent, quantity
+from tuner.core.phrases import Worded, listed, percent, quantity
 from tuner.vehicle import scale_group
 
 WELL_KNOWN = 0.05
@@ -117,35 +117,52 @@ class Verdict(StrEnum):
     """A constant multiple of another coefficient, as the job file says."""
 
 
-class ReasonCode(StrEnum):
-    """Main reason of a verdict."""
+class ReasonCode(Worded):
+    """Main reason of a verdict; ``{prior}`` and so on in its text are those of `_main_clause`."""
 
-    INTERVAL = "interval"
-    """The flights determine it, to ``half_width``."""
-    NULL_DIRECTION = "null_direction"
-    """It takes part in ``direction``, along which nothing that was recorded changes."""
-    NO_INFORMATION = "no_information"
-    """With the others free, the flights hold no information about it."""
-    WIDE_INTERVAL = "wide_interval"
-    """The flights alone determine it no better than ``half_width``."""
-    REFUTED = "refuted"
-    """The fitted vehicle flies otherwise than the recorded one: flights say nothing about it."""
-    PRIOR_DOMINATES = "prior_dominates"
-    """``prior_share`` of the information about it comes from its prior."""
-    NOT_WITH_ALL_FREE = "not_with_all_free"
-    """Not identifiable before others were held, although it would be now."""
-    IMPOSSIBLE_INERTIA = "impossible_inertia"
-    """``fitted_value`` and the other moments of inertia are those of no rigid body."""
-    COMBINATION_MEASURED = "combination_measured"
-    """Ground measurements determine it together with ``correlated_with`` only."""
-    MEASURED_ROUGHLY = "measured_roughly"
-    """Ground measurements determine it no better than ``half_width``."""
-    REGRESSED = "regressed"
-    """A regression of recorded accelerations determines it, to ``half_width``."""
-    NOT_FITTED = "not_fitted"
-    """It is fixed."""
-    NOT_EXAMINED = "not_examined"
-    """It was fitted, and how well it is known was not computed, or not yet."""
+    INTERVAL = "interval", "±{half_width} (95 %){source}"
+    REGRESSED = "regressed", "±{half_width} (95 %), by regression of accelerations"
+    NULL_DIRECTION = (
+        "null_direction",
+        "the flights do not identify it: {direction} The interval is that of {prior}",
+    )
+    NO_INFORMATION = (
+        "no_information",
+        "the flights hold no information about it; the interval is that of {prior}",
+    )
+    WIDE_INTERVAL = (
+        "wide_interval",
+        "the flights alone {closeness}; the interval leans on {prior}",
+    )
+    REFUTED = (
+        "refuted",
+        (
+            "the fitted vehicle does not fly what was recorded, so that its flights say nothing "
+            "about it; the interval is no narrower than that of {prior}"
+        ),
+    )
+    PRIOR_DOMINATES = (
+        "prior_dominates",
+        "{prior_share} of the information about it is that of {prior}",
+    )
+    NOT_WITH_ALL_FREE = (
+        "not_with_all_free",  # although it would be now, with others held
+        "the flights do not identify it while all others are free",
+    )
+    IMPOSSIBLE_INERTIA = (
+        "impossible_inertia",
+        (
+            "fitted to {fitted_value:.4g}, which no rigid body has together with the other moments "
+            "of inertia"
+        ),
+    )
+    COMBINATION_MEASURED = (
+        "combination_measured",
+        ("measured only in combination with {correlated_with}, whose value alone was not measured"),
+    )
+    MEASURED_ROUGHLY = "measured_roughly", "measured only to ±{half_width} (95 %)"
+    NOT_FITTED = "not_fitted", ""
+    NOT_EXAMINED = "not_examined", "its interval was not computed"
 
 
 class Reason(Part):
@@ -399,32 +416,17 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
 
 
 def _main_clause(reason: Reason) -> str:
-    prior = f"the {'given' if reason.prior_given else 'default'} prior"
-    source = "" if reason.channel is None else f", mostly from {_source(reason)}"
-    direction = reason.direction
-    return {
-        ReasonCode.INTERVAL: f"±{_half_width(reason)} (95 %){source}",
-        ReasonCode.REGRESSED: f"±{_half_width(reason)} (95 %), by regression of accelerations",
-        ReasonCode.NULL_DIRECTION: "the flights do not identify it: "
-        f"{'' if direction is None else direction_in_words(direction)} "
-        f"The interval is that of {prior}",
-        ReasonCode.NO_INFORMATION: "the flights hold no information about it; "
-        f"the interval is that of {prior}",
-        ReasonCode.WIDE_INTERVAL: f"the flights alone {_closeness(reason)}; the interval leans "
-        f"on {prior}",
-        ReasonCode.REFUTED: "the fitted vehicle does not fly what was recorded, so that its "
-        f"flights say nothing about it; the interval is no narrower than that of {prior}",
-        ReasonCode.PRIOR_DOMINATES: f"{percent(reason.prior_share or 0.0)} of the information "
-        f"about it is that of {prior}",
-        ReasonCode.NOT_WITH_ALL_FREE: "the flights do not identify it while all others are free",
-        ReasonCode.IMPOSSIBLE_INERTIA: f"fitted to {reason.fitted_value or 0.0:.4g}, which no "
-        "rigid body has together with the other moments of inertia",
-        ReasonCode.COMBINATION_MEASURED: "measured only in combination with "
-        f"{reason.correlated_with}, whose value alone was not measured",
-        ReasonCode.MEASURED_ROUGHLY: f"measured only to ±{_half_width(reason)} (95 %)",
-        ReasonCode.NOT_FITTED: "",
-        ReasonCode.NOT_EXAMINED: "its interval was not computed",
-    }[reason.code]
+    text: str = reason.code.text
+    return text.format(
+        prior=f"the {'given' if reason.prior_given else 'default'} prior",
+        source="" if reason.channel is None else f", mostly from {_source(reason)}",
+        direction="" if reason.direction is None else direction_in_words(reason.direction),
+        half_width=_half_width(reason),
+        closeness=_closeness(reason),
+        prior_share=percent(reason.prior_share or 0.0),
+        fitted_value=reason.fitted_value or 0.0,
+        correlated_with=reason.correlated_with,
+    )
 
 
 def _half_width(reason: Reason) -> str:
