@@ -106,6 +106,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         The system refuses to write there.
     """
     with _refusals(path):
+        _check_kind(path)
         path = Path(os.path.realpath(path))
         path.parent.mkdir(parents=True, exist_ok=True)
         unfinished = path.with_name(f".{secrets.token_hex(8)}{path.suffix}")
@@ -160,7 +161,14 @@ def check_file(path: Path) -> None:
                 raise OSError(errno.EISDIR, "")
             if not os.access(path, os.W_OK):
                 raise OSError(errno.EACCES, "")
-        _check_writable(path.parent)
+            _check_kind(path)
+        _check_writable(Path(os.path.realpath(path)).parent)
+
+
+def _check_kind(path: Path) -> None:
+    """Raise what the system would not say to a file in the place of a device or a pipe."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "")
 
 
 def _check_writable(folder: Path) -> None:
@@ -199,6 +207,7 @@ _REFUSALS = {
     errno.EEXIST: ("it is a file", "name a folder"),
     errno.EILSEQ: ("its name is not UTF-8", "give another name"),
     errno.EISDIR: ("it is a folder", "name a file"),
+    errno.EINVAL: ("it is a device or a pipe", "name a file"),
     errno.ENOENT: ("its folder does not exist", "make the folder first"),
 }
 

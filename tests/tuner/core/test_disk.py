@@ -18,6 +18,7 @@ import pytest
 from tuner.core import files
 from tuner.core.disk import (
     cache_folder,
+    check_file,
     check_folder,
     exists,
     make_folder,
@@ -76,6 +77,24 @@ def test_a_link_stays_one_and_what_it_leads_to_is_written(tmp_path):
         assert path.is_symlink()
         assert (there.parent / path.name).read_text() == "after"
     assert len(list(tmp_path.iterdir())) == 3
+    astray = tmp_path / "astray.csv"
+    astray.symlink_to(there / "z.csv")  # inside a file
+    for refused in (check_file, lambda place: write_text(place, "x")):
+        with pytest.raises(OutputError, match=r"it lies inside a file|it is a file"):
+            refused(astray)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_a_device_or_a_pipe_stays_what_it_is(tmp_path):
+    """As of --out /dev/null for root, who may put a file in its place."""
+    pipe, link = tmp_path / "pipe.csv", tmp_path / "link.csv"
+    os.mkfifo(pipe)
+    link.symlink_to(pipe)
+    for path in (pipe, link):
+        for refused in (check_file, lambda place: write_text(place, "x")):
+            with pytest.raises(OutputError, match="it is a device or a pipe; name a file"):
+                refused(path)
+    assert pipe.is_fifo()
 
 
 def test_a_refusal_that_nobody_foresaw_is_reported_with_its_own_words(tmp_path):
