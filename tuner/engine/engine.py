@@ -229,7 +229,8 @@ class ClusterFile(Section):
         Of each, as ``2GiB``: a worker that takes more is ended and its task computed again. None
         shares the machine's out, and is possible on this machine alone.
     gpus
-        Of this machine, which its workers take in turn, each one alone.
+        Of this machine, which its workers take in turn, each one alone: for what runs through XLA,
+        as a force of one's own without a kernel. Fits fly on the processor.
     address, tls
         A running scheduler; its workers bring their own cores and memory.
     jobs, kubernetes
