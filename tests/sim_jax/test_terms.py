@@ -31,6 +31,8 @@ CRAFT = vehicle()
 EFFECTS = [row for row in REGISTRY.values() if row.is_effect and row.scope == "vehicle"]
 IN_MOTORS = ("battery_exponent", "time_constant_slope", "time_constant_second")
 IN_WRENCH = [row for row in EFFECTS if row.name not in IN_MOTORS]
+NEUTRAL = {row.name: float(row.neutral) for row in IN_WRENCH}
+NONE = dict.fromkeys(NEUTRAL, 0.0)
 SPEEDS = tuple(jnp.asarray(speed) for speed in (590.0, 610.0, 600.0, 630.0))
 ACCELERATIONS = tuple(jnp.asarray(change) for change in (40.0, -20.0, 10.0, 90.0))
 MOVING = Motion(
@@ -49,6 +51,11 @@ def wrench(craft, motion=MOVING, speeds=SPEEDS, environment=None):
     return jnp.concatenate([sum_.force.stacked(), sum_.moment.stacked()])
 
 
+@jax.jit
+def with_slope(effects, along):
+    return jax.jvp(lambda values: wrench(with_effects(**values)), (effects,), (along,))
+
+
 def change(**effects):
     return np.asarray(wrench(with_effects(**effects)) - wrench(CRAFT))
 
@@ -62,10 +69,12 @@ def test_the_neutral_value_changes_no_bit_and_another_value_does(row):
 
 @pytest.mark.parametrize("row", IN_WRENCH, ids=lambda row: row.name)
 def test_derivatives_agree_with_differences(row):
-    at = row.neutral + 0.3 * row.prior_sd
-    _, slope = jax.jvp(lambda value: wrench(with_effects(**{row.name: value})), (at,), (1.0,))
-    width = 1e-4 * row.prior_sd
-    up, down = (wrench(with_effects(**{row.name: at + side * width})) for side in (1, -1))
+    """Of one beside all others, at their neutral values: one program for all."""
+    at, width = row.neutral + 0.3 * row.prior_sd, 1e-4 * row.prior_sd
+    (_, slope), (up, _), (down, _) = (
+        with_slope(NEUTRAL | {row.name: at + side * width}, NONE | {row.name: 1.0})
+        for side in (0, 1, -1)
+    )
     np.testing.assert_allclose(slope, (up - down) / (2 * width), rtol=1e-5, atol=1e-6)
 
 

@@ -515,7 +515,7 @@ def test_rotor_speeds_in_bursts_say_too_little(flown):
 
 
 @pytest.mark.parametrize(
-    ("shape", "speed", "seconds"), [("circle", 3.0, 10.0), ("lemniscate", 4.0, 20.0)]
+    ("shape", "speed", "seconds"), [("circle", 3.0, 10.0), ("lemniscate", 4.0, 12.0)]
 )
 def test_flights_that_determine_few_coefficients_do_not_mislead(shape, speed, seconds, tmp_path):
     """Commands and poses without noise; many laws are free that it does not determine."""

@@ -219,7 +219,7 @@ def test_what_only_hovers_is_cut_to_a_piece() -> None:
 
 @pytest.fixture(scope="module")
 def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the shipped circle ten times, with half a minute of hover between."""
+    """Return the shipped circle seven times, with half a minute of hover between."""
     messages = making.px4_messages(making.CIRCLE)
     names = (
         "vehicle_local_position",
@@ -233,7 +233,7 @@ def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
         hover = column.time < column.time[0] + 4e9
         random = np.random.default_rng(1)
         parts, times = [], []
-        for lap in range(10):
+        for lap in range(7):
             start = column.time[0] + lap * 68 * 10**9
             times.append(start + column.time - column.time[0])
             parts.append(column.values)
@@ -250,14 +250,14 @@ def long_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_missions_of_a_long_log(long_log: Path) -> None:
     flights = load_flights(long_log)
-    assert len(flights) == 10
+    assert len(flights) == 7
     assert all(flight.duration < 60 for flight in flights)
     (inspection,), _ = inspect_recordings([long_log])
     assert sum(mission.fitted for mission in inspection.missions) in (4, 5)
     recordings, findings = read_recordings(resolve_settings(Options([str(long_log)])))
     assert len(recordings) == sum(mission.fitted for mission in inspection.missions)
     (chosen,) = [f for f in findings if f.code is Code.MANOEUVRES_CHOSEN]
-    assert chosen.numbers["flights"] == 10
+    assert chosen.numbers["flights"] == 7
 
 
 def test_a_side_car_names_the_missions(long_log: Path) -> None:
