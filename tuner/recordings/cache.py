@@ -10,6 +10,7 @@ import functools
 import hashlib
 import json
 import logging
+import math
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
@@ -26,8 +27,13 @@ T = TypeVar("T")
 
 #: Larger files are recognised by name, size and time of change instead of their content.
 MAX_HASHED_BYTES = 256 << 20
-#: The cached files together take no more; the longest unused are removed first.
+#: The cached files together take no more, but for `UNCHECKED_SHARE`; the longest unused go first.
 MAX_CACHE_BYTES = 2 << 30
+#: Share of that which a process stores before it looks through all files again.
+UNCHECKED_SHARE = 0.01
+
+_unchecked = math.inf
+"""bytes that this process has stored since it looked."""
 
 
 def cache_root() -> Path:
@@ -119,11 +125,15 @@ def load_or_compute(kind: type[T], path: Path, compute: Callable[[], T]) -> T:
 
 def store(path: Path, content: bytes) -> None:
     """Write a cached file atomically; a full disk is no error."""
+    global _unchecked  # noqa: PLW0603 (of this process)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as unfinished:
             unfinished.write_bytes(content)
-        _remove_oldest()
+        _unchecked += len(content)
+        if _unchecked > UNCHECKED_SHARE * MAX_CACHE_BYTES:
+            _remove_oldest()
+            _unchecked = 0.0
     except (OSError, OutputError) as err:
         logger.info("nothing is cached in %s: %s", path.parent, err)
 

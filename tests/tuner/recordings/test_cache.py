@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from tests.tuner.recordings import making
 from tuner.recordings import cache
 from tuner.recordings import loader as loading
-from tuner.recordings.cache import cache_root, digest
+from tuner.recordings.cache import cache_root, digest, store
 from tuner.recordings.content import ReadOptions
 from tuner.recordings.flight import Flight
 from tuner.recordings.loader import load_flight
@@ -83,6 +84,21 @@ def test_same_content_elsewhere_is_known(bag: Path, reads: list[Path], tmp_path:
     moved = bag.rename(tmp_path / "there" / bag.name)
     assert load_flight(moved).path == str(moved)
     assert len(reads) == 1
+
+
+def test_the_longest_unused_go_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TUNE_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr("tuner.recordings.cache.MAX_CACHE_BYTES", 1000)
+    files = [tmp_path / "flights" / str(number) for number in range(4)]
+    for age, file in enumerate(files[:3]):
+        store(file, bytes(300))
+        os.utime(file, (1e9 - age, 1e9 - age))
+    store(files[3], bytes(300))
+    assert [file.exists() for file in files] == [True, True, False, True]
+    monkeypatch.setattr("tuner.recordings.cache.MAX_CACHE_BYTES", 10_000)
+    store(files[2], bytes(90))  # less than a hundredth: nobody looks
+    monkeypatch.setattr("tuner.recordings.cache._remove_oldest", lambda: pytest.fail("looks"))
+    store(files[2], bytes(9))
 
 
 def test_damaged_cache_is_read_anew(bag: Path, reads: list[Path]) -> None:
