@@ -13,7 +13,7 @@ from sim_jax.constants import GRAVITY
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.rigid_body import Motion
 from tuner.config import InletName
-from tuner.core.numerics import Array
+from tuner.core.numerics import Array, finite_rows
 from tuner.objective.inlets import (
     MAX_PERIODS,
     at_ticks,
@@ -75,7 +75,7 @@ class Steps:
     @property
     def known(self) -> Mask:
         """Whether all of each step (N,) was recorded."""
-        return np.asarray(np.isfinite(self.accelerations).all(axis=1))
+        return finite_rows(self.accelerations)
 
 
 def steps_of(flight: Flight, *, input_late: float = 0.0, averaged: bool = False) -> Steps | None:
@@ -93,7 +93,7 @@ def steps_of(flight: Flight, *, input_late: float = 0.0, averaged: bool = False)
     rotors = flight.series.get("rotor_speed")
     if rotors is None:
         return None
-    known = np.isfinite(rotors.values).all(axis=1)
+    known = finite_rows(rotors.values)
     if known.sum() < MIN_SAMPLES:
         return None
     rotors = Series(rotors.time[known] - input_late, rotors.values[known])
@@ -131,7 +131,7 @@ def steps_with(flight: Flight, rotors: Series, *, averaged: bool = False) -> Ste
     rates = _weighed(gyro, edges, about[None], 1.0 / (rate * readings))[0]
     turning = np.diff(rates, axis=0) * rate
     accelerations = np.hstack([turned.inv().apply(pull), turning])
-    accelerations[~np.isfinite(state.body_rate).all(axis=1)] = np.nan
+    accelerations[~finite_rows(state.body_rate)] = np.nan
     part = Steps(
         step=1.0 / rate,
         time=middle,

@@ -20,7 +20,7 @@ from sim_jax.constants import GRAVITY
 from sim_jax.control.mixer import ROTORS
 from tuner.config import Settings
 from tuner.core.errors import ConfigError
-from tuner.core.numerics import Z95, Array, symmetric_eigen, unit_diagonal
+from tuner.core.numerics import Z95, Array, finite_rows, symmetric_eigen, unit_diagonal
 from tuner.core.runtime import configure
 from tuner.core.spans import span
 from tuner.engine.beside import do_beside
@@ -297,7 +297,7 @@ def _hover_lift(flight: Flight, vehicle: VehicleFile) -> dict[Source, float]:
     lifts: dict[Source, float] = {}
     for source in get_args(Source):
         series = flight.series.get(source)
-        complete = None if series is None else np.isfinite(series.values).all(axis=1)
+        complete = None if series is None else finite_rows(series.values)
         if series is None or complete is None or complete.sum() < MIN_SAMPLES:
             continue
         speeds = np.sqrt(squared_speed(vehicle, source, series.values[complete]))

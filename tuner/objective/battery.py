@@ -14,7 +14,7 @@ from sim_jax.numeric import Array, Scalar
 from sim_jax.schedule import Schedule
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array as Numbers
-from tuner.core.numerics import robust_sd
+from tuner.core.numerics import finite_rows, robust_sd
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
 from tuner.vehicle import VehicleFile
@@ -115,7 +115,7 @@ def _mean_cube(flight: Flight, signal: str) -> Series | None:
     if not flight.has(signal):
         return None
     series = flight.series[signal]
-    known = np.isfinite(series.values).all(axis=1)
+    known = finite_rows(series.values)
     time, speeds = series.time[known], np.abs(series.values[known])
     if signal == "command" and len(time):
         speeds = _lagged(time, speeds + IDLE_SPEED_RATIO)

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.numerics import Array
+from tuner.core.numerics import Array, finite_rows
 from tuner.recordings.notes import Damage, Note
 
 
@@ -81,7 +81,7 @@ class RawSeries:
 
     def complete(self) -> Self:
         """Return the samples of which all columns were measured."""
-        return self.where(np.asarray(np.isfinite(self.values).all(axis=1)))
+        return self.where(finite_rows(self.values))
 
     def column(self, number: int) -> tuple[Array, Array]:
         """Return times and values, (m,) each, of the measured samples of a column."""

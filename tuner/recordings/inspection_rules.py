@@ -18,7 +18,7 @@ import yaml
 
 from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import Array
+from tuner.core.numerics import Array, finite_rows
 from tuner.recordings.clocks import clock_of, pose_offset
 from tuner.recordings.consistency import contradiction_in
 from tuner.recordings.content import (
@@ -248,7 +248,7 @@ def _mission(content: Content, index: int) -> MissionReport:
         turn_rates = np.linalg.norm(resample("body_rate", rates, clock), axis=1)
         turning = float(np.nanmax(turn_rates)) if np.isfinite(turn_rates).any() else None
     yaw_rate, level_held = yaw_spin(content.series.get("rate_setpoint"), mission.start, mission.end)
-    known = np.isfinite(position).all(axis=1) & np.isfinite(attitude).all(axis=1)
+    known = finite_rows(position) & finite_rows(attitude)
     return MissionReport(
         start=mission.start,
         duration=mission.end - mission.start,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tuner.core.numerics import Array
+from tuner.core.numerics import Array, finite_rows
 from tuner.recordings.flight import SIGNALS, Series
 
 #: A signal is unknown in gaps longer than this, or than three periods of a slower signal.
@@ -180,7 +180,7 @@ def body_rate_from(q: Array, q_dot: Array) -> Array:
 
 def both_known(a: Array, b: Array) -> tuple[Array, Array]:
     """Return the rows of two (n, k) signals at which all columns of both are known."""
-    known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
+    known = finite_rows(a) & finite_rows(b)
     return a[known], b[known]
 
 
@@ -206,7 +206,7 @@ def correlations(a: Array, b: Array, furthest: int) -> Array:
     """
     spectra = list[Any]()
     for values in (a, b):
-        known = np.asarray(np.isfinite(values).all(axis=1))
+        known = finite_rows(values)
         about = np.where(
             known[:, None], values - values[known].sum(axis=0) / max(known.sum(), 1), 0
         )
@@ -231,7 +231,7 @@ def correlations(a: Array, b: Array, furthest: int) -> Array:
 
 def rms(values: Array) -> float:
     """Return the root mean square length of (n, k) vectors about their mean."""
-    known = values[np.isfinite(values).all(axis=1)]
+    known = values[finite_rows(values)]
     if len(known) == 0:
         return 0.0
     return float(np.sqrt(((known - known.mean(axis=0)) ** 2).sum(axis=1).mean()))

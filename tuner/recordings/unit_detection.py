@@ -22,7 +22,7 @@ import numpy as np
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import Array
+from tuner.core.numerics import Array, finite_rows
 from tuner.recordings.flight import SIGNALS, RawSeries
 from tuner.recordings.interpolation import both_known, rotate, upward
 from tuner.recordings.notes import Note, NoteCode
@@ -356,7 +356,7 @@ def _force_and_tilt(push: Array, attitude: RawSeries, centres: Array) -> tuple[A
     weights = np.convolve(np.ones(HALF_BINS), np.ones(HALF_BINS)) / HALF_BINS**2
     columns = _binned(RawSeries(attitude.time, up), centres).T
     leant = np.column_stack([np.convolve(c, weights, "valid")[1:-1] for c in columns])
-    known = np.isfinite(push).all(axis=1) & (leant[:, 2] > MIN_TILT_COSINE)
+    known = finite_rows(push) & (leant[:, 2] > MIN_TILT_COSINE)
     tilt = leant[known, :2] / leant[known, 2:]
     return push[known, :2] - push[known, 2:] * tilt, tilt
 
@@ -454,7 +454,7 @@ def unit_by_range(signal: str, values: Array, assumed: str) -> str:
         (n, k) as recorded; NaN where not measured.
     """
     rule = _RANGE_RULES.get(signal)
-    known = values[np.isfinite(values).all(axis=1)] if signal != "command" else values
+    known = values[finite_rows(values)] if signal != "command" else values
     if rule is None or len(known) < MIN_SAMPLES or not np.isfinite(known).any():
         return assumed
     found = rule(known)

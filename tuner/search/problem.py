@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sim_jax.state import AIRBORNE, Limits
 from tuner.config import CHANNELS, ErrorKind, FlightSettings, InletName, JobFile, Settings
 from tuner.core.errors import ConfigError, RecordingError
+from tuner.core.numerics import finite_rows
 from tuner.equation_error.estimate import RegressionEstimate
 from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
 from tuner.objective.initial_conditions import begins_gently
@@ -274,7 +275,7 @@ def limits_of(flights: Sequence[Flight]) -> Limits:
     arena = Limits()
     for flight in flights:
         places = flight.series["position"].between(0.0, flight.duration).values
-        places = places[np.isfinite(places).all(axis=1)]
+        places = places[finite_rows(places)]
         low = places[:, 2].min() < arena.floor + FLOOR_CLEARANCE_M
         if low or np.abs(places).max() > arena.half_width / 2:
             return AIRBORNE

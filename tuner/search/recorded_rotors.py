@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
-from tuner.core.numerics import Array
+from tuner.core.numerics import Array, finite_rows
 from tuner.equation_error.recorded_accelerations import Mask, steps_with, with_rotors
 from tuner.equation_error.regression import convolved, whitening_filter
 from tuner.findings.findings import Code, Finding
@@ -119,7 +119,7 @@ def _turning_likelihoods(flight: Flight, vehicle: VehicleFile, at: Sequence[floa
     Forces are left out: the velocity that they come from is filtered.
     """
     rotors = flight.series["rotor_speed"]
-    there = np.isfinite(rotors.values).all(axis=1)
+    there = finite_rows(rotors.values)
     rotors = Series(rotors.time[there], rotors.values[there])
     steps = steps_with(flight, rotors)
     if steps is None:
@@ -339,7 +339,7 @@ def rotor_change_of(flight: Flight, vehicle: VehicleFile) -> RotorChange | None:
     edges = np.arange(0.0, flight.duration, WINDOW_S)
     shares = _shares(flight, vehicle, source, edges)
     motion = _motion(flight, edges)
-    whole = np.isfinite(shares).all(axis=1) & np.isfinite(motion).all(axis=1)
+    whole = finite_rows(shares) & finite_rows(motion)
     least = round(MIN_SIDE_S / WINDOW_S)
     if whole.sum() < max(2 * least, 2 * motion.shape[1]):
         return None

@@ -11,6 +11,7 @@ from scipy.special import ndtri
 from tuner.core.numerics import (
     Z95,
     Inverse,
+    finite_rows,
     huber_weights,
     log_determinant,
     robust_sd,
@@ -23,6 +24,13 @@ from tuner.core.numerics import (
 
 SIZES = st.integers(1, 8)
 SEEDS = st.integers(0, 2**32 - 1)
+
+
+def test_a_row_is_finite_where_all_of_it_is() -> None:
+    rows = np.array([[1.0, 2.0], [np.nan, 2.0], [1.0, np.inf], [-np.inf, np.inf], [1e308, 1e308]])
+    assert finite_rows(rows).tolist() == [True, False, False, False, True]
+    assert finite_rows(rows[:, :0]).tolist() == [True] * 5
+    assert finite_rows(rows[:0]).tolist() == []
 
 
 def test_an_interval_holds_95_percent() -> None:
