@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
 from itertools import compress
 from math import prod
 from operator import or_
@@ -15,9 +15,11 @@ from jax.extend.core import JaxprEqn
 from llvmlite import ir
 
 from lanes.dependence import dependent, dependent_in_scan, dependent_in_while, parts_of_scan
+from lanes.linear import push_rows
 from lanes.lowering import CONTROL, I64, MAX_CARRIED_IN_REGISTERS, Lowering, dtype_of, shape_of
 from lanes.rules import constant, is_bool, type_of
 from lanes.values import (
+    OF_COLUMN,
     OF_LANE,
     Elements,
     Memory,
@@ -153,6 +155,8 @@ def _laid_before(lower: Lowering, value: Value, *, indexed: bool) -> Value:
 
 
 def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -> list[Value]:
+    if (pushed := push_rows(lower, eqn, operands)) is not None:
+        return pushed
     p, b = eqn.params, lower.b
     (consts, carried), length, body = parts_of_scan(eqn), p["length"], p["jaxpr"]
     once = length == 1
@@ -271,6 +275,13 @@ def _cond(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> li
     branches = eqn.params["branches"]
     which = lower.elements(operands[0])[()]
     rest = operands[1:]
+    if lower.chooses and any(kind_of(v) & OF_COLUMN for v in rest):
+        found = [lower.run(branch.jaxpr, branch.consts, rest) for branch in branches]
+        flags = [_is_number(lower, which, n, len(branches)) for n in range(1, len(branches))]
+        return [
+            reduce(partial(_chosen, lower), zip(flags, others, strict=True), first)
+            for first, *others in zip(*found, strict=True)
+        ]
     if is_vector(which) or not isinstance(which, ir.Constant):
         rest = lower.with_tangents_in_memory(rest)
     if is_vector(which):  # a change in place by one lane would be a change for all
@@ -305,6 +316,11 @@ def _cond(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> li
         )
 
     return chosen_from(0)
+
+
+def _chosen(lower: Lowering, old: Value, instead: tuple[ir.Value, Value]) -> Value:
+    flag, new = instead
+    return lower.elementwise("select_n", {}, [array_of([flag], ()), old, new], old.shape)
 
 
 def _branched(

@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import reduce
 from itertools import product
 from math import gcd, prod
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import numpy as np
@@ -54,6 +54,7 @@ from lanes.values import (
 )
 
 I64 = ir.IntType(64)
+Made = TypeVar("Made")
 LINE_BYTES = 64
 """bytes of a line of the cache."""
 MAX_IN_REGISTERS = 512
@@ -102,6 +103,10 @@ class Lowering:
         """Reads of memory that may change before they are computed."""
         self.storages: list[Storage] = []
         """All that is written to."""
+        self.chooses = False
+        """Whether choices between tangents are sums, and not branches."""
+        self._known: list[dict[tuple[int, ...], tuple[Any, Any]]] = []
+        """What each jaxpr under way keeps, with what it is made of, by the latter's identities."""
 
     @property
     def b(self) -> ir.IRBuilder:
@@ -127,6 +132,7 @@ class Lowering:
         )
         values.update(zip(jaxpr.invars, arguments, strict=True))
         self._alive.append(values)
+        self._known.append({})
         for eqn, last in zip(jaxpr.eqns, _last_reads(jaxpr), strict=True):
             operands = [self._read(values, var) for var in eqn.invars]
             for var in last:
@@ -134,7 +140,20 @@ class Lowering:
             outs = self._equation(eqn, operands, bound)
             values.update(zip(eqn.outvars, outs, strict=True))
         self._alive.pop()
+        self._known.pop()
         return [self._read(values, var) for var in jaxpr.outvars]
+
+    def known(self, of: Sequence[Any], make: Callable[[], Made]) -> Made:
+        """Return what is written once for the same values, where it is known already."""
+        parts = [x for v in of for x in (v.ravel() if isinstance(v, np.ndarray) else [v])]
+        key = tuple(map(id, parts))
+        for frame in self._known:
+            if key in frame:
+                found: Made = frame[key][1]
+                return found
+        made = make()
+        self._known[-1][key] = parts, made
+        return made
 
     def is_read_again(self, slot: Tangent) -> bool:
         """Return whether a number in memory, as it is now, is asked for later."""
@@ -330,21 +349,37 @@ class Lowering:
         if not outs:
             return
         graph = Graph([x for x, _ in outs])
+        hand_on = [hand_on for _, hand_on in outs]
+        self.each_column(graph, self.factors_of(graph), hand_on, self.columns)
+        for node, slot in kept:
+            node.operands = slot.operands
+
+    def factors_of(self, graph: Graph) -> dict[Any, ir.Value]:
+        """Compute the factors of a graph's sums, which all columns share."""
         factors = Factors(self.apply)
-        shared = {
+        return {
             (node, operand): factors.of(factor, node.kind)
             for node in graph.nodes
             if node.terms is not None
             for operand, factor in node.terms.items()
         }
 
+    def each_column(
+        self,
+        graph: Graph,
+        factors: Mapping[Any, ir.Value],
+        hand_on: Sequence[Callable[[ir.Value], None]],
+        columns: ir.Value,
+    ) -> None:
+        """Write a loop that computes a graph column by column, and hands its outputs on."""
+
         def of_column(number: ir.Value) -> None:
             found: dict[Node, ir.Value] = {}
             self._column, self.e.flags = number, LINEAR
-            begun = self._begun(graph, shared)
+            begun = self._begun(graph, factors)
             for node in graph.nodes:
                 if node.terms is not None:
-                    found[node] = self._sum_of(node, shared, found, *begun.get(node, ()))
+                    found[node] = self._sum_of(node, factors, found, *begun.get(node, ()))
                 elif not isinstance(node.of, Tangent):
                     found[node] = node.of
                 elif node.is_read:
@@ -353,13 +388,11 @@ class Lowering:
                     given = (found[x] if isinstance(x, Node) else x for x in node.operands)
                     found[node] = self.apply(node.of.name, node.of.params, *given)
             self.e.flags = CONTRACT
-            for (_, hand_on), node in zip(outs, graph.outs, strict=True):
-                hand_on(found[node])
+            for hand, node in zip(hand_on, graph.outs, strict=True):
+                hand(found[node])
             self._column = None
 
-        self.count(constant(I64, 0), self.columns, 1, of_column)
-        for node, slot in kept:
-            node.operands = slot.operands
+        self.count(constant(I64, 0), columns, 1, of_column)
 
     def _begun(
         self, graph: Graph, factors: Mapping[Any, ir.Value]
@@ -797,6 +830,7 @@ class Lowering:
             column_stride=storage.column_stride and constant(I64, rows * size * width),
             begins=None,
             guard=None,
+            writes=[0],
         )
         return Memory(own, (rows, *shape))
 
@@ -900,6 +934,8 @@ class Lowering:
         """Return memory on the stack, uninitialised, for numbers of a type."""
         if any(length in self.lengths for length in shape):
             raise UnsupportedError(f"an array of shape {shape} that is no output")
+        if kind & OF_COLUMN and self.chooses:
+            raise UnsupportedError("a row's numbers in memory")
         count, stored = prod(shape), ir.IntType(8) if number == BOOL else number
         width = self.e.width if kind & OF_LANE else 1
         total = count * width * (MAX_COLUMNS if kind & OF_COLUMN else 1)

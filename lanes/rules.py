@@ -169,6 +169,8 @@ class Emitter:
     def select(self, flag: ir.Value, yes: ir.Value, no: ir.Value) -> ir.Value:
         """Choose; a shared flag chooses between vectors whole."""
         yes, no = self.alike(yes, no)
+        if yes is no:
+            return yes
         if is_vector(flag):
             flag, yes, no = self.alike(flag, yes, no)
         return self.b.select(flag, yes, no)

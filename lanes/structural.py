@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import reduce
 from math import prod
 
@@ -10,9 +11,11 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 from llvmlite import ir
 
+from lanes.linear import sliced, updated
 from lanes.lowering import I64, STRUCTURAL, Lowering, Rule, shape_of
 from lanes.rules import constant, converted, type_of
 from lanes.values import (
+    OF_COLUMN,
     Deferred,
     Element,
     Elements,
@@ -52,6 +55,15 @@ def _reshape(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
         return lower.at(value, [constant(I64, 0) if n == 1 else next(own) for n in value.shape])
 
     return Deferred(tuple(shape), at, (value,))
+
+
+def _transpose(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    (value,), order = operands, eqn.params["permutation"]
+    if not isinstance(value, Memory) or not lower.is_long(value.shape):
+        return lower.elements(value).transpose(order)
+    strides = tuple(value.storage.strides[axis] for axis in order)
+    turned = replace(value.storage, strides=strides, writable=False)
+    return Memory(turned, tuple(value.shape[axis] for axis in order), value.version)
 
 
 def _concatenate(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
@@ -177,6 +189,8 @@ def _dynamic_slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Val
         for s, length, size in zip(operands[1:], value.shape, sizes, strict=True)
     ]
     if isinstance(value, np.ndarray) and not all(isinstance(s, ir.Constant) for s in starts):
+        if lower.chooses and kind_of(value) & OF_COLUMN:
+            return sliced(lower, value, starts, sizes)
         value = lower.readable(value)
     if isinstance(value, Memory) and value.storage.begins and prod(sizes[:-1]) == 1:
         return array_of(lower.read_row(value.storage, starts, sizes[-1]), sizes)
@@ -201,6 +215,8 @@ def _dynamic_update_slice(lower: Lowering, _: JaxprEqn, operands: list[Value]) -
             to = tuple(i + s.constant for i, s in zip(place, starts, strict=True))
             changed[to] = update[place]
         return changed
+    if lower.chooses and (kind_of(value) | kind_of(update)) & OF_COLUMN:
+        return updated(lower, lower.elements(value), starts, update)
     if not isinstance(value, Memory) or not value.storage.writable:
         value = lower.copied_to_memory(value, kind_of(update))
     if any(map(is_vector, starts)):
@@ -222,9 +238,7 @@ STRUCTURAL.update(
         "reshape": _reshape,
         "squeeze": _reshape,
         "expand_dims": _reshape,
-        "transpose": lambda lower, eqn, operands: lower.elements(operands[0]).transpose(
-            eqn.params["permutation"]
-        ),
+        "transpose": _transpose,
         "concatenate": _concatenate,
         "stack": lambda lower, eqn, operands: np.stack(
             [lower.elements(o) for o in operands], axis=eqn.params.get("axis", 0)

@@ -19,8 +19,6 @@ from lanes.rules import constant, is_bool
 from lanes.values import Element, Tangent
 
 Factor: TypeAlias = "float | ir.Value | _Operation"
-SHARED_COST = 0.1
-"""Cost of an operation on factors, over that of one in each column."""
 MAX_CHOSEN_TERMS = 6
 """Terms up to which a choice is made for each of a sum's."""
 
@@ -189,9 +187,16 @@ class Graph:
     ----------
     outs
         Wanted elements.
+    shared_cost
+        Cost of an operation on factors, over that of one in each column.
+    finite
+        Whether all factors are known to be finite, those of choices that are not taken too.
     """
 
-    def __init__(self, outs: Sequence[Element]) -> None:
+    def __init__(
+        self, outs: Sequence[Element], *, shared_cost: float = 0.1, finite: bool = False
+    ) -> None:
+        self._shared_cost, self._all_finite = shared_cost, finite
         needed: dict[int, Tangent] = {}
         left = [x for x in outs if isinstance(x, Tangent)]
         while left:
@@ -216,7 +221,7 @@ class Graph:
         if isinstance(x, Tangent):
             return self._found[x.number]
         if id(x) not in self._plain:
-            self._plain[id(x)] = Node(x, kept=True)
+            self._plain[id(x)] = Node(x, kept=True, finite=self._all_finite)
             self.nodes.append(self._plain[id(x)])
         return self._plain[id(x)]
 
@@ -231,7 +236,7 @@ class Graph:
                 x.finite if isinstance(x, Node) else isinstance(x, ir.Constant)
                 for x in operands[1:]
             )
-            finite = tangent.is_read or chosen
+            finite = self._all_finite or tangent.is_read or chosen
             node = Node(tangent, None, operands, kept=True, finite=finite)
             self._known[key] = node
             for operand in operands:
@@ -253,7 +258,9 @@ class Graph:
             )
             if key in self._known:
                 return self._known[key]
-            finite = all(of.finite and self._is_finite(factor) for of, factor in terms.items())
+            finite = self._all_finite or all(
+                of.finite and self._is_finite(factor) for of, factor in terms.items()
+            )
             node = Node(tangent, terms, finite=finite)
             self._known[key] = node
             for operand in terms:
@@ -299,7 +306,7 @@ class Graph:
         (of, factor), (other, own) = parts
         if of is other:
             return [(of, _chosen_between(which, factor, own))]
-        if of.has_column_flags and other.has_column_flags:
+        if self._all_finite or (of.has_column_flags and other.has_column_flags):
             return [
                 (of, _chosen_between(which, factor, 0.0)),
                 (other, _chosen_between(which, 0.0, own)),
@@ -388,7 +395,7 @@ class Graph:
                     shared += (not _is_sign(each) and not _is_sign(factor)) + (operand in terms)
                     _add(terms, operand, _times(factor, each))
             change += _cost(terms) - _cost(reader.sum)
-        if change + SHARED_COST * shared > 0:
+        if change + self._shared_cost * shared > 0:
             return False
         for node in nodes:
             for operand in node.sum:

@@ -124,7 +124,17 @@ class Storage:
     moves: ir.Value | None = None
     """To a byte a column, which is zero where a tangent's number is zero in every lane; None where
     that is not known."""
-    version: int = 0
+    writes: list[int] = field(default_factory=lambda: [0])
+    """How often it was written to; shared with others of the same memory."""
+
+    @property
+    def version(self) -> int:
+        """How often it was written to."""
+        return self.writes[0]
+
+    @version.setter
+    def version(self, number: int) -> None:
+        self.writes[0] = number
 
 
 @dataclass(frozen=True, eq=False)

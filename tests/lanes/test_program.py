@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from jax import lax
 
+import lanes.linear as lanes_linear
 import lanes.program
 from lanes import Argument, Program, dependent, joined, keep_code_in
 from lanes.lowering import LINE_BYTES
@@ -418,3 +419,59 @@ def test_where_jax_computes_in_single_precision_a_kernel_does_too():
 def test_an_array_is_laid_out_without_a_warning():
     with warnings.catch_warnings(action="error"):
         assert Argument.of(jnp.zeros(3, jnp.float32), lanes=True).dtype == jnp.float32
+
+
+def pushed(given, _):
+    """Return a matrix times a map's Jacobian from both sides: choices, delay lines, divisions."""
+    x, matrix, slot = given["x"], given["matrix"], given["slot"]
+
+    def answer(state):
+        line = lax.dynamic_update_index_in_dim(state[4:16].reshape(3, 4), state[:4], slot, 0)
+        late = lax.dynamic_index_in_dim(line, (slot + 1) % 3, 0, keepdims=False)
+        size = jnp.where(state[16] > 0.0, jnp.sqrt(jnp.where(state[16] > 0.0, state[16], 1.0)), 0.0)
+        turned = lax.cond(slot == 1, lambda: jnp.sin(late) * size, lambda: late / (2.0 + size**2))
+        turned = lax.cond(state[3] > 0.0, lambda: turned, lambda: turned * state[0])
+        swapped = jnp.where(turned > 0.2, turned[::-1], state[17:21])
+        rest = jnp.exp(-state[21:]) * jnp.sum(swapped) - state[0] * state[21:]
+        return jnp.concatenate([turned, line.ravel(), size[None], swapped, rest])
+
+    _, push = jax.linearize(answer, x)
+
+    def row(_, row):
+        return None, push(row)
+
+    def turn(matrix, _):
+        half = lax.scan(row, None, matrix)[1]
+        whole = lax.scan(row, None, half.T)[1]
+
+        def with_row(i, matrix):
+            return lax.dynamic_update_index_in_dim(matrix, 0.1 * whole[i], i, 0)
+
+        return lax.fori_loop(0, len(x), with_row, matrix), None
+
+    matrix, _ = lax.scan(turn, matrix, None, length=2)
+    return matrix, lax.scan(lambda _, row: (None, row * jnp.sum(row)), None, matrix)[1]
+
+
+def test_rows_that_enter_a_loop_linearly_are_what_they_are_one_by_one(monkeypatch):
+    size, lanes, maps = 24, 5, []
+    make = lanes_linear._Map.__init__
+    monkeypatch.setattr(lanes_linear._Map, "__init__", lambda *a: (maps.append(a), make(*a))[1])
+    random = np.random.default_rng(3)
+    values = {
+        "x": random.normal(size=(size, lanes)),
+        "matrix": random.normal(size=(size, size, lanes)),
+    }
+    arguments = {
+        "x": Argument((size,), float, lanes=True),
+        "matrix": Argument((size, size), float, lanes=True),
+        "slot": Argument((), int, lanes=False),
+    }
+    program = Program(pushed, arguments)
+    assert program.is_kernel
+    assert len(maps) == 1, "of both products, and not of the loop that is not linear"
+    for slot in range(3):
+        run = program({**values, "slot": np.array(slot)}, lanes=lanes)
+        other = program.by_xla({**values, "slot": np.array(slot)})
+        for mine, theirs in zip(run.values, other.values, strict=True):
+            np.testing.assert_allclose(mine, theirs, rtol=1e-11, atol=1e-11)

@@ -194,7 +194,7 @@ def innovations_of(covariance: Array, gain: Array, samples: Samples) -> Innovati
 
 
 def propagated(
-    matrices: tuple[Array, Array],
+    covariance: Array,
     update: Innovations,
     samples: Samples,
     transition: Callable[[Array], Array],
@@ -202,53 +202,62 @@ def propagated(
     *,
     retention: Array,
     tick: Array,
-) -> tuple[Array, Array]:
+) -> Array:
     """Return the covariance a tick later, F (P - W Wᵀ) Fᵀ + Q.
 
     Parameters
     ----------
-    matrices
-        P (n, n), and scratch of the same size; both are overwritten and returned.
+    covariance
+        P (n, n), overwritten.
     update, samples
         Their gains are W.
     transition, process_noise
-        F, as a function of a column, and the diagonal (n,) of Q.
+        The first rows of F, as a function of a column, and the diagonal (n,) of Q.
     retention
         (D,) factors of F on the last numbers of the state, the disturbances.
     tick
         Its number.
     """
-    covariance, scratch = matrices
-    size = len(covariance)
+    size, disturbances = len(covariance), len(retention)
+    others = size - disturbances
 
-    def known_better(j: Array, first: int, count: int) -> Array:
-        def less(number: Array, rest: Array) -> Array:
-            i = samples.order(number)
-            return rest - _entry(update.gain, i, j) * _part(update.gain, i, first, count)
+    def corrected(j: Array, into: Array) -> Array:
+        def known_better(first: int, count: int) -> Array:
+            def less(number: Array, rest: Array) -> Array:
+                i = samples.order(number)
+                return rest - _entry(update.gain, i, j) * _part(update.gain, i, first, count)
 
-        rest: Array = lax.fori_loop(0, samples.used, less, _part(covariance, j, first, count))
-        return rest
+            rest: Array = lax.fori_loop(0, samples.used, less, _part(into, j, first, count))
+            return rest
 
-    def first(j: Array, into: Array) -> Array:
-        rest = [known_better(j, *part) for part in _side_by_side(size)]
-        return _with_row(into, j, transition(jnp.concatenate(rest)))
+        rest = [known_better(*part) for part in _side_by_side(size)]
+        return _with_row(into, j, jnp.concatenate(rest))
 
-    scratch = lax.fori_loop(0, size, first, scratch)
+    covariance = lax.fori_loop(0, size, corrected, covariance)
 
-    def second(i: Array, into: Array) -> Array:
-        return _with_row(into, i, transition(_column(scratch, i)))
+    def pushed(_: None, row: Array) -> tuple[None, Array]:
+        return None, transition(row)
 
-    def kept(number: Array, into: Array) -> Array:
-        i = number + size - len(retention)
-        return _with_row(into, i, at(retention, number) * _part(scratch, i, 0, size))
+    half = lax.scan(pushed, None, covariance)[1]
+    whole = lax.scan(pushed, None, half.T)[1]
+
+    def of_disturbance(number: Array, into: Array) -> Array:
+        i = number + others
+        among = retention * _part(into, i, others, disturbances)
+        row = jnp.concatenate([_part(half, i, 0, others), among])
+        return _with_row(into, i, at(retention, number) * row)
+
+    def of_state(i: Array, into: Array) -> Array:
+        across = lax.dynamic_slice(into, (others, i), (disturbances, 1))[:, 0]
+        return _with_row(into, i, jnp.concatenate([_part(whole, i, 0, others), across]))
 
     def added(i: Array, matrix: Array) -> Array:
         return _with_entry(matrix, i, i, _entry(matrix, i, i) + at(process_noise, i))
 
-    covariance = lax.fori_loop(0, size - len(retention), second, covariance)
-    covariance = lax.fori_loop(0, len(retention), kept, covariance)
+    covariance = lax.fori_loop(0, disturbances, of_disturbance, covariance)
+    covariance = lax.fori_loop(0, others, of_state, covariance)
     covariance = lax.fori_loop(0, size, added, covariance)
-    return _symmetric(covariance, jnp.where(tick % SYMMETRISED_EVERY == 0, size, 0)), scratch
+    return _symmetric(covariance, jnp.where(tick % SYMMETRISED_EVERY == 0, size, 0))
 
 
 def _symmetric(matrix: Array, count: Array) -> Array:

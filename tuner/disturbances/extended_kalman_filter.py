@@ -302,7 +302,7 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
 
     def tick(carried: Any, number: Array) -> Any:
         state, pushed, matrices, before, beyond = carried
-        covariance, gain, scratch = matrices
+        covariance, gain = matrices
         read = row_of(given.inputs.samples, number)
 
         def compare(change: list[Array]) -> list[Array]:
@@ -330,12 +330,11 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
         def advance(change: Array) -> tuple[Array, State]:
             moved = observer.corrected(state, change[:-PROCESSES], number, in_flight)
             after = observer.next(moved, pushed + change[-PROCESSES:], number, draught)
-            numbers = observer.numbers(after, number + 1, in_flight)
-            return jnp.concatenate([numbers, processes.retention * change[-PROCESSES:]]), after
+            return observer.numbers(after, number + 1, in_flight), after
 
         _, transition, after = jax.linearize(advance, jnp.zeros(size), has_aux=True)
-        covariance, scratch = propagated(
-            (covariance, scratch),
+        covariance = propagated(
+            covariance,
             update,
             samples,
             transition,
@@ -344,7 +343,7 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
             tick=number,
         )
         gains = update.gain.astype(jnp.float32)
-        matrices = covariance, update.gain, scratch
+        matrices = covariance, update.gain
         carried = after, pushed * processes.retention, matrices, before, beyond
         return carried, (white, root, loss, gains, factors.astype(jnp.float32), draught)
 
@@ -353,7 +352,7 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
     begin = (
         first,
         jnp.zeros(PROCESSES),
-        (jnp.where(diagonal, sd**2, 0.0), jnp.zeros((wide, size)), jnp.zeros((size, size))),
+        (jnp.where(diagonal, sd**2, 0.0), jnp.zeros((wide, size))),
         observer.outputs(first, jnp.asarray(0)),
         jnp.zeros(wide, int),
     )

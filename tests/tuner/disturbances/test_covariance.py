@@ -51,11 +51,11 @@ def test_samples_tell_and_time_spreads_what_products_of_matrices_say() -> None:
             jnp.asarray(error), jnp.asarray(variance), sparse, lambda number: order[number], used
         )
         update = innovations_of(jnp.asarray(covariance), jnp.ones((WIDE, SIZE)), samples)
-        after, _ = propagated(
-            (jnp.asarray(covariance), jnp.zeros((SIZE, SIZE))),
+        after = propagated(
+            jnp.asarray(covariance),
             update,
             samples,
-            lambda column: jnp.asarray(transition) @ column,
+            lambda column: jnp.asarray(transition[:-3]) @ column,
             jnp.asarray(process_noise),
             retention=jnp.asarray(retention),
             tick=jnp.asarray(1),
@@ -97,20 +97,20 @@ def test_the_covariance_of_an_unstable_vehicle_settles_as_riccatis_equation_says
     process_noise = np.full(size, 0.01)
 
     def tick(matrices: tuple[Array, ...], number: Array) -> tuple[tuple[Array, ...], None]:
-        covariance, gain, scratch = matrices
+        covariance, gain = matrices
         update = innovations_of(covariance, gain, samples)
-        covariance, scratch = propagated(
-            (covariance, scratch),
+        covariance = propagated(
+            covariance,
             update,
             samples,
-            lambda c: transition @ c,
+            lambda c: transition[:-1] @ c,
             jnp.asarray(process_noise),
             retention=jnp.asarray([kept]),
             tick=number,
         )
-        return (covariance, update.gain, scratch), None
+        return (covariance, update.gain), None
 
-    begin = jnp.eye(size), jnp.zeros((2, size)), jnp.zeros((size, size))
-    (covariance, *_), _ = lax.scan(tick, begin, jnp.arange(ticks))
+    begin = jnp.eye(size), jnp.zeros((2, size))
+    (covariance, _), _ = lax.scan(tick, begin, jnp.arange(ticks))
     settled = solve_discrete_are(transition.T, derivatives.T, np.diag(process_noise), np.eye(2))
     np.testing.assert_allclose(covariance, settled, rtol=1e-9)
