@@ -114,7 +114,9 @@ def with_disturbances(
     if fitted.residuals_at_noise_level or not fitted.polished or not wanted:
         return None
     full = full_problem_of(fitted.objective, fitted.point)  # the examination's: compiled once
-    terms = names_of(groups_left_out(selected))
+    # those that are kept, too: without one that is dropped later, all would be compiled again
+    kept = [name for row in selected.rows if row.kept for name in row.names if name in COEFFICIENTS]
+    terms = (*names_of(groups_left_out(selected)), *kept)
     predictor = Predictor.of(full.objective, full.point, job.fitted, terms)
     if predictor is None:
         return None

@@ -199,7 +199,7 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     space = SimpleNamespace(names=("inertia_xx",))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=space))
-    row = SimpleNamespace(group="fuselage_drag", kept=True)
+    row = SimpleNamespace(group="fuselage_drag", kept=True, names=("fuselage_drag", "wind_x"))
     begin = Selected(job, fitted(2.0 * COLOURED_RATIO), (cast(Any, row),))
     model_errors = ModelErrors((Law("force_z", "airspeed_across", 0.2),), None)
     polished, examined, read = [], [], []
@@ -228,7 +228,12 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
         return SimpleNamespace(uncertainty=NOBODY)
 
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
-    monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
+
+    def predictor_of(*given: Any) -> Any:
+        assert given[3] == ("fuselage_drag",), "computed where it is dropped, too"
+        return predictor
+
+    monkeypatch.setattr(disturbances.Predictor, "of", predictor_of)
     monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, own, **__: (there, own))
     monkeypatch.setattr(disturbances.LinearisedInnovations, "of", seen)
     monkeypatch.setattr(disturbances, "free_parameters", lambda *_, **__: None)
