@@ -32,7 +32,6 @@ from tuner.evaluate.simulation_files import roll_pitch_yaw
 from tuner.findings.findings import one_line
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of
-from tuner.objective.initial_conditions import recent_command
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.normal_equations import Objective
 from tuner.objective.residuals import Reading, at_stamps
@@ -40,6 +39,7 @@ from tuner.objective.segments import (
     CLOCKS,
     OFFSETS,
     Segments,
+    commanded_before,
     cut_windows,
     noise_of,
     segments_of,
@@ -433,9 +433,8 @@ class _Group:
         """Return the windows with starting speeds from commands for rotors without tachometer."""
         motor = vehicle.motor
         lag = 0.5 * (motor.time_constant_up + motor.time_constant_down)
-        pieces = [window.flight for windows in self._windows for window in windows]
-        turning = np.stack([recent_command(piece, lag) for piece in pieces], axis=-1)
-        return replace(self._segments, turning=turning)
+        pieces = [window for windows in self._windows for window in windows]
+        return replace(self._segments, turning=commanded_before(pieces, lag))
 
     def _likeliest_starts(self, model: Model, segments: Segments) -> Array:
         """Return the most likely starts (L, F), in the segments' standard deviations.

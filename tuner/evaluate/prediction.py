@@ -34,7 +34,7 @@ from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import picked
 from tuner.objective.inlets import INLETS
-from tuner.objective.segments import Segments, cut_windows, window_segments
+from tuner.objective.segments import Segments, commanded_before, cut_windows, window_segments
 from tuner.objective.simulation import MOTION, TORQUE_RATE_HZ, fly
 from tuner.recordings.flight import Flight
 from tuner.recordings.states import States, states_at
@@ -230,7 +230,8 @@ class FlightPredictor:
         self._whole = np.flatnonzero(begins + seconds <= flight.duration + 1e-9)
         self.begins = begins[self._whole]
         self.ahead = np.arange(1, round(seconds * flight.rate) + 1) / flight.rate
-        self._segments: dict[tuple[float, Schedule], Segments] = {}
+        self._segments: dict[Schedule, Segments] = {}
+        self._turning: dict[float, Array] = {}
 
     @cached_property
     def recorded(self) -> States:
@@ -254,7 +255,7 @@ class FlightPredictor:
         """
         motor, schedule = vehicle.motor, schedule_of(controller)
         lag = 0.5 * (motor.time_constant_up + motor.time_constant_down)
-        if (lag, schedule) not in self._segments:
+        if schedule not in self._segments:
             laid = window_segments(
                 [self.flight],
                 self._pieces,
@@ -264,8 +265,10 @@ class FlightPredictor:
                 noise={},
                 free_starts=False,
             )
-            self._segments[lag, schedule] = picked(laid, (..., self._whole))
-        segments = self._segments[lag, schedule]
+            self._segments[schedule] = picked(laid, (..., self._whole))
+        if lag not in self._turning:
+            self._turning[lag] = commanded_before(self._pieces, lag)[:, self._whole]
+        segments = replace(self._segments[schedule], turning=self._turning[lag])
         if observer is not None:
             fed = self.flight, self.inlet, self.input_late
             segments = replace(segments, disturbance=observer.disturbance(fed, self.begins))

@@ -38,6 +38,7 @@ from tuner.objective.inlets import INLETS, bypassed_by, is_sparse
 from tuner.objective.rotor_signals import Source, dshot_lift, order_findings, squared_speed
 from tuner.objective.setpoints import setpoint_findings
 from tuner.objective.space import extended
+from tuner.objective.trajectory import build_publishers
 from tuner.recordings.flight import Flight, Series
 from tuner.search.findings import MIN_TURNING_EXPLAINED, late_input_findings
 from tuner.search.job_flights import read_recordings
@@ -119,6 +120,8 @@ def build_ahead(job: Job) -> None:
         do_beside(configure)
     for program in missing:
         do_beside(Program.build, program)
+    if missing and finer is not None:  # its next flight is designed
+        do_beside(build_publishers)
 
 
 def check_recordings(job: Job) -> tuple[Finding, ...]:

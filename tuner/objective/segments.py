@@ -345,12 +345,17 @@ def window_segments(
         start=start,
         measured={name: _measured(cut, name, sd, weights) for name, sd in compared.items()},
         flight=np.asarray([piece.number for piece in pieces]),
-        turning=np.stack([recent_command(flight, lag) for flight in cut], axis=-1),
+        turning=commanded_before(pieces, lag),
         begin=np.asarray([piece.begin for piece in pieces]),
         log_voltage=log_voltage_of([flights[piece.number] for piece in pieces], pieces, schedule),
         start_sd=of_all[free_rows] if free_starts else None,
         free_rows=tuple(free_rows.tolist()),
     )
+
+
+def commanded_before(pieces: Sequence[Window], lag: float) -> Numbers:
+    """Return the commands (4, F) that the rotors of windows have followed, as `recent_command`."""
+    return np.stack([recent_command(piece.flight, lag) for piece in pieces], axis=-1)
 
 
 def stamped_earlier(flight: Flight, signals: Sequence[str], late: float) -> Flight:

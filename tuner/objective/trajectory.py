@@ -100,6 +100,12 @@ def _publisher(shape: type[Shape]) -> Program:
     return Program(sent, arguments, name=shape.name, made_of=shape, packages=CODE)
 
 
+def build_publishers() -> None:
+    """Have the kernels of all trajectories on disk."""
+    for shape in shapes().values():
+        _publisher(shape).build()
+
+
 def with_named_reference(flight: Flight, settings: TrajectorySettings) -> Flight:
     """Return a recording without a reference with that of a named trajectory.
 

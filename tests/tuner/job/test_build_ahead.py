@@ -11,6 +11,7 @@ from tuner.config import JobFile, resolve_settings
 from tuner.core.runtime import configure
 from tuner.evaluate.comparison import Comparison
 from tuner.job import prepare
+from tuner.objective.trajectory import build_publishers
 from tuner.options import Options
 from tuner.search.progress import plain_criterion
 from tuner.terms.candidates import with_terms
@@ -49,8 +50,9 @@ def test_what_a_job_flies_is_built_ahead(inlet, terms, monkeypatch):
     monkeypatch.setattr(Program, "is_kept", False)
     prepare.build_ahead(job)
     assert asked_for.pop(0) == (configure,)
-    ahead = [program for build, program in asked_for if build is Program.build]
-    assert len(set(ahead)) == len(ahead) == len(asked_for)
+    assert ((build_publishers,) in asked_for) == (inlet == "reference")
+    ahead = [what[1] for what in asked_for if what[0] is Program.build]
+    assert len(set(ahead)) == len(ahead) == len(asked_for) - (inlet == "reference")
 
     monkeypatch.setattr(Program, "__call__", _fly)
     objective, comparison = job.objective, Comparison(job.recordings, settings.controller)
