@@ -6,6 +6,7 @@ import math
 from functools import lru_cache
 
 import numpy as np
+from scipy.signal import lfilter
 
 GRAVITY = 9.81
 TRUTH = {
@@ -120,17 +121,18 @@ def motor_steps(random: np.random.Generator, *, rate: float = 500.0, second: flo
     for edge in np.flatnonzero(np.diff(dense)) + 1:
         goal[edge - before + delay :] = dense[edge]
     goal = TRUTH["input_scaling"] * goal + TRUTH["zero_position_armed"]
-    level, slow = goal[0], goal[0]
-    series = []
     up, down, after = (
         1 - math.exp(-1 / (rate * fine * constant)) if constant else 1.0
         for constant in (TRUTH["time_constant_up"], TRUTH["time_constant_down"], second)
     )
-    for asked in goal.tolist():
-        series.append(slow)  # the value at the sample, before the command acts on the next piece
-        level += (up if asked > level else down) * (asked - level)
-        slow += after * (level - slow)
-    speed = np.array(series[::fine]) + random.normal(0, 4.0, len(time))
+    levels = [goal[:1]]
+    for piece in np.split(goal, np.flatnonzero(np.diff(goal)) + 1):
+        gap = levels[-1][-1] - piece[0]
+        share = up if gap < 0.0 else down
+        levels.append(piece + gap * (1.0 - share) ** np.arange(1, len(piece) + 1))
+    level = np.concatenate(levels)[:-1]  # at the sample, before the command acts on the next piece
+    series = lfilter([after], [1.0, after - 1.0], level - goal[0]) + goal[0]
+    speed = series[::fine] + random.normal(0, 4.0, len(time))
     return {"time": time, "command": command, "rotor_speed": outliers(random, speed, 0.005)}
 
 
