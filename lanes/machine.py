@@ -212,9 +212,12 @@ def _write(path: Path, code: bytes) -> None:
 
 
 def _bound(folder: Path) -> None:
-    """Remove the least recently used files, down to `MAX_CODE_BYTES` bytes."""
+    """Remove the least recently used files, down to `MAX_CODE_BYTES` bytes.
+
+    Those too that a process began to write and, killed, left.
+    """
     found = []
-    for path in folder.glob("*.o"):
+    for path in (*folder.glob("*.o"), *folder.glob(".code-*")):
         with suppress(OSError):
             state = path.stat()
             found.append((state.st_mtime, state.st_size, path))

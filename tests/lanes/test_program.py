@@ -374,9 +374,12 @@ def test_kept_code_is_used_and_damage_is_noticed(kernels):
 
 def test_kept_code_is_bounded_and_the_longest_unused_goes(kernels, monkeypatch):
     monkeypatch.setattr(lanes.machine, "MAX_CODE_BYTES", 1500)
+    left = kernels / ".code-of-a-process-that-was-killed"
+    left.write_bytes(bytes(1000))
     for number in range(6):
         object_code(TEXT.replace("7", str(number)))
     held = list(kernels.glob("*.o"))
+    assert not left.exists()
     assert sum(path.stat().st_size for path in held) <= 1500
     assert held
 
