@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial, reduce
 from itertools import compress
 from math import prod
@@ -16,7 +16,15 @@ from llvmlite import ir
 
 from lanes.dependence import dependent, dependent_in_scan, dependent_in_while, parts_of_scan
 from lanes.linear import push_rows
-from lanes.lowering import CONTROL, I64, MAX_CARRIED_IN_REGISTERS, Lowering, dtype_of, shape_of
+from lanes.lowering import (
+    CONTROL,
+    I64,
+    MAX_CARRIED_IN_REGISTERS,
+    Lowering,
+    dtype_of,
+    read_only,
+    shape_of,
+)
 from lanes.rules import constant, is_bool, type_of
 from lanes.values import (
     OF_COLUMN,
@@ -147,11 +155,7 @@ def _laid_before(lower: Lowering, value: Value, *, indexed: bool) -> Value:
         and (value.size > MAX_CARRIED_IN_REGISTERS or indexed)
     ):
         value = lower.readable(value)
-    if isinstance(value, Memory) and value.storage.writable:
-        if value.version != value.storage.version:
-            raise UnsupportedError("an array that is read after it was changed in place")
-        return Memory(replace(value.storage, writable=False), value.shape, value.version)
-    return value
+    return read_only(value)
 
 
 def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -> list[Value]:

@@ -18,7 +18,7 @@ from jax.extend.core import Jaxpr, JaxprEqn, Literal
 from llvmlite import ir
 
 from lanes.dependence import CALLS, called, parts_of_scan
-from lanes.lowering import I64, MAX_IN_REGISTERS, Lowering, dtype_of, shape_of
+from lanes.lowering import I64, MAX_IN_REGISTERS, Lowering, dtype_of, read_only, shape_of
 from lanes.rules import BOOL, constant, type_of
 from lanes.tangents import Graph
 from lanes.values import (
@@ -39,13 +39,11 @@ SHARED_COST = 3.0
 _OF_ANY = frozenset(
     {"add", "add_any", "sub", "neg", "copy", "convert_element_type", "reduce_sum", "concatenate"}
     | {"stack", "slice", "split", "rev", "pad", "reshape", "squeeze", "expand_dims", "transpose"}
-    | {"broadcast_in_dim", "unstack"}
+    | {"broadcast_in_dim", "unstack", "select_n", "cond"}
 )
-"""Primitives that are linear in all operands."""
+"""Primitives that are linear in all operands that are real numbers."""
 _OF_FIRST = frozenset({"div", "dynamic_slice"})
 """Primitives that are linear in the first."""
-_OF_OTHERS = frozenset({"select_n", "cond"})
-"""Primitives that are linear in all but the first."""
 
 
 def _moving(jaxpr: Jaxpr, moves: Sequence[bool]) -> list[bool] | None:
@@ -69,35 +67,31 @@ def _is_short(var: Any) -> bool:
 
 
 def _moving_of(eqn: JaxprEqn, ins: Sequence[bool]) -> list[bool] | None:
-    name, first, others = eqn.primitive.name, ins[0], ins[1:]
+    name = eqn.primitive.name
     if name in CALLS:
         return _moving(called(eqn.params)[0], ins)
     linear = (
         name in _OF_ANY
         or (name == "mul" and not all(ins))
-        or (name in _OF_FIRST and not any(others))
-        or (name == "dynamic_update_slice" and not any(ins[2:]))
-        or (name in _OF_OTHERS and not first)
+        or (name in _OF_FIRST and not any(ins[1:]))
+        or name == "dynamic_update_slice"
     )
     if not linear or name != "cond":
         return [True] * len(eqn.outvars) if linear else None
     branches = [branch.jaxpr for branch in eqn.params["branches"]]
-    if not all(map(_is_always_computable, branches)):
+    if any(map(_has_loop, branches)):
         return None
-    found = [_moving(branch, others) for branch in branches]
+    found = [_moving(branch, ins[1:]) for branch in branches]
     return [any(of) for of in zip(*found, strict=True)] if None not in found else None
 
 
-def _is_always_computable(branch: Jaxpr) -> bool:
-    """Return whether a branch neither changes memory nor takes time where it is not taken."""
-    for eqn in branch.eqns:
-        name = eqn.primitive.name
-        if name in CALLS:
-            if not _is_always_computable(called(eqn.params)[0]):
-                return False
-        elif name in {"scan", "while", "dynamic_update_slice"}:
-            return False
-    return True
+def _has_loop(branch: Jaxpr) -> bool:
+    """Return whether a branch may take long, also where it is not taken."""
+    return any(
+        eqn.primitive.name in {"scan", "while"}
+        or (eqn.primitive.name in CALLS and _has_loop(called(eqn.params)[0]))
+        for eqn in branch.eqns
+    )
 
 
 class _Map:
@@ -113,7 +107,7 @@ class _Map:
         self.rows = [[Tangent(m.storage.kind, READ, {}, at) for at in _places(m)] for m in rows]
         given = [array_of(row, m.shape[1:]) for row, m in zip(self.rows, rows, strict=True)]
         lower.chooses = True
-        outs = lower.run(body.jaxpr, body.consts, [*consts, *given])
+        outs = lower.run(body.jaxpr, body.consts, [*map(read_only, consts), *given])
         lower.chooses = False
         elements = [e for out in outs for e in lower.elements(out).ravel()]
         self.graph = Graph(elements, shared_cost=SHARED_COST / eqn.params["length"], finite=True)
@@ -151,9 +145,7 @@ def push_rows(lower: Lowering, eqn: JaxprEqn, operands: Sequence[Value]) -> list
     slots = [Tangent(m.storage.kind, READ, {}, at) for m in into for at in _places(m)]
     hand_on = list(map(lower.into, slots))
     lower.each_column(made.graph, made.factors, hand_on, constant(I64, length))
-    for memory in into:
-        memory.storage.version += 1
-    return [Memory(m.storage, m.shape, m.storage.version) for m in into]
+    return list(into)
 
 
 def sliced(

@@ -934,8 +934,7 @@ class Lowering:
         """Return memory on the stack, uninitialised, for numbers of a type."""
         if any(length in self.lengths for length in shape):
             raise UnsupportedError(f"an array of shape {shape} that is no output")
-        if kind & OF_COLUMN and self.chooses:
-            raise UnsupportedError("a row's numbers in memory")
+        assert not (self.chooses and kind & OF_COLUMN)  # there are more rows than columns
         count, stored = prod(shape), ir.IntType(8) if number == BOOL else number
         width = self.e.width if kind & OF_LANE else 1
         total = count * width * (MAX_COLUMNS if kind & OF_COLUMN else 1)
@@ -1041,6 +1040,15 @@ class Lowering:
         start = self.e.select(self.b.icmp_signed("<", start, lowest), lowest, start)
         start, last = self.e.alike(start, last)
         return self.e.select(self.b.icmp_signed(">", start, last), last, start)
+
+
+def read_only(value: Value) -> Value:
+    """Return an array, in memory one that is not written to."""
+    if not isinstance(value, Memory) or not value.storage.writable:
+        return value
+    if value.version != value.storage.version:
+        raise UnsupportedError("an array that is read after it was changed in place")
+    return Memory(replace(value.storage, writable=False), value.shape, value.version)
 
 
 def _last_reads(jaxpr: Jaxpr) -> list[list[Any]]:

@@ -453,7 +453,8 @@ def pushed(given, _):
         return lax.fori_loop(0, len(x), with_row, matrix), None
 
     matrix, _ = lax.scan(turn, matrix, None, length=2)
-    return matrix, lax.scan(lambda _, row: (None, row * jnp.sum(row)), None, matrix)[1]
+    sometimes = lax.cond(slot == 2, lambda: lax.scan(row, None, matrix)[1][0], lambda: matrix[0])
+    return matrix, sometimes, lax.scan(row, None, matrix)[1]
 
 
 def test_rows_that_enter_a_loop_linearly_are_what_they_are_one_by_one(monkeypatch):
@@ -472,9 +473,73 @@ def test_rows_that_enter_a_loop_linearly_are_what_they_are_one_by_one(monkeypatc
     }
     program = Program(pushed, arguments)
     assert program.is_kernel
-    assert len(maps) == 1, "of both products, and not of the loop that is not linear"
+    assert len(maps) == 3, "one of both products, one in a branch, one after it"
     for slot in range(3):
         run = program({**values, "slot": np.array(slot)}, lanes=lanes)
         other = program.by_xla({**values, "slot": np.array(slot)})
         for mine, theirs in zip(run.values, other.values, strict=True):
             np.testing.assert_allclose(mine, theirs, rtol=1e-11, atol=1e-11)
+
+
+def looping(given):
+    """Return a loop over rows, in a branch of each row's body."""
+    far = given["slot"] > 0
+    return lambda row: lax.cond(
+        far, lambda: lax.fori_loop(0, 2, lambda _, r: r + r, row), lambda: row
+    )
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        lambda _: lambda row: row * jnp.sum(row),
+        lambda given: lambda row: given["x"] / (2.0 + row),
+        lambda _: lambda row: jnp.where(row > 0.0, row, 0.0),
+        lambda _: lambda row: row.astype(int).astype(float),
+        looping,
+    ],
+    ids=["squares", "quotients", "signs", "whole numbers", "loops"],
+)
+def test_rows_that_do_not_enter_linearly_stay_rows(monkeypatch, body):
+    size, lanes = 24, 3
+
+    def function(given, _):
+        row = body(given)
+        return lax.scan(lambda _, r: (None, row(r)), None, given["matrix"])[1]
+
+    monkeypatch.setattr(lanes_linear, "_Map", None)
+    arguments = {
+        "x": Argument((size,), float, lanes=True),
+        "matrix": Argument((size, size), float, lanes=True),
+        "slot": Argument((), int, lanes=False),
+    }
+    random = np.random.default_rng(4)
+    values = {
+        "x": random.normal(size=(size, lanes)),
+        "matrix": random.normal(size=(size, size, lanes)),
+        "slot": np.array(1),
+    }
+    program = Program(function, arguments)
+    assert program.is_kernel
+    np.testing.assert_allclose(program(values, lanes=lanes).values, program.by_xla(values).values)
+
+
+def test_a_transposed_matrix_is_the_one_before_a_change_in_place():
+    """It shares the matrix's memory: read after the change, it has no kernel."""
+
+    def function(given, _):
+        def doubled(i, matrix):
+            row = 2.0 * lax.dynamic_index_in_dim(matrix, i, 0, keepdims=False)
+            return lax.dynamic_update_index_in_dim(matrix, row, i, 0)
+
+        matrix = lax.fori_loop(0, 24, doubled, given)
+        turned = matrix.T
+        after = lax.fori_loop(0, 24, doubled, matrix)
+        return after, lax.dynamic_slice(turned, (2, 0), (1, 24))
+
+    values = np.random.default_rng(5).normal(size=(24, 24, 2))
+    program = Program(function, Argument((24, 24), float, lanes=True))
+    for mine, theirs in zip(
+        program(values, lanes=2).values, program.by_xla(values).values, strict=True
+    ):
+        np.testing.assert_allclose(mine, theirs)
