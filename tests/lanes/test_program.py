@@ -482,11 +482,12 @@ def test_rows_that_enter_a_loop_linearly_are_what_they_are_one_by_one(monkeypatc
 
 
 def looping(given):
-    """Return a loop over rows, in a branch of each row's body."""
-    far = given["slot"] > 0
-    return lambda row: lax.cond(
-        far, lambda: lax.fori_loop(0, 2, lambda _, r: r + r, row), lambda: row
-    )
+    """Return rows times what a loop in a branch finds, which takes time only where it is taken."""
+
+    def found():
+        return lax.fori_loop(0, 2, lambda _, x: jnp.sin(x), given["x"])
+
+    return lambda row: lax.cond(given["slot"] > 0, lambda: row * found(), lambda: row)
 
 
 @pytest.mark.parametrize(
