@@ -8,6 +8,7 @@ with factors on the moments free, and quoted errors are no smaller than those of
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -98,7 +99,8 @@ def prepare(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
 def build_ahead(job: Job) -> None:
     """Have the process beside this one build the kernels that the job flies after its first.
 
-    They come in the order in which the job asks for them; what is not begun by then it builds.
+    They come in the order in which the job asks for them; what is not begun by then it builds. The
+    other process ends after them, and gives back its memory.
     """
     problems = [problem for problem in (job.windows, job.objective) if problem is not None]
     has_terms = job.objective.has_terms
@@ -122,6 +124,7 @@ def build_ahead(job: Job) -> None:
         do_beside(Program.build, program)
     if missing and finer is not None:  # its next flight is designed
         do_beside(build_publishers)
+    do_beside(os._exit, 0)
 
 
 def check_recordings(job: Job) -> tuple[Finding, ...]:

@@ -40,6 +40,18 @@ except ChildProcessError: print("no child is left")
     assert not (tmp_path / "later").exists()
 
 
+def test_it_may_end_before_the_block(tmp_path: Path) -> None:
+    code = """
+with beside():
+    do_beside(os._exit, 0)
+    os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+    do_beside(os.mkdir, folder / "a")
+print("done")
+"""
+    assert _run(code, tmp_path) == "done\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_none_is_forked_once_jax_has_its_threads(tmp_path: Path) -> None:
     code = """
 sys.modules["jax"] = None

@@ -1,5 +1,6 @@
 """The kernels that the process beside a job builds are those that the job then flies."""
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -50,6 +51,7 @@ def test_what_a_job_flies_is_built_ahead(inlet, terms, monkeypatch):
     monkeypatch.setattr(Program, "is_kept", False)
     prepare.build_ahead(job)
     assert asked_for.pop(0) == (configure,)
+    assert asked_for.pop() == (os._exit, 0)  # it holds no memory once it has nothing to do
     assert ((build_publishers,) in asked_for) == (inlet == "reference")
     ahead = [what[1] for what in asked_for if what[0] is Program.build]
     assert len(set(ahead)) == len(ahead) == len(asked_for) - (inlet == "reference")
