@@ -6,17 +6,19 @@ Callers set jax up first, see `tuner.core.runtime.configure`.
 from __future__ import annotations
 
 import datetime
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from math import nan
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
 from tuner.config import Settings, resolve_settings
 from tuner.core.disk import result_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
+from tuner.core.numerics import Array
 from tuner.core.phrases import clause
 from tuner.core.spans import span
 from tuner.design.proposals import LogProposal
@@ -115,6 +117,41 @@ def run(
     return folder, result
 
 
+WRITTEN_EVERY_S = 1.0
+"""Least s between two files of the best vehicle so far: a step may take a hundredth of that."""
+
+
+@dataclass
+class _BestSoFar:
+    """The best vehicle of an unfinished run, and its file."""
+
+    path: Path
+    now: tuple[Job, Array] | None = None
+    written: float = -inf
+
+    def keep(self, job: Job, progress: Progress) -> None:
+        """Keep a search's best, and write it if the file is old."""
+        self.now = job, progress.best_point.coefficients
+        if time.monotonic() - self.written >= WRITTEN_EVERY_S:
+            self.write()
+
+    def write(self) -> None:
+        """Write what was kept, if anything."""
+        if self.now is None:
+            return
+        job, vector = self.now
+        with suppress(ConfigError):  # a search may pass through impossible inertias
+            values = job.space.numbers(vector)
+            best = with_values(job.settings.vehicle, values)
+            write_vehicle(best, self.path, header="Best so far of an unfinished run.")
+        self.written = time.monotonic()
+
+    def rescue(self) -> None:
+        """Write what was kept, if that is possible still."""
+        with suppress(OutputError):
+            self.write()
+
+
 @dataclass(frozen=True)
 class _Run:
     """A run whose input was checked, and that writes into its result folder.
@@ -134,15 +171,16 @@ class _Run:
 
         The search's result is written before the examination.
         """
-        reporter, folder = self.reporter, self.folder
+        reporter, folder, best = self.reporter, self.folder, _BestSoFar(self.folder / BEST_FIT_FILE)
         if not resume:
             forget(folder)
-        reporter.on_progress = self.on_progress
+        reporter.on_progress = partial(self.on_progress, best)
         try:
             searched = search_with_terms(
                 self.job, folder, resume=resume, reporter=reporter, findings=findings
             )
         except (KeyboardInterrupt, OutputError, EngineError):
+            best.rescue()
             reporter.listener.on_stop(
                 f"The best coefficients so far are in {folder}. "
                 f"Continue the search with --out {folder} --resume."
@@ -200,13 +238,9 @@ class _Run:
         reporter.attempt("page", partial(render, folder), None)
         return result
 
-    def on_progress(self, job: Job, progress: Progress) -> None:
-        """Write the best vehicle so far, and report the last iteration."""
-        with suppress(ConfigError):  # a search may pass through impossible inertias
-            values = job.space.numbers(progress.best_point.coefficients)
-            best = with_values(job.settings.vehicle, values)
-            header = "Best so far of an unfinished run."
-            write_vehicle(best, self.folder / BEST_FIT_FILE, header=header)
+    def on_progress(self, best: _BestSoFar, job: Job, progress: Progress) -> None:
+        """Keep the best vehicle so far, and report the last iteration."""
+        best.keep(job, progress)
         self.reporter.listener.on_iteration(progress.iterations[-1], progress.left)
 
     def validated(self, selected: Selected) -> Validation:

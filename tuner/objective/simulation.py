@@ -7,6 +7,7 @@ they last or which coefficients are free.
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
@@ -192,65 +193,127 @@ def _prepared(
     moves: bool,
 ) -> tuple[_Given, Program, tuple[str, ...]]:
     """Return the input of a program, the program, and the channels that it logs."""
-    if conditions or {*model.vehicle.effects, *coefficients}.intersection(EFFECTS):
-        model, segments, conditions = _with_all_terms(model, segments, conditions)
-        if not moves and segments.disturbance is None:
-            zero = Vec3(*np.zeros((3, 1, segments.count)))
-            segments = replace(segments, disturbance=Disturbance(moment=zero, rate=TORQUE_RATE_HZ))
-    else:  # nothing reads the voltage: recordings with and without it share a program
-        model = replace(model, reference_voltage=None)
-        segments = replace(segments, log_voltage=None)
-    names = tuple(segments.measured) if channels is None else channels
-    # in one order, for it tells programs apart
-    logged = tuple(sorted({*LOGGED, *names}))
-    coefficients = {**coefficients_in(model), **coefficients}
-    own = not moves or any(np.ndim(value) for value in coefficients.values())
-    none = np.zeros((len(segments.free_rows), segments.count))
-    if segments.start_sd is None and segments.free_rows:
-        # as if they were free: one program serves both
-        segments = replace(segments, start_sd=none)
-    if segments.start_sd is not None and states is None:
-        states = none
-    given = _Given(
-        model=model,
-        coefficients={name: np.asarray(value, float) for name, value in coefficients.items()},
-        segments=flown_part(segments),
-        states=None if segments.start_sd is None else states,
-        conditions=dict(conditions),
-    )
-    if own:
-        given = given._replace(
+    several = any(np.ndim(value) for value in coefficients.values())
+    how = _How(schedule, limits, tuple(coefficients), tuple(conditions), channels, several, moves)
+    key = id(model), id(segments), how
+    fixed = _FIXED.get(key)
+    if fixed is None or fixed.owner is not model:
+        fixed = _Fixed.of(model, segments, how)
+        if len(_FIXED) >= MAX_FIXED:
+            _FIXED.clear()
+        _FIXED[key] = fixed
+        weakref.finalize(segments, _FIXED.pop, key, None).atexit = False
+    given = fixed.given
+    values = {
+        name: np.asarray(coefficients.get(name, value), float)
+        for name, value in given.coefficients.items()
+    }
+    if how.own:
+        values = {name: np.broadcast_to(v, (segments.count,)) for name, v in values.items()}
+    given = given._replace(coefficients=values, conditions={**given.conditions, **conditions})
+    if states is not None and given.states is not None:
+        given = given._replace(states=states)
+    return given, fixed.program, fixed.logged
+
+
+class _How(NamedTuple):
+    """What a program is made for besides a model and segments, as `_prepared` is given it.
+
+    ``several`` is whether segments have coefficients of their own.
+    """
+
+    schedule: Schedule
+    limits: Limits
+    coefficients: tuple[str, ...]
+    conditions: tuple[str, ...]
+    channels: tuple[str, ...] | None
+    several: bool
+    moves: bool
+
+    @property
+    def own(self) -> bool:
+        """Whether the program takes coefficients of each segment's own."""
+        return self.several or not self.moves
+
+
+class _Fixed(NamedTuple):
+    """A program, and of its input what is the same at every point.
+
+    Attributes
+    ----------
+    owner
+        The model that was given: as long as it is there, no other one has its place.
+    """
+
+    owner: Model
+    given: _Given
+    program: Program
+    logged: tuple[str, ...]
+
+    @staticmethod
+    def of(model: Model, segments: Segments, how: _How) -> _Fixed:
+        """Lay out a program for a model and segments."""
+        owner, still = model, np.zeros(segments.count)
+        calm = dict.fromkeys(how.conditions, still)
+        if how.conditions or {*model.vehicle.effects, *how.coefficients}.intersection(EFFECTS):
+            model, segments = _with_all_terms(model, segments)
+            calm = dict.fromkeys(("wind_x", "wind_y", "battery_decline"), still) | calm
+            if not how.moves and segments.disturbance is None:
+                zero = Vec3(*np.zeros((3, 1, segments.count)))
+                segments = replace(
+                    segments, disturbance=Disturbance(moment=zero, rate=TORQUE_RATE_HZ)
+                )
+        else:  # nothing reads the voltage: recordings with and without it share a program
+            model = replace(model, reference_voltage=None)
+            segments = replace(segments, log_voltage=None)
+        names = tuple(segments.measured) if how.channels is None else how.channels
+        # in one order, for it tells programs apart
+        logged = tuple(sorted({*LOGGED, *names}))
+        none = np.zeros((len(segments.free_rows), segments.count))
+        if segments.start_sd is None and segments.free_rows:
+            # as if they were free: one program serves both
+            segments = replace(segments, start_sd=none)
+        shape = (segments.count,) if how.own else ()
+        values = dict.fromkeys(how.coefficients, np.zeros(())) | coefficients_in(model)
+        given = _Given(
+            model=jax.tree.map(np.asarray, model),
             coefficients={
-                name: np.broadcast_to(value, (segments.count,))
-                for name, value in given.coefficients.items()
-            }
+                name: np.broadcast_to(np.asarray(value, float), shape)
+                for name, value in values.items()
+            },
+            segments=flown_part(segments),
+            states=None if segments.start_sd is None else none,
+            conditions=calm,
         )
-    arguments = _arguments(given, own_coefficients=own, moves=moves)
-    static = (schedule, limits, logged)
-    program = program_of(
-        _flight,
-        arguments,
-        *static,
-        name="flight of a segment",
-        made_of=(static, moves, terms.TERMS),
-        packages=CODE,
-    )
-    return given, program, logged
+        arguments = _arguments(given, own_coefficients=how.own, moves=how.moves)
+        static = (how.schedule, how.limits, logged)
+        program = program_of(
+            _flight,
+            arguments,
+            *static,
+            name="flight of a segment",
+            made_of=(static, how.moves, terms.TERMS),
+            packages=CODE,
+        )
+        return _Fixed(owner, given, program, logged)
 
 
-def _with_all_terms(
-    model: Model, segments: Segments, conditions: Mapping[str, Any]
-) -> tuple[Model, Segments, dict[str, Any]]:
-    """Return model, segments and conditions with all terms and conditions, at neutral values.
+MAX_FIXED = 16
+"""Most layouts that are kept: a stage of a fit takes turns with two."""
+_FIXED: dict[tuple[Any, ...], _Fixed] = {}
+"""What was laid out for segments that are still there: a fit asks for the same at every point."""
+
+
+def _with_all_terms(model: Model, segments: Segments) -> tuple[Model, Segments]:
+    """Return model and segments with all terms, at neutral values.
 
     So two programs serve all vehicles: one of the base model, and one of any terms beyond it,
     whether or not the battery's voltage was recorded.
     """
-    calm = dict.fromkeys(("wind_x", "wind_y", "battery_decline"), np.zeros(segments.count))
     if segments.log_voltage is None or model.reference_voltage is None:
         model = replace(model, reference_voltage=np.asarray(1.0))
         segments = replace(segments, log_voltage=np.full((1, segments.count), np.nan))
-    return with_terms_computed(model, TERMS), segments, {**calm, **conditions}
+    return with_terms_computed(model, TERMS), segments
 
 
 def flown_part(segments: Segments) -> Segments:

@@ -62,9 +62,9 @@ from tuner.terms.model_averaging import selection_shifts, substitutes_of, values
 from tuner.terms.score import Score, backward_elimination, row_of, score
 from tuner.uncertainty.model_error import (
     GAIN_AXES,
+    answers_of,
     gain_by_commands,
     gains_far_off,
-    model_errors_of,
     with_other_readings,
 )
 from tuner.vehicle import COEFFICIENTS, term_groups
@@ -539,12 +539,11 @@ def refuted_by_commands(selected: Selected) -> tuple[str, ...]:
     """
     kept = {row.group: row.names for row in selected.rows if row.kept and row.names[0] in GAIN_AXES}
     fitted = selected.fitted
-    if not kept or (model_errors := model_errors_of(fitted, selected.job.fitted)) is None:
-        return ()
+    answers = answers_of(fitted, selected.job.fitted) if kept else ()
     numbers = fitted.objective.space.numbers(fitted.point.coefficients)
 
     def matches_file(name: str) -> bool:
-        gain = gain_by_commands(name, model_errors.controller)
+        gain = gain_by_commands(name, answers)
         return gain is not None and abs(numbers[name] * gain[0] - 1.0) < GAIN_TOLERANCE
 
     return tuple(group for group, names in kept.items() if any(map(matches_file, names)))

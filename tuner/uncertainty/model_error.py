@@ -148,11 +148,11 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
     """
     objective, point = fitted.objective, fitted.point
     segments, schedule = objective.segments, objective.schedule
-    if segments.windowed or not isinstance(segments.inlet, ReferenceInlet):
+    simulated = _flown(fitted)
+    if simulated is None:
         return None
-    vector = np.asarray(point.coefficients)
-    model = objective.model_at(vector)
-    conditions = objective.conditions_at(point)
+    flown, usable = simulated
+    model, conditions = objective.model_at(point.coefficients), objective.conditions_at(point)
     environment = environment_of(model, segments, conditions)
     driven = [not flight.has_tachometers for flight in flights]
     commands = {
@@ -171,20 +171,7 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
             lagging = series["rotor_speed"]
             series["rotor_speed"] = Series(lagging.time - tachometer_lag, lagging.values)
         read.append(_recorded(replace(flight, series=series), model, conditions, number))
-    flown = fly(
-        objective.model,
-        segments,
-        schedule,
-        samples=objective.samples,
-        limits=objective.limits,
-        coefficients=objective.space.values(vector),
-        conditions=conditions,
-        channels=(*_CHANNELS, MOTION, BODY_ATTITUDE, SETPOINTS),
-    )
     rate = float(schedule.log_rate)
-    odd = outlying_flights(fitted.scales)
-    usable = ~np.isfinite(np.asarray(flown.crash_time))
-    usable[[number for number, name in enumerate(fitted.scales) if name in odd]] = False
     estimates = _controller_estimates(flights, flown, model.controller.mixer, rate, usable)
     differing = tuple(estimate for estimate in estimates if estimate.differs)
     gain_shifts = {}
@@ -217,6 +204,37 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
     force, moment = (Vec3(*map(jnp.asarray, rows)) for rows in (pushes[:3], pushes[3:]))
     pushed = Disturbance(force=force, moment=moment, rate=rate)
     return ModelErrors(found.laws, pushed, differing, found.speed_lag, gain_shifts)
+
+
+def answers_of(fitted: Fitted, flights: Sequence[Flight]) -> tuple[ControllerEstimate, ...]:
+    """Return the estimates of the rate controller that differ; arguments of `model_errors_of`."""
+    simulated, objective = _flown(fitted), fitted.objective
+    if simulated is None:
+        return ()
+    mixer, rate = objective.model.controller.mixer, float(objective.schedule.log_rate)
+    estimates = _controller_estimates(flights, simulated[0], mixer, rate, simulated[1])
+    return tuple(estimate for estimate in estimates if estimate.differs)
+
+
+def _flown(fitted: Fitted) -> tuple[Flown, Mask] | None:
+    """Return a fit's flights as simulated, and which (F,) show errors; None if not flown whole."""
+    objective, segments = fitted.objective, fitted.objective.segments
+    if segments.windowed or not isinstance(segments.inlet, ReferenceInlet):
+        return None
+    flown = fly(
+        objective.model,
+        segments,
+        objective.schedule,
+        samples=objective.samples,
+        limits=objective.limits,
+        coefficients=objective.space.values(np.asarray(fitted.point.coefficients)),
+        conditions=objective.conditions_at(fitted.point),
+        channels=(*_CHANNELS, MOTION, BODY_ATTITUDE, SETPOINTS),
+    )
+    odd = outlying_flights(fitted.scales)
+    usable = ~np.isfinite(np.asarray(flown.crash_time))
+    usable[[number for number, name in enumerate(fitted.scales) if name in odd]] = False
+    return flown, usable
 
 
 def gain_by_commands(
@@ -364,11 +382,9 @@ def model_error_findings(
 
 def gains_far_off(fitted: Fitted, flights: Sequence[Flight]) -> Iterator[Finding]:
     """Return findings on gains far from the file's; arguments are those of `model_errors_of`."""
-    model_errors = model_errors_of(fitted, flights)
-    controller = () if model_errors is None else model_errors.controller
     return _controller_findings(
         one
-        for one in controller
+        for one in answers_of(fitted, flights)
         if one.part != "late" and not 1.0 / FAR_OFF_GAIN < one.value < FAR_OFF_GAIN
     )
 

@@ -7,6 +7,7 @@ import re
 import shutil
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from tuner.cli.results import LINES, WIDTH, print_run
 from tuner.core.errors import InputError
 from tuner.evaluate.comparison import Comparison
 from tuner.findings.findings import Code, sentence
+from tuner.job import run as module
 from tuner.job.run import run
 from tuner.options import Options
 from tuner.recordings.loader import load_flight
@@ -251,6 +253,28 @@ def test_what_was_salvaged_is_said_by_result_and_page_even_of_a_quiet_run(salvag
 def test_a_spin_alone_has_no_position_error(salvaged):
     iterations = SearchRecord.read(salvaged[2].folder).iterations
     assert {iteration.position_rmse for iteration in iterations} == {None}
+
+
+def test_the_best_vehicle_so_far_is_written_once_a_second_and_on_a_stop(tmp_path, monkeypatch):
+    file = read_vehicle(FLIGHTS.parent / "configs" / "vehicles" / "crazyflie.yaml")
+    space = SimpleNamespace(numbers=lambda vector: {"mass": float(vector[0])})
+    job = SimpleNamespace(space=space, settings=SimpleNamespace(vehicle=file))
+    clock = [5.0]
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    best = module._BestSoFar(tmp_path / "best_fit.yaml")
+    best.write()
+    assert not best.path.exists()  # nothing was found yet
+
+    def kept(mass: float, *, after: float) -> float:
+        clock[0] += after
+        point = SimpleNamespace(coefficients=np.array([mass]))
+        best.keep(job, SimpleNamespace(best_point=point))
+        return read_vehicle(best.path).mass
+
+    assert [kept(1.0, after=0.0), kept(2.0, after=0.5), kept(3.0, after=0.6)] == [1.0, 1.0, 3.0]
+    assert kept(4.0, after=0.9) == 3.0
+    best.rescue()
+    assert read_vehicle(best.path).mass == 4.0
 
 
 @pytest.mark.slow

@@ -184,6 +184,41 @@ def test_what_is_differentiated_flies_without_derivatives_by_the_same_program(mo
         np.testing.assert_allclose(still.channels[name], values, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.usefixtures("optimised")
+def test_what_is_laid_out_once_serves_other_values_but_no_other_model_or_segments(monkeypatch):
+    monkeypatch.setattr(simulation, "_FIXED", fixed := {})
+    craft = round_airframe(4)
+    start = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], hover(craft, vec(0, 0, 1)))
+
+    def pushed(share):
+        thrust = tuple(np.tile(share * command, (STEPS + 2, 1)) for command in start.command)
+        return Segments(ActuatorInlet(thrust), start, {}, np.zeros(1, int))
+
+    def height(model, segments, **coefficients):
+        flown = simulation.fly(
+            model,
+            segments,
+            SCHEDULE,
+            samples=STEPS,
+            limits=AIRBORNE,
+            channels=("position",),
+            coefficients=coefficients,
+        )
+        return flown.channels["position"][0, -1, 2]
+
+    model, segments = Model(craft, controller()), pushed(0.9)
+    heavy = with_coefficients(model, {"mass": 2.0 * craft.body.mass})
+    light = height(model, segments)
+    twice = height(heavy, segments)
+    assert twice < light
+    assert height(model, segments, mass=2.0 * float(craft.body.mass)) == twice
+    assert height(model, segments) == light
+    assert height(model, pushed(0.8)) < light
+    assert len(fixed) == 3  # the pushed segments are gone
+    del segments
+    assert not fixed
+
+
 # every inlet of the simulator has one class that feeds it, and every table names the same ones
 
 

@@ -41,7 +41,7 @@ def selected(monkeypatch, groups=GROUPS, **given):
 
     monkeypatch.setattr(selection, "candidate_groups", candidates)
     monkeypatch.setattr(selection, "condition_groups", lambda *_, **__: {})
-    monkeypatch.setattr(selection, "model_errors_of", lambda *_: None)  # no commands were recorded
+    monkeypatch.setattr(selection, "answers_of", lambda *_: ())  # no commands were recorded
     fit = job_with(0.0, seed=0, **given)
     return with_terms_selected(*fit, Reporter())
 
