@@ -28,12 +28,12 @@ from tuner.service.database import JobRow, RecordingRow, State
 from tuner.service.jobs import add_event
 from tuner.service.request import JobRequest
 from tuner.service.service import Service
-from tuner.service.settings import GIB, MIB, Limits, ServiceSettings
+from tuner.service.settings import GIB, MIB, ServiceLimits, ServiceSettings
 
 JOBS = 10_000
 CLIENTS = 100
 UPLOAD = 2 * GIB
-LIMITS = Limits(free_bytes=0, requests_in_a_burst=10**9, inspection_seconds=300.0)
+LIMITS = ServiceLimits(free_bytes=0, requests_in_a_burst=10**9, inspection_seconds=300.0)
 PAGES = ("/api/v1/jobs", "/api/v1/jobs?state=done", "/api/v1/jobs?vehicle=quad%203", "/jobs")
 
 

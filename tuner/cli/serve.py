@@ -90,7 +90,7 @@ def _serve(
     with extra("service", "tune serve"):
         from tuner.service.app import LOOPBACK, is_loopback
         from tuner.service.app import serve as run
-    from tuner.service.settings import GIB, Limits, ServiceSettings, default_data
+    from tuner.service.settings import GIB, ServiceLimits, ServiceSettings, default_data
 
     if not 0 <= port < 2**16:
         raise InputError("--port", f"{port} is no port", "name one from 1 to 65535")
@@ -100,7 +100,7 @@ def _serve(
     for name in allow_host:
         if not re.fullmatch(r"[A-Za-z0-9.-]+", name):
             raise InputError("--allow-host", f"'{name}' is no host name", "write tune.lab.example")
-    limits = Limits(upload_bytes=int(max_upload * GIB), memory_bytes=int(memory * GIB))
+    limits = ServiceLimits(upload_bytes=int(max_upload * GIB), memory_bytes=int(memory * GIB))
     settings = ServiceSettings(
         data=data or default_data(),
         database=database or "",

@@ -45,9 +45,9 @@ from tuner.core.runtime import configure, extra
 from tuner.engine.engine import (
     DASK,
     HERE,
+    BatchSystem,
     ClusterFile,
     Engine,
-    JobQueue,
     Kubernetes,
     Report,
     Task,
@@ -407,13 +407,15 @@ def connected(cluster: Any, file: ClusterFile) -> Iterator[Client]:
             client.close()
 
 
-def job_script(file: ClusterFile, jobs: JobQueue) -> str:
+def job_script(file: ClusterFile, jobs: BatchSystem) -> str:
     """Return the job script with which a batch system would start a worker; none is submitted."""
     with _jobs(file, jobs, submit=False) as cluster:
         return str(cluster.job_script())
 
 
-def _jobs(file: ClusterFile, jobs: JobQueue, *, submit: bool = True) -> AbstractContextManager[Any]:
+def _jobs(
+    file: ClusterFile, jobs: BatchSystem, *, submit: bool = True
+) -> AbstractContextManager[Any]:
     with extra("cluster", *DASK):
         import dask_jobqueue  # noqa: PLC0415 (few need it)
 

@@ -165,7 +165,7 @@ class Tls(Section):
     key: Path
 
 
-class JobQueue(Section):
+class BatchSystem(Section):
     """A batch system from which `dask_jobqueue` gets workers, one a job.
 
     Attributes
@@ -246,7 +246,7 @@ class ClusterFile(Section):
     gpus: Annotated[Whole, Interval(ge=0, le=64)] = 0
     address: Address | None = None
     tls: Tls | None = None
-    jobs: JobQueue | None = None
+    jobs: BatchSystem | None = None
     kubernetes: Kubernetes | None = None
     store: str | None = None
 

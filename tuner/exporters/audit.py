@@ -64,7 +64,7 @@ RELATIVE_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
-class Rotor:
+class ModelRotor:
     """One motor plugin with its rotor."""
 
     number: int
@@ -128,7 +128,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     return Audit(path, whole.mass, tuple(dict.fromkeys(faults)), differences, tuple(model.included))
 
 
-def _rotors(model: SdfModel) -> list[Rotor]:
+def _rotors(model: SdfModel) -> list[ModelRotor]:
     links = model.rotor_links()
     motors = {motor_number(motor): motor for motor in model.motors()}
     rotors = []
@@ -136,7 +136,7 @@ def _rotors(model: SdfModel) -> list[Rotor]:
         radii = [radius.number for disc in link.all("collision") for radius in disc.all("radius")]
         place = model.pose_of(link).position
         radius = (radii or [0.0])[0] or 0.0
-        rotors.append(Rotor(index, place, turns, motors[index].numbers, radius))
+        rotors.append(ModelRotor(index, place, turns, motors[index].numbers, radius))
     return rotors
 
 
@@ -156,7 +156,7 @@ def _body_faults(model: SdfModel) -> Iterator[str]:
             )
 
 
-def _inertia_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
+def _inertia_faults(whole: Inertial, rotors: list[ModelRotor]) -> Iterator[str]:
     """Yield faults of the whole inertia for the vehicle's size."""
     arm = max(float(np.hypot(*(r.place - whole.pose.position)[:2])) for r in rotors)
     if arm <= 0:
@@ -171,7 +171,7 @@ def _inertia_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
         )
 
 
-def _rotor_faults(rotors: list[Rotor], model: SdfModel) -> Iterator[str]:
+def _rotor_faults(rotors: list[ModelRotor], model: SdfModel) -> Iterator[str]:
     """Yield faults of motors, and differences between them."""
     has_effective = MARK in model.root.source.raw
     for rotor in rotors:
@@ -209,7 +209,7 @@ def _rotor_faults(rotors: list[Rotor], model: SdfModel) -> Iterator[str]:
         yield f"{fewer} motor plugins share a motorNumber with another, or name no link"
 
 
-def _layout_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
+def _layout_faults(whole: Inertial, rotors: list[ModelRotor]) -> Iterator[str]:
     """Yield faults of the rotors' positions and turning directions."""
     senses = [rotor.turns for rotor in rotors]
     if senses.count("ccw") != senses.count("cw"):
@@ -234,7 +234,7 @@ def _layout_faults(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
 
 
 def _speeds(
-    model: SdfModel, rotors: list[Rotor], parameters: Mapping[str, float]
+    model: SdfModel, rotors: list[ModelRotor], parameters: Mapping[str, float]
 ) -> tuple[float, float] | None:
     """Return the rotor speeds in rad/s at zero and at full command; None if unknown."""
     limit = min((r.numbers.get("maxRotVelocity", math.inf) for r in rotors), default=math.inf)
@@ -251,7 +251,7 @@ def _speeds(
 
 
 def _hover(
-    whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float] | None
+    whole: Inertial, rotors: list[ModelRotor], speeds: tuple[float, float] | None
 ) -> tuple[float, float] | None:
     """Return full thrust over weight, and the hover throttle between zero and full command.
 
@@ -265,7 +265,7 @@ def _hover(
 
 
 def _hover_faults(
-    whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float] | None
+    whole: Inertial, rotors: list[ModelRotor], speeds: tuple[float, float] | None
 ) -> Iterator[str]:
     """Yield faults of the thrust-to-weight ratio and of the hover."""
     if speeds is None or any("motorConstant" not in rotor.numbers for rotor in rotors):
@@ -289,7 +289,7 @@ def _hover_faults(
 def _parameter_faults(
     parameters: Mapping[str, float],
     whole: Inertial,
-    rotors: list[Rotor],
+    rotors: list[ModelRotor],
     speeds: tuple[float, float] | None,
 ) -> Iterator[str]:
     """Yield disagreements of PX4's parameters with the model."""
@@ -316,7 +316,7 @@ def _parameter_faults(
         yield f"MPC_THR_HOVER is {hover:g}, the model hovers at a throttle of {there[1]:.2f}"
 
 
-def _differences_from(run: Run, whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
+def _differences_from(run: Run, whole: Inertial, rotors: list[ModelRotor]) -> Iterator[str]:
     """Yield the difference of each number from the fitted one."""
     fitted = values_of(run.vehicle)
     first = rotors[0].numbers

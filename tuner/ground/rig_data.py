@@ -210,13 +210,13 @@ def open_table(path: Path) -> TabularRecording:
     RecordingError
         It cannot be read, is too large, or is no table.
     """
-    from tuner.recordings.table import Table  # noqa: PLC0415 (pyarrow takes a third of a second)
+    from tuner.recordings.table import TableRecording  # noqa: PLC0415 (pyarrow takes a third of a second)
 
     try:
         about = path.stat()
         if not stat.S_ISREG(about.st_mode) or about.st_size > MAX_BYTES:
             raise RecordingError(path, "is no file, or larger than 200 MB", "cut it to the rig's")
-        return Table(path)
+        return TableRecording(path)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "no valid path"
         raise RecordingError(path, f"cannot be read ({reason})", "check the path") from None

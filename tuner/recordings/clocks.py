@@ -27,7 +27,7 @@ from tuner.recordings.interpolation import (
     smooth,
 )
 from tuner.recordings.notes import Kind, Note, NoteCode
-from tuner.recordings.recording import NS_PER_SECOND, Nanoseconds, Samples
+from tuner.recordings.recording import NS_PER_SECOND, Nanoseconds, TopicSamples
 
 #: A stamp that leaves its neighbours by more, while its arrival does not, has jumped.
 MIN_CLOCK_JUMP_NS = NS_PER_SECOND // 10
@@ -56,7 +56,7 @@ AVERAGING_WINDOW_S = 0.1
 
 
 def message_times(
-    samples: Mapping[str, Samples],
+    samples: Mapping[str, TopicSamples],
     receive_only: Collection[str] = (),
     slow_topics: Collection[str] = (),
 ) -> tuple[dict[str, Nanoseconds], tuple[Note, ...]]:

@@ -42,7 +42,7 @@ from tuner.recordings.unit_detection import (
     INVERSE,
     READINGS,
     SCALAR_FIRST,
-    Reading,
+    SignalReading,
     force_and_tilt,
     to_enu_flu,
     turned_about_z,
@@ -137,7 +137,7 @@ def _world_forces(flown: Flown) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class Pair:
+class SignalPair:
     """A signal, and the one whose change it must be.
 
     Attributes
@@ -169,8 +169,8 @@ class Pair:
     max_unmatched: float = np.inf
 
 
-PAIRS: Mapping[str, Pair] = {
-    "body_rate": Pair(
+PAIRS: Mapping[str, SignalPair] = {
+    "body_rate": SignalPair(
         "attitude",
         [_turning],
         min_motion=0.1,
@@ -178,7 +178,7 @@ PAIRS: Mapping[str, Pair] = {
         max_share=0.9,
         doubt=NoteCode.BODY_RATE_DOUBTED,
     ),
-    "velocity": Pair(
+    "velocity": SignalPair(
         "position",
         [lambda s: (smooth(derivative(s["position"]), 0.1), smooth(s["velocity"], 0.1))],
         min_motion=0.2,
@@ -188,8 +188,8 @@ PAIRS: Mapping[str, Pair] = {
         max_unmatched=1.0,
     ),
     # a flipped height shows in world axes, a turned accelerometer in body axes
-    "acceleration": Pair("position", [_world_forces, _body_forces], MIN_ACCELERATION, 0.7),
-    "rate_setpoint": Pair(
+    "acceleration": SignalPair("position", [_world_forces, _body_forces], MIN_ACCELERATION, 0.7),
+    "rate_setpoint": SignalPair(
         "body_rate", [lambda s: (smooth(s["body_rate"]), smooth(s["rate_setpoint"]))], 0.1
     ),
 }
@@ -279,7 +279,7 @@ def _saturation(gyro: Series, topic: str) -> list[Note]:
     return [NoteCode.GYRO_SATURATED.note(topic=topic, count=count, limit=limit)]
 
 
-def _judge(signal: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
+def _judge(signal: str, flown: Flown) -> tuple[SignalReading | None, Sequence[Note]]:
     """Return the right reading of a signal of `PAIRS`, or a doubt."""
     pair = PAIRS[signal]
     change, recorded = pair.compared[-1](flown)
@@ -330,7 +330,7 @@ def _residual_share(change: Array, recorded: Array) -> float:
     return rms(change - recorded) / size if size > 0.0 else np.inf
 
 
-def _judge_attitude(_: str, flown: Flown) -> tuple[Reading | None, Sequence[Note]]:
+def _judge_attitude(_: str, flown: Flown) -> tuple[SignalReading | None, Sequence[Note]]:
     """Return the right reading of the attitude, or a doubt on it or on the felt weight."""
     q, pull = flown["attitude"], _specific_force(flown)
     push = pull - np.array([0.0, 0.0, GRAVITY])
@@ -338,7 +338,7 @@ def _judge_attitude(_: str, flown: Flown) -> tuple[Reading | None, Sequence[Note
     heading = 0.0 if gyro is None else _heading_of_markers(flown)
     if heading:
         name = f"of markers turned left by {np.degrees(heading) % 360:.0f} degrees"
-        return Reading(name, lambda q, _: turned_about_z(q, -heading)), []
+        return SignalReading(name, lambda q, _: turned_about_z(q, -heading)), []
     turns = [smooth(rate) for rate in (body_rate_of(q), gyro) if rate is not None]
     of_markers = MAX_MARKER_OFFSET_M * min(
         np.nan_to_num(rate**2).sum(axis=1).mean() for rate in turns

@@ -17,7 +17,7 @@ from tuner.recordings.flight import SIGNALS, RawSeries, Series
 from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.missions import Mission, find_missions, split_into_manoeuvres
 from tuner.recordings.notes import Damage, Note, NoteCode
-from tuner.recordings.recording import Clock, Nanoseconds, ReadResult, Recording, Samples
+from tuner.recordings.recording import Clock, Nanoseconds, ReadResult, Recording, TopicSamples
 from tuner.recordings.sources import (
     Place,
     choose_map,
@@ -117,7 +117,7 @@ class ReadOptions:
 
 
 @dataclass(frozen=True)
-class Signals:
+class RecordedSignals:
     """The cleaned signals of a recording, with or without a pose.
 
     Attributes
@@ -139,7 +139,7 @@ class Signals:
     recording: Recording
     topic_map: TopicMap
     places: Mapping[str, Place]
-    samples: Mapping[str, Samples]
+    samples: Mapping[str, TopicSamples]
     topics: Mapping[str, str]
     series: Mapping[str, Series]
     notes: tuple[Note, ...]
@@ -148,14 +148,14 @@ class Signals:
 
 
 @dataclass(frozen=True)
-class Content(Signals):
+class Content(RecordedSignals):
     """A recording: its signals on one clock and in one frame, and its missions."""
 
     missions: tuple[Mission, ...]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # of corrupt numbers, which are dropped as such
-def read_signals(options: ReadOptions) -> Signals:
+def read_signals(options: ReadOptions) -> RecordedSignals:
     """Read and clean all signals that a topic map finds in a recording.
 
     Raises
@@ -214,7 +214,7 @@ def read_signals(options: ReadOptions) -> Signals:
         if no_pose is None and needed not in series:
             where = f" in {topics[needed]}" if topics.get(needed) else ""
             no_pose = RecordingError(path, f"no usable {needed}{where}", "inspect the recording")
-    return Signals(
+    return RecordedSignals(
         recording, chosen, places, contents.samples, topics, series, tuple(notes), damage, no_pose
     )
 
@@ -246,7 +246,7 @@ def read_content(options: ReadOptions) -> Content:
     return content_of(read_signals(options), options.sidecar)
 
 
-def content_of(signals: Signals, sidecar: Sidecar) -> Content:
+def content_of(signals: RecordedSignals, sidecar: Sidecar) -> Content:
     """Return the signals of a recording on one clock and in one frame, and its missions.
 
     Raises
@@ -432,7 +432,7 @@ def _recorded_unit(
     return unit_of_angles(recording.path, recorded, position, required=required)
 
 
-def _in_flight_axes(samples: Samples, signal: str, place: Place, values: Array) -> Array:
+def _in_flight_axes(samples: TopicSamples, signal: str, place: Place, values: Array) -> Array:
     """Return (n, k) values in the columns and axes of a `Flight`."""
     columns, axes = SIGNALS[signal].columns, SIGNALS[signal].axes
     if place.source.quaternion == "rpy" and axes == "attitude":

@@ -207,7 +207,7 @@ def _unit_quaternions(time: Array, values: Array) -> tuple[Array, Array, int]:
 
 
 @dataclass(frozen=True)
-class Limits:
+class NoiseLimits:
     """Bounds of noise and motion between neighbouring samples.
 
     Attributes
@@ -234,16 +234,16 @@ class Limits:
         return max(self.floor, self.share * level)
 
 
-LIMITS: Mapping[str, Limits] = {
-    "position": Limits(floor=0.02, curvature=30.0, jump=0.08),
-    "attitude": Limits(floor=0.03, curvature=100.0, jump=0.15),
-    "rotor_speed": Limits(floor=30.0, share=0.05),
+LIMITS: Mapping[str, NoiseLimits] = {
+    "position": NoiseLimits(floor=0.02, curvature=30.0, jump=0.08),
+    "attitude": NoiseLimits(floor=0.03, curvature=100.0, jump=0.15),
+    "rotor_speed": NoiseLimits(floor=30.0, share=0.05),
 }
 """Signals with an outlier test. A quadcopter reaches 3 g; its quaternion bends by half the angular
 acceleration; a rotor that turns at some 600 rad/s needs tens of ms for 30 up and back."""
 
 
-def is_outlier(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
+def is_outlier(time: Array, values: Array, limits: NoiseLimits) -> NDArray[np.bool_]:
     """Return which samples of a signal stick out on one side of their surroundings.
 
     A sample is compared with the medians of the three samples before and the three after it. Ramps
@@ -298,7 +298,7 @@ def is_held(time: Array, values: Array) -> NDArray[np.bool_]:
     return np.asarray(same & (since < 2.0 * period), dtype=np.bool_)
 
 
-def is_repeated(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
+def is_repeated(time: Array, values: Array, limits: NoiseLimits) -> NDArray[np.bool_]:
     """Return which samples of (n, k) values repeat the one before although the vehicle moved.
 
     Motion capture that loses its markers goes on sending the last pose. A vehicle at rest in a
@@ -317,7 +317,9 @@ def is_repeated(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]
     return stuck
 
 
-def find_excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray[np.bool_], int]:
+def find_excursions(
+    time: Array, values: Array, limits: NoiseLimits
+) -> tuple[NDArray[np.bool_], int]:
     """Return which samples of (n, k) values lie between a leap away and the leap back.
 
     Returns

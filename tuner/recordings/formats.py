@@ -97,10 +97,16 @@ READERS: tuple[Reader, ...] = (
         "table",
         "MATLAB .mat",
         lambda _, start: start.startswith((b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")),
-        _lazy_reader("matlab", "MatlabTable"),
+        _lazy_reader("matlab", "MatlabRecording"),
         tabular=True,
     ),
-    Reader("table", ".csv and .parquet", _is_table, _lazy_reader("table", "Table"), tabular=True),
+    Reader(
+        "table",
+        ".csv and .parquet",
+        _is_table,
+        _lazy_reader("table", "TableRecording"),
+        tabular=True,
+    ),
 )
 """The first that matches reads the recording."""
 

@@ -24,7 +24,7 @@ from tuner.recordings.consistency import contradiction_in
 from tuner.recordings.content import (
     Content,
     ReadOptions,
-    Signals,
+    RecordedSignals,
     content_of,
     read_content,
     read_signals,
@@ -44,7 +44,7 @@ from tuner.recordings.interpolation import RATE_HZ, derivative, resample, smooth
 from tuner.recordings.loader import flights_of, flying_stretches, inertial_error, is_inertial
 from tuner.recordings.missions import mission_error, yaw_spin
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.recording import Samples, Topic
+from tuner.recordings.recording import Topic, TopicSamples
 from tuner.recordings.sources import choose_map, locate, sources_by_name
 from tuner.recordings.topics import Sidecar, Source, TopicMap, shipped_maps
 from tuner.vehicle import COEFFICIENTS
@@ -113,7 +113,7 @@ def inspect_recording(
     return _with_flight(content, options.sidecar)
 
 
-def _without_pose(signals: Signals) -> Inspection:
+def _without_pose(signals: RecordedSignals) -> Inspection:
     """Return the inspection of a recording of gyro, accelerometer and motor commands alone."""
     flown = flying_stretches(signals)
     error = inertial_error(signals, flown)
@@ -149,7 +149,7 @@ def _in_words(error: RecordingError | None) -> str | None:
     return None if error is None else f"{error.what}; {error.remedy}"
 
 
-def _with_signals(read: Signals) -> Inspection:
+def _with_signals(read: RecordedSignals) -> Inspection:
     """Return the inspection of a recording's topics and signals alone."""
     recording, samples = read.recording, read.samples
     times = [s.receive for s in samples.values() if len(s.receive)]
@@ -207,7 +207,7 @@ def _measured_columns(series: Mapping[str, Series]) -> dict[str, tuple[int, ...]
     }
 
 
-def _topic(topic: Topic, samples: Samples | None, signals: tuple[str, ...]) -> TopicReport:
+def _topic(topic: Topic, samples: TopicSamples | None, signals: tuple[str, ...]) -> TopicReport:
     if samples is None or len(samples.receive) < 2:
         return TopicReport(topic.name, topic.type, topic.count, None, None, None, None, signals)
     stamps = samples.receive if samples.stamp is None else samples.stamp

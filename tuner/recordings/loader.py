@@ -28,7 +28,7 @@ from tuner.recordings.clocks import Grid, clock_of
 from tuner.recordings.content import (
     Content,
     ReadOptions,
-    Signals,
+    RecordedSignals,
     content_of,
     read_content,
     read_signals,
@@ -299,13 +299,13 @@ class InertialFlight:
     notes: tuple[Note, ...]
 
 
-def is_inertial(signals: Signals) -> bool:
+def is_inertial(signals: RecordedSignals) -> bool:
     """Return whether a recording lacks a pose, but has all `INERTIAL_SIGNALS`."""
     has_pose = {"position", "attitude"} <= set(signals.series)
     return not has_pose and set(INERTIAL_SIGNALS) <= set(signals.series)
 
 
-def flying_stretches(signals: Signals) -> tuple[tuple[float, float], ...]:
+def flying_stretches(signals: RecordedSignals) -> tuple[tuple[float, float], ...]:
     """Return the stretches, in s, with motors above idle."""
     commands = signals.series["command"]
     turns = np.asarray(commands.values.mean(axis=1) > MAX_IDLE_COMMAND, dtype=np.bool_)
@@ -314,7 +314,7 @@ def flying_stretches(signals: Signals) -> tuple[tuple[float, float], ...]:
 
 
 def inertial_error(
-    signals: Signals, flown: tuple[tuple[float, float], ...]
+    signals: RecordedSignals, flown: tuple[tuple[float, float], ...]
 ) -> RecordingError | None:
     """Return why a recording without a pose cannot be fitted; None if it can.
 

@@ -26,8 +26,8 @@ from tuner.recordings.recording import (
     TABLE_TOPIC,
     Clock,
     ReadResult,
-    Samples,
     TabularRecording,
+    TopicSamples,
     short_reason,
 )
 from tuner.recordings.sources import column_meaning
@@ -44,7 +44,7 @@ MAX_DEPTH = 8
 ANY_TIME = "*.time"
 
 
-class MatlabTable(TabularRecording):
+class MatlabRecording(TabularRecording):
     """Arrays of one or several structures.
 
     Raises
@@ -100,11 +100,11 @@ class MatlabTable(TabularRecording):
             )
         stamps = np.concatenate([part.receive for part in parts])
         fields = {n: np.concatenate([part.fields[n] for part in parts]) for n in wanted_columns}
-        return ReadResult({TABLE_TOPIC: Samples(stamps, stamps, fields)}, tuple(notes))
+        return ReadResult({TABLE_TOPIC: TopicSamples(stamps, stamps, fields)}, tuple(notes))
 
     def _part(
         self, clock: Clock, names: list[str], fields: tuple[str, ...]
-    ) -> tuple[Samples, tuple[Note, ...]]:
+    ) -> tuple[TopicSamples, tuple[Note, ...]]:
         """Return the rows of one structure, NaN in the columns of the others."""
         stamps = self._columns[clock.field]
         column = pyarrow.chunked_array([pyarrow.array(stamps)])
@@ -112,7 +112,7 @@ class MatlabTable(TabularRecording):
         time, notes = read_times(self.path, column, clock, held.values())
         known, nothing = time != NO_TIME, np.full(len(time), np.nan)
         values = {name: held.get(name, nothing)[known] for name in fields}
-        return Samples(time[known], time[known], values), notes
+        return TopicSamples(time[known], time[known], values), notes
 
 
 Described = tuple[dict[str, Array], list[str]]

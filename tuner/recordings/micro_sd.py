@@ -19,7 +19,14 @@ import numpy as np
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
-from tuner.recordings.recording import NS_PER_UNIT, Clock, ReadResult, Recording, Samples, Topic
+from tuner.recordings.recording import (
+    NS_PER_UNIT,
+    Clock,
+    ReadResult,
+    Recording,
+    Topic,
+    TopicSamples,
+)
 
 MAGIC = 0xBC
 #: Logs are read into memory; a kilohertz of ten variables is 3 MB a minute.
@@ -96,7 +103,7 @@ class MicroSdRecording(Recording):
             return (Damage(Cause.LOG_DAMAGED),)
         return (Damage(Cause.END_MISSING, bytes_lost=self._lost),)
 
-    def _samples(self, topic: str, fields: tuple[str, ...]) -> Samples:
+    def _samples(self, topic: str, fields: tuple[str, ...]) -> TopicSamples:
         event, missing = self._events[topic], self.missing_fields(topic, fields)
         if missing:
             raise RecordingError(
@@ -109,7 +116,9 @@ class MicroSdRecording(Recording):
         latest = np.uint64(np.iinfo(np.int64).max // self._unit)
         time = np.minimum(rows[_STAMP].astype(np.uint64), latest).astype(np.int64) * self._unit
         with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged log
-            return Samples(time, time, {name: rows[name].astype(np.float64) for name in fields})
+            return TopicSamples(
+                time, time, {name: rows[name].astype(np.float64) for name in fields}
+            )
 
 
 class _Header:

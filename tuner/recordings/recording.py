@@ -67,7 +67,7 @@ class Clock(Section):
 
 
 @dataclass(frozen=True)
-class Samples:
+class TopicSamples:
     """The messages of one topic, in the order of the file.
 
     Attributes
@@ -108,7 +108,7 @@ class ReadResult:
         What the recording has lost, with times in s since 1970 by the recorder's clock.
     """
 
-    samples: Mapping[str, Samples]
+    samples: Mapping[str, TopicSamples]
     notes: tuple[Note, ...] = ()
     damage: tuple[Damage, ...] = ()
 

@@ -38,8 +38,8 @@ from tuner.recordings.recording import (
     Clock,
     Nanoseconds,
     ReadResult,
-    Samples,
     TabularRecording,
+    TopicSamples,
     short_reason,
 )
 
@@ -59,7 +59,7 @@ MAX_UNREAD_SHARE = 0.1
 MIN_TURNS_SHARE = 0.3
 
 
-class Table(TabularRecording):
+class TableRecording(TabularRecording):
     """A CSV or Parquet file with a line of column names.
 
     Attributes
@@ -112,7 +112,7 @@ class Table(TabularRecording):
             lost = int((~kept).sum())
             notes.append(NoteCode.ROWS_WITHOUT_TIME.note(topic=TABLE_TOPIC, count=lost))
         fields = {name: values[kept] for name, values in fields.items()}
-        samples = Samples(time[kept], time[kept], fields)
+        samples = TopicSamples(time[kept], time[kept], fields)
         return ReadResult({TABLE_TOPIC: samples}, tuple(notes), tuple(damage))
 
     def _require_numbers(self, name: str, cells: pyarrow.ChunkedArray, numbers: Array) -> None:

@@ -29,8 +29,8 @@ from tuner.recordings.recording import (
     FieldLayout,
     ReadResult,
     Recording,
-    Samples,
     Topic,
+    TopicSamples,
     short_reason,
 )
 
@@ -126,7 +126,7 @@ class ULogRecording(Recording):
 
     def _samples(
         self, topic: str, data: Mapping[str, Any], fields: Sequence[str], clocks: Sequence[Clock]
-    ) -> Samples:
+    ) -> TopicSamples:
         if "timestamp" not in data:
             raise RecordingError(self.path, f"{topic} has no timestamp", "leave it out of the map")
         receive = data["timestamp"].astype(np.int64) * NS_PER_UNIT["us"]
@@ -143,7 +143,9 @@ class ULogRecording(Recording):
                 f"{topic} has no field '{missing[0]}', it has {', '.join(list(data)[:12])}",
                 "correct the topic map",
             )
-        return Samples(receive, stamp, {name: data[name].astype(np.float64) for name in fields})
+        return TopicSamples(
+            receive, stamp, {name: data[name].astype(np.float64) for name in fields}
+        )
 
 
 def _blocks(path: Path) -> Iterator[tuple[bytes, list[int]]]:

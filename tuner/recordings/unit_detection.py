@@ -95,7 +95,7 @@ def turned_about_z(q: Array, angle: float) -> Array:
 
 
 @dataclass(frozen=True)
-class Reading:
+class SignalReading:
     """Another frame, order or unit of recorded numbers: a row of the table of hypotheses.
 
     Attributes
@@ -115,38 +115,42 @@ INVERSE = np.array([1.0, -1.0, -1.0, -1.0])
 _DEGREE = math.pi / 180
 _SCALAR_LAST = [3, 0, 1, 2]
 _TURN_READINGS = (
-    Reading("in FRD axes", lambda w, _: to_enu_flu(w, "body_rate")),
-    Reading("in degrees per second", lambda w, _: w * _DEGREE),
-    Reading("in FRD axes and degrees", lambda w, _: to_enu_flu(w, "body_rate") * _DEGREE),
-    Reading("in milliradians per second", lambda w, _: w * 1e-3),
-    Reading("in milliradians, not degrees, per second", lambda w, _: w * 1e-3 / _DEGREE),
+    SignalReading("in FRD axes", lambda w, _: to_enu_flu(w, "body_rate")),
+    SignalReading("in degrees per second", lambda w, _: w * _DEGREE),
+    SignalReading("in FRD axes and degrees", lambda w, _: to_enu_flu(w, "body_rate") * _DEGREE),
+    SignalReading("in milliradians per second", lambda w, _: w * 1e-3),
+    SignalReading("in milliradians, not degrees, per second", lambda w, _: w * 1e-3 / _DEGREE),
 )
-SCALAR_FIRST = Reading("scalar-first", lambda q, _: q[:, [1, 2, 3, 0]])
+SCALAR_FIRST = SignalReading("scalar-first", lambda q, _: q[:, [1, 2, 3, 0]])
 """Without a yaw it leans as the right attitude does along x: a gyro alone tells it."""
-IN_WORLD_AXES = Reading("in world axes", lambda w, q: rotate(q * INVERSE, w))
-READINGS: Mapping[str, tuple[Reading, ...]] = {
+IN_WORLD_AXES = SignalReading("in world axes", lambda w, q: rotate(q * INVERSE, w))
+READINGS: Mapping[str, tuple[SignalReading, ...]] = {
     "attitude": (
-        Reading("scalar-last", lambda q, _: q[:, _SCALAR_LAST]),
-        Reading("world to body", lambda q, _: q * INVERSE),
-        Reading("NED and FRD", lambda q, _: to_enu_flu(q, "attitude")),
-        Reading(
+        SignalReading("scalar-last", lambda q, _: q[:, _SCALAR_LAST]),
+        SignalReading("world to body", lambda q, _: q * INVERSE),
+        SignalReading("NED and FRD", lambda q, _: to_enu_flu(q, "attitude")),
+        SignalReading(
             "scalar-last, NED and FRD", lambda q, _: to_enu_flu(q[:, _SCALAR_LAST], "attitude")
         ),
     ),
     "body_rate": (*_TURN_READINGS, IN_WORLD_AXES),
     "rate_setpoint": _TURN_READINGS,
     "velocity": (
-        Reading("in body axes", lambda v, q: rotate(q, v)),
-        Reading("in NED axes", lambda v, _: to_enu_flu(v, "velocity")),
-        Reading(  # gravity alone does not tell these two apart
+        SignalReading("in body axes", lambda v, q: rotate(q, v)),
+        SignalReading("in NED axes", lambda v, _: to_enu_flu(v, "velocity")),
+        SignalReading(  # gravity alone does not tell these two apart
             "in kilometres per hour, not feet per second", lambda v, _: v / 3.6 / UNITS["ft"][0]
         ),
     ),
     "acceleration": (
-        Reading("in FRD axes", lambda a, _: to_enu_flu(a, "acceleration")),
-        Reading("with x and y swapped", lambda a, _: a[:, [1, 0, 2]]),
-        Reading("in axes turned left about z", lambda a, _: a[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]),
-        Reading("in axes turned right about z", lambda a, _: a[:, [1, 0, 2]] * [1.0, -1.0, 1.0]),
+        SignalReading("in FRD axes", lambda a, _: to_enu_flu(a, "acceleration")),
+        SignalReading("with x and y swapped", lambda a, _: a[:, [1, 0, 2]]),
+        SignalReading(
+            "in axes turned left about z", lambda a, _: a[:, [1, 0, 2]] * [-1.0, 1.0, 1.0]
+        ),
+        SignalReading(
+            "in axes turned right about z", lambda a, _: a[:, [1, 0, 2]] * [1.0, -1.0, 1.0]
+        ),
     ),
 }
 """Signal -> other ways in which it may be recorded than declared; the likelier first."""

@@ -149,7 +149,7 @@ HEAD_S = 10.0
 """The line and the headers of a request get so long, from the connection or their first byte on."""
 
 
-class Connection(H11Protocol):
+class HttpConnection(H11Protocol):
     """A connection that is closed if the head of a request has not come in time."""
 
     _closing: asyncio.TimerHandle | None = None
@@ -249,7 +249,7 @@ def _serve(service: Service, *, host: str, port: int, say: Callable[[str], None]
         create_app(service),
         host=host,
         port=port,
-        http=Connection,  # whose headers are bounded, too
+        http=HttpConnection,  # whose headers are bounded, too
         log_level="warning",
         access_log=False,
         server_header=False,

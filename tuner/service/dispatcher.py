@@ -38,7 +38,7 @@ from tuner.service.database import State
 from tuner.service.errors import NoSpaceError, UnavailableError, full_disk
 from tuner.service.jobs import AttemptOutcome, Claim, JobQueue
 from tuner.service.request import FLIGHTS, CheckedRequest
-from tuner.service.settings import Limits, ServiceSettings
+from tuner.service.settings import ServiceLimits, ServiceSettings
 from tuner.service.worker import RESULT_FOLDER, Assignment
 
 logger = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ END_KINDS = ("done", "refused", "fault")
 """and at its end."""
 
 Events = Sequence[tuple[str, Mapping[str, Any]]]
-Report = Callable[[Events], bool]
+EventReport = Callable[[Events], bool]
 
 
 class DiedError(Exception):
@@ -93,8 +93,8 @@ def attempt(
     claim: Claim,
     store: ContentStore,
     *,
-    limits: Limits,
-    report: Report,
+    limits: ServiceLimits,
+    report: EventReport,
     cores: Sequence[int] = (),
     is_unwanted: Callable[[], bool] = lambda: False,
 ) -> AttemptOutcome:
@@ -179,7 +179,7 @@ def _listen(stream: IO[bytes], heard: Queue[Events]) -> dict[str, Any] | None:
 
 
 def _follow(
-    ended: Future[T], heard: Queue[Events], report: Report, is_unwanted: Callable[[], bool]
+    ended: Future[T], heard: Queue[Events], report: EventReport, is_unwanted: Callable[[], bool]
 ) -> T:
     """Report events as they are heard until an attempt has ended, and return how."""
     while True:
@@ -281,7 +281,7 @@ def put(file: Path, store: ContentStore) -> str:
     return digest
 
 
-RemoteTask = tuple[Claim, str, Limits]
+RemoteTask = tuple[Claim, str, ServiceLimits]
 """The task of a machine of the cluster: the claim on a job, the store's URL, and its limits."""
 
 
@@ -313,7 +313,7 @@ def fit_remotely(task: RemoteTask, report: Channel) -> AttemptOutcome:
 
 
 def run_remotely(
-    task: RemoteTask, engine: Engine, report: Report, is_unwanted: Callable[[], bool]
+    task: RemoteTask, engine: Engine, report: EventReport, is_unwanted: Callable[[], bool]
 ) -> AttemptOutcome:
     """Fit a job on a machine of a cluster, and return its outcome.
 
@@ -448,7 +448,7 @@ class Dispatcher:
     def _worked_on(self, claim: Claim, slot: int, folder: Path) -> AttemptOutcome:
         """Return the outcome of an attempt, on this machine or another."""
         limits, lease = self._settings.limits, self._settings.lease_seconds
-        report = Reporter(self._jobs, claim, lease)
+        report = AttemptReporter(self._jobs, claim, lease)
         is_unwanted = self._stopping.is_set
         if self._engine is not None:
             task = claim, self._settings.store_url, limits
@@ -500,7 +500,7 @@ class Dispatcher:
         return sorted(os.sched_getaffinity(0))[slot :: self._settings.workers]
 
 
-class Reporter:
+class AttemptReporter:
     """Enters the messages of a worker, and renews the lease now and then without any.
 
     Events are kept for the next time while the database does not answer. Messages of earlier

@@ -15,14 +15,14 @@ from typing import Any
 
 from tuner.core.errors import RecordingError
 from tuner.core.runtime import THREAD_VARIABLES
-from tuner.service.settings import Limits, limit_process, size_in_words
+from tuner.service.settings import ServiceLimits, limit_process, size_in_words
 
 SPLIT_REMEDY = "split the recording, or leave topics out that are not needed (images, point clouds)"
 MAX_JSON_LETTERS = 1_000_000
 """letters of an inspection, which pages show"""
 
 
-def inspect(file: Path, limits: Limits) -> dict[str, Any]:
+def inspect(file: Path, limits: ServiceLimits) -> dict[str, Any]:
     """Return the JSON content of `tune inspect` on a recording.
 
     Raises

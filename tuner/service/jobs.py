@@ -29,8 +29,8 @@ from tuner.service.database import (
 )
 from tuner.service.errors import NotKnownError, NotNowError, TooManyError, shown, unknown_job
 from tuner.service.request import JobRequest, check_request, recording_name, stems
-from tuner.service.settings import Limits
-from tuner.service.shapes import CoefficientHistory, History, Point, iso
+from tuner.service.settings import ServiceLimits
+from tuner.service.shapes import CoefficientHistory, History, HistoryPoint, iso
 from tuner.vehicle.registry import mass_factor
 
 MAX_EVENTS = 20_000
@@ -268,7 +268,7 @@ _ID = re.compile("[0-9a-f]{16}")
 
 
 def submit(
-    database: Database, request: JobRequest, limits: Limits, *, submission: str | None = None
+    database: Database, request: JobRequest, limits: ServiceLimits, *, submission: str | None = None
 ) -> tuple[JobRow, bool]:
     """Enter a job, and return it and whether it is new.
 
@@ -335,7 +335,9 @@ def submit(
     return row, True
 
 
-def _recordings(session: Session, digests: Sequence[str], limits: Limits) -> list[RecordingRow]:
+def _recordings(
+    session: Session, digests: Sequence[str], limits: ServiceLimits
+) -> list[RecordingRow]:
     """Return the recordings of a request."""
     if len(digests) > limits.recordings_of_job:
         raise TooManyError(
@@ -568,7 +570,7 @@ def history(database: Database, vehicle: str) -> History:
         factor, ci95 = mass_factor(row.coefficient, masses.get(row.job), mass), None
         if row.lower is not None and row.upper is not None:
             ci95 = (factor * row.lower, factor * row.upper)
-        point = Point(
+        point = HistoryPoint(
             job=job.id,
             name=job.name,
             flown=iso(job.flown),

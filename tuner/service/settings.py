@@ -12,7 +12,7 @@ GIB = 2**30
 
 
 @dataclass(frozen=True)
-class Limits:
+class ServiceLimits:
     """Limits of one visitor, one recording and one job.
 
     Attributes
@@ -95,7 +95,7 @@ class ServiceSettings:
     lease_seconds: float = 30.0
     demands_tokens: bool = False
     hosts: tuple[str, ...] = ()
-    limits: Limits = field(default_factory=Limits)
+    limits: ServiceLimits = field(default_factory=ServiceLimits)
 
     @property
     def database_url(self) -> str:

@@ -120,7 +120,7 @@ class JobPage(BaseModel):
     next: str | None
 
 
-class Point(BaseModel):
+class HistoryPoint(BaseModel):
     """A coefficient as one job found it, with the flights behind it; times as ISO 8601.
 
     ``mass``, kg, is the job's own; what goes with the mass is at that of `History`.
@@ -142,7 +142,7 @@ class CoefficientHistory(BaseModel):
     """A coefficient over the jobs of a vehicle, in the order in which they were flown."""
 
     unit: str
-    points: list[Point]
+    points: list[HistoryPoint]
 
 
 class History(BaseModel):

@@ -23,7 +23,7 @@ from pydantic import BaseModel
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
 from tuner.service.request import CheckedRequest
-from tuner.service.settings import Limits, limit_process, size_in_words
+from tuner.service.settings import ServiceLimits, limit_process, size_in_words
 
 RESULT_FOLDER = Path("result")
 LOCK_FILE = ".lock"
@@ -53,7 +53,7 @@ class Assignment(BaseModel):
     flights: tuple[str, ...]
     asked: CheckedRequest
     cores: tuple[int, ...] = ()
-    limits: Limits = Limits()
+    limits: ServiceLimits = ServiceLimits()
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ import tuner
 from tuner.config import JobFile
 from tuner.core.errors import ConfigError
 from tuner.core.yaml_section import OTHER_FORM, PATTERN_PHRASES, Section, build, complaint, expected
-from tuner.engine.engine import JobQueue
+from tuner.engine.engine import BatchSystem
 from tuner.ground.plan import BenchFile
 from tuner.recordings.topics import TopicMap
 from tuner.vehicle import ControllerFile, VehicleFile
@@ -76,7 +76,7 @@ def complaints(model: type[BaseModel]) -> Iterator[Any]:
 
 def test_the_walk_meets_the_models_that_users_write():
     found = models()
-    assert {VehicleFile, ControllerFile, JobFile, BenchFile, TopicMap, JobQueue} <= set(found)
+    assert {VehicleFile, ControllerFile, JobFile, BenchFile, TopicMap, BatchSystem} <= set(found)
 
 
 @pytest.mark.parametrize("model", models(), ids=lambda kind: kind.__name__)

@@ -23,7 +23,7 @@ from tuner.exporters.sdf.model import (
 )
 from tuner.exporters.sdf.spans import (
     Edit,
-    Source,
+    ModelFile,
     append_child,
     apply_edits,
     parse,
@@ -581,7 +581,7 @@ def test_every_element_is_cut_out_whole(tree):
 
 
 def test_edits_that_overlap_are_our_mistake():
-    source = Source(PATH, "abcd", "abcd")
+    source = ModelFile(PATH, "abcd", "abcd")
     with pytest.raises(ValueError, match="overlap"):
         apply_edits("abcd", [Edit(source, 0, 2, ""), Edit(source, 1, 3, "")])
 

@@ -27,7 +27,7 @@ from tuner.recordings.flight import Flight, Series
 from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.unit_detection import READINGS, SCALAR_FIRST, Reading
+from tuner.recordings.unit_detection import READINGS, SCALAR_FIRST, SignalReading
 from tuner.search.job_flights import load_flights, read_recordings
 from tuner.vehicle import ControllerFile, read_vehicle
 
@@ -275,7 +275,9 @@ def of_markers(q: np.ndarray, heading: float) -> np.ndarray:
     [(name, row) for name in READINGS if name != "attitude" for row in READINGS[name]],
     ids=lambda value: getattr(value, "name", value),
 )
-def test_each_reading_of_the_table_is_recognised(signal: str, reading: Reading, seed: int) -> None:
+def test_each_reading_of_the_table_is_recognised(
+    signal: str, reading: SignalReading, seed: int
+) -> None:
     signals = flown_at_random(seed)
     attitude = Rotation.from_quat(signals["attitude"].values, scalar_first=True)
     right = signals[signal].values
@@ -289,7 +291,7 @@ def test_each_reading_of_the_table_is_recognised(signal: str, reading: Reading, 
 @pytest.mark.parametrize(
     "reading", [*READINGS["attitude"], SCALAR_FIRST], ids=lambda reading: reading.name
 )
-def test_each_reading_of_an_attitude_is_recognised(reading: Reading, seed: int) -> None:
+def test_each_reading_of_an_attitude_is_recognised(reading: SignalReading, seed: int) -> None:
     signals = flown_at_random(seed)
     right = signals["attitude"].values
     recorded = Series(TIME, AS_RECORDED[reading.name](right))

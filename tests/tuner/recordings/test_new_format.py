@@ -19,7 +19,7 @@ MODULE = '''
 import numpy as np
 
 from tuner.recordings.formats import Reader
-from tuner.recordings.recording import TABLE_TOPIC, ReadResult, Samples, TabularRecording
+from tuner.recordings.recording import TABLE_TOPIC, ReadResult, TabularRecording, TopicSamples
 
 
 class StructuredArray(TabularRecording):
@@ -31,7 +31,7 @@ class StructuredArray(TabularRecording):
         clock = self.clock(clocks)
         time = (self._rows[clock.field] * clock.nanoseconds).astype(np.int64)
         fields = {name: self._rows[name].astype(float) for name in wanted[TABLE_TOPIC]}
-        return ReadResult({TABLE_TOPIC: Samples(time, time, fields)})
+        return ReadResult({TABLE_TOPIC: TopicSamples(time, time, fields)})
 
 
 READER = Reader(

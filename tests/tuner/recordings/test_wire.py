@@ -13,7 +13,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tuner.recordings.ros.container import block_of
-from tuner.recordings.ros.messages import Block, Definitions, decode, missing_fields
+from tuner.recordings.ros.messages import Definitions, MessageBlock, decode, missing_fields
 
 TEXT = """
 uint8 first
@@ -91,7 +91,7 @@ def value(message: Any, path: str) -> float:
 DEFINITIONS = Definitions(Path("x"), {KIND: MessageDefinition(MessageDefinitionFormat.MSG, TEXT)})
 
 
-def decoded(block: Block, form: str) -> Any:
+def decoded(block: MessageBlock, form: str) -> Any:
     return decode(DEFINITIONS, KIND, FIELDS, block, aligned=form != "ros1")
 
 

@@ -20,12 +20,12 @@ import uvicorn
 from tests.tuner.service import serving
 from tests.tuner.service.serving import FAKE_WORKER
 from tuner.service import dispatcher, recordings
-from tuner.service.app import Connection, create_app
+from tuner.service.app import HttpConnection, create_app
 from tuner.service.service import Service
-from tuner.service.settings import Limits, ServiceSettings
+from tuner.service.settings import ServiceLimits, ServiceSettings
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
-LIMITS = Limits(free_bytes=0)
+LIMITS = ServiceLimits(free_bytes=0)
 
 
 @pytest.fixture(autouse=True)
@@ -92,7 +92,7 @@ class _Server(uvicorn.Server):
 def listening(service: Service) -> Iterator[httpx.Client]:
     """Serve from a thread, and yield a client of it."""
     config = uvicorn.Config(
-        create_app(service), host="127.0.0.1", port=0, http=Connection, log_level="warning",
+        create_app(service), host="127.0.0.1", port=0, http=HttpConnection, log_level="warning",
         server_header=False,
     )  # fmt: skip
     server = _Server(config)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tuner.service import dispatcher, recordings
 from tuner.service.app import serve
-from tuner.service.settings import Limits, ServiceSettings
+from tuner.service.settings import ServiceLimits, ServiceSettings
 
 ROOT = Path(__file__).parents[3]
 FAKE_WORKER = [sys.executable, "-S", str(Path(__file__).with_name("fake_worker.py"))]
@@ -34,6 +34,6 @@ def serve_at(port: int, data: Path, database: str, *, real: bool) -> None:
     if not real:
         dispatcher.WORKER, recordings.inspect = FAKE_WORKER, found_in_a_table
     settings = ServiceSettings(
-        data, database=database, limits=Limits(free_bytes=0), lease_seconds=3.0
+        data, database=database, limits=ServiceLimits(free_bytes=0), lease_seconds=3.0
     )
     serve(settings, host="127.0.0.1", port=port, say=lambda _: None)

@@ -7,12 +7,12 @@ import json
 import pytest
 
 from tuner.report.section import charts_json
-from tuner.service.shapes import CoefficientHistory, Point
+from tuner.service.shapes import CoefficientHistory, HistoryPoint
 from tuner.service.web.comparison import MAX_POINTS, history_chart, rmse_chart
 
 
-def point(best: float, half: float | None, name: str = "day") -> Point:
-    return Point(
+def point(best: float, half: float | None, name: str = "day") -> HistoryPoint:
+    return HistoryPoint(
         mass=None,
         job="0" * 16,
         name=name,

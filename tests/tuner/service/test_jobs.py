@@ -19,7 +19,7 @@ from tuner.report.outcome import outcome
 from tuner.result import RunResult
 from tuner.service import dispatcher, http, jobs
 from tuner.service.database import FileRow, JobRow, State
-from tuner.service.dispatcher import Reporter, put
+from tuner.service.dispatcher import AttemptReporter, put
 
 KEYS = {
     "id",
@@ -285,7 +285,7 @@ def test_what_happens_again_after_the_preamble_is_said_again(idle):
     jobs_queue = jobs.JobQueue(idle.database, "here", 60.0)
     for _ in range(3):
         claim = jobs_queue.claim()
-        Reporter(jobs_queue, claim, 60.0)([said, said, iteration, worse, said])
+        AttemptReporter(jobs_queue, claim, 60.0)([said, said, iteration, worse, said])
         jobs_queue.give_back(claim, message="gone")
     texts = [e.content["text"] for e in jobs.events(idle.database, row, kind="message")]
     again = ["a flight got worse", "the flights", "gone"]

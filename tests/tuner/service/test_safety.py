@@ -232,7 +232,7 @@ def test_the_server_bounds_headers_whatever_else_is_installed(settings, monkeypa
 
     monkeypatch.setattr(app._Server, "run", run)
     serve(replace(settings, workers=0), host="127.0.0.1", port=0, say=lambda _: None)
-    assert served == [app.Connection]  # not httptools, which takes headers of any length
+    assert served == [app.HttpConnection]  # not httptools, which takes headers of any length
 
 
 def test_a_request_whose_head_does_not_come_is_cut_off(client, monkeypatch):

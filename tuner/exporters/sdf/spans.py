@@ -25,7 +25,7 @@ MAX_DEPTH = 40
 
 
 @dataclass(frozen=True)
-class Source:
+class ModelFile:
     """A file of a model: its raw text, and the text to parse."""
 
     path: Path
@@ -49,7 +49,7 @@ class Element:
         Of an include that holds the included model: the pose, ``x y z roll pitch yaw``.
     """
 
-    source: Source
+    source: ModelFile
     tag: str
     attributes: Mapping[str, str]
     start: int
@@ -99,7 +99,7 @@ class Element:
 class Edit:
     """The replacement of a part of a file."""
 
-    source: Source
+    source: ModelFile
     start: int
     end: int
     text: str
@@ -124,7 +124,7 @@ def parse(text: str, path: Path, raw: str | None = None) -> Element:
     # One byte per character, so that the parser's byte positions are positions in the text.
     plain = re.sub(r"[^\x00-\x7f]", "x", without_comments(text))
     parser = expat.ParserCreate("utf-8")
-    source = Source(path, text if raw is None else raw, text)
+    source = ModelFile(path, text if raw is None else raw, text)
     top = Element(source, "", {}, 0, 0)
     open_elements = [top]
 

@@ -106,7 +106,7 @@ def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
     }
     inverse = np.linalg.inv(arrays["J"])
 
-    class Flying:
+    class DroneModelsBody:
         """As of `tuner.exporters.external_simulator.ExternalBody`."""
 
         def __init__(self, step: float) -> None:
@@ -144,7 +144,7 @@ def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
             self.state = state
             return state[ORDER], state[13:] * RAD_S_PER_RPM
 
-    return flier_of(Flying)
+    return flier_of(DroneModelsBody)
 
 
 DRONE_MODELS = Simulator(

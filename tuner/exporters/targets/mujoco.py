@@ -165,7 +165,7 @@ def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
         ) from None
     count, constant = len(vehicle.rotors), vehicle.aerodynamics.motor_constant
 
-    class Flying:
+    class MujocoBody:
         """As of `tuner.exporters.external_simulator.ExternalBody`."""
 
         def __init__(self, step: float) -> None:
@@ -185,7 +185,7 @@ def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
             state = np.concatenate([qpos[:3], qvel[:3], qpos[3:7], qvel[3:6]])
             return state, self.data.act[:count] / constant
 
-    return flier_of(Flying)
+    return flier_of(MujocoBody)
 
 
 MUJOCO = Simulator(

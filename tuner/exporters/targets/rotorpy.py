@@ -77,7 +77,7 @@ def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
         "rotor_speed_max": 10.0 * params["rotor_speed_max"],  # what is asked for is in its range
     }
 
-    class Flying:
+    class RotorPyBody:
         """As of `tuner.exporters.external_simulator.ExternalBody`."""
 
         def __init__(self, step: float) -> None:
@@ -95,7 +95,7 @@ def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
             x, v, q, w = (self.state[key] for key in "xvqw")
             return np.concatenate([x, v, q[[3, 0, 1, 2]], w]), self.state["rotor_speeds"]
 
-    return flier_of(Flying)
+    return flier_of(RotorPyBody)
 
 
 ROTORPY = Simulator(

@@ -35,7 +35,7 @@ from tuner.recordings.ros.container import (
     RecordContent,
     unsigned,
 )
-from tuner.recordings.ros.messages import Block, Bytes, Index
+from tuner.recordings.ros.messages import Bytes, Index, MessageBlock
 
 MESSAGE, INDEX, CHUNK, CONNECTION = 2, 4, 5, 7
 
@@ -86,7 +86,7 @@ class Bag1(ChunkedFile):
         entries = np.frombuffer(content, dtype="<u4").reshape(-1, 3).astype(np.int64)
         return entries[:, 0] * NS_PER_SECOND + entries[:, 1], entries[:, 2]
 
-    def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
+    def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> MessageBlock:
         length = len(content)
         inside = (offset >= 0) & (offset + 4 <= length)
         offset, time = offset[inside], time[inside]
@@ -96,7 +96,7 @@ class Bag1(ChunkedFile):
         start = offset + 8 + size
         end = start + unsigned(content, start - 4, 4)
         inside = (end <= length) & _is_of(content, number, offset + 4, size)
-        return Block(content, start[inside], end[inside], time[inside])
+        return MessageBlock(content, start[inside], end[inside], time[inside])
 
 
 Header = dict[bytes, bytes]

@@ -16,7 +16,7 @@ import numpy as np
 from rosbags.interfaces import MessageDefinition
 
 from tuner.recordings.notes import Cause, Damage
-from tuner.recordings.ros.messages import Block, Bytes, Index
+from tuner.recordings.ros.messages import Bytes, Index, MessageBlock
 
 #: A larger chunk is not unpacked: those of cameras and lidars are far smaller.
 MAX_CHUNK_BYTES = 128 << 20
@@ -79,7 +79,7 @@ class Container(ABC):
     damage: list[Damage] = field(default_factory=list)
 
     @abstractmethod
-    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
+    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, MessageBlock]]:
         """Yield the messages of some connections, each block of one connection."""
 
 
@@ -127,12 +127,12 @@ def unsigned(buffer: Bytes, at: Index, size: int) -> Index:
     return np.asarray(spread.view(f"<u{size}")[:, 0].astype(np.int64), dtype=np.int64)
 
 
-def block_of(times: Sequence[int], payloads: Sequence[bytes]) -> Block:
+def block_of(times: Sequence[int], payloads: Sequence[bytes]) -> MessageBlock:
     """Return messages as one block."""
     lengths = np.array([len(payload) for payload in payloads], dtype=np.int64)
     end = np.cumsum(lengths)
     content = np.frombuffer(b"".join(payloads), dtype=np.uint8)
-    return Block(content, end - lengths, end, np.array(times, dtype=np.int64))
+    return MessageBlock(content, end - lengths, end, np.array(times, dtype=np.int64))
 
 
 Entries = Mapping[int, tuple[Index, Index]]
@@ -220,10 +220,10 @@ class ChunkedFile(Container):
         """
 
     @abstractmethod
-    def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
+    def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> MessageBlock:
         """Return the payloads of a connection's messages from the offsets of their records."""
 
-    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
+    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, MessageBlock]]:
         """Yield the messages of some connections, chunk by chunk."""
         lost: list[Chunk] = []
         with self.path.open("rb") as stream:
@@ -250,7 +250,9 @@ class ChunkedFile(Container):
                 )
             )
 
-    def _locate(self, data: FileBytes, chunk: Chunk, wanted: list[int]) -> list[tuple[int, Block]]:
+    def _locate(
+        self, data: FileBytes, chunk: Chunk, wanted: list[int]
+    ) -> list[tuple[int, MessageBlock]]:
         """Return the blocks of a chunk, by the index after it or by a walk."""
         entries = chunk.entries or self._index(data, chunk) or self._walked(data, chunk)[0].entries
         if chunk.packed or chunk.length < 4 * MAX_READ_GAP_BYTES:

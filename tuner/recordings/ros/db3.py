@@ -23,7 +23,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.container import MAX_CHUNK_BYTES, Connection, Container, block_of
-from tuner.recordings.ros.messages import Block
+from tuner.recordings.ros.messages import MessageBlock
 
 #: Messages and bytes that are decoded together.
 MESSAGES_PER_BLOCK = 16384
@@ -63,7 +63,7 @@ class Db3(Container):
         if not self.connections:
             raise RecordingError(self.path, "holds no ROS messages", "record it again")
 
-    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
+    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, MessageBlock]]:
         """Yield the messages of some connections, some thousands at a time, in one pass."""
         marks = ", ".join("?" for _ in wanted)
         rows = self._rows(

@@ -32,7 +32,7 @@ from tuner.recordings.ros.container import (
     RecordContent,
     unsigned,
 )
-from tuner.recordings.ros.messages import Block, Bytes, Index
+from tuner.recordings.ros.messages import Bytes, Index, MessageBlock
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX = 0x03, 0x04, 0x05, 0x06, 0x07
@@ -119,13 +119,13 @@ class Mcap(ChunkedFile):
         entries = np.frombuffer(content, dtype="<i8").reshape(-1, 2)
         return entries[:, 0].copy(), entries[:, 1].copy()
 
-    def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
+    def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> MessageBlock:
         inside = (offset >= 0) & (offset + MESSAGE_HEAD_BYTES <= len(content))
         offset, time = offset[inside], time[inside]
         end = offset + 9 + unsigned(content, offset + 1, 8)
         inside = (content[offset] == MESSAGE) & (unsigned(content, offset + 9, 2) == number)
         inside &= (end >= offset + MESSAGE_HEAD_BYTES) & (end <= len(content))
-        return Block(content, offset[inside] + MESSAGE_HEAD_BYTES, end[inside], time[inside])
+        return MessageBlock(content, offset[inside] + MESSAGE_HEAD_BYTES, end[inside], time[inside])
 
 
 def records(data: Content, at: int) -> Iterator[tuple[int, int, int]]:

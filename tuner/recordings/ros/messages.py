@@ -249,7 +249,7 @@ _NUMPY_KINDS = dict.fromkeys(("bool", "byte", "char", "octet"), "u1") | {
 
 
 @dataclass(frozen=True)
-class Block:
+class MessageBlock:
     """Messages of one connection that lie in one buffer.
 
     Attributes
@@ -278,12 +278,17 @@ def missing_fields(definitions: Definitions, kind: str, fields: Sequence[str]) -
     """
     nothing, empty = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.uint8)
     walker = _Walker(definitions, set(fields), empty, np.ones(0, dtype=np.bool_))
-    walker.walk((Nodetype.NAME, kind), "", _Messages(nothing, nothing, nothing), 0, 0)
+    walker.walk((Nodetype.NAME, kind), "", _MessageSpans(nothing, nothing, nothing), 0, 0)
     return tuple(path for path in dict.fromkeys(fields) if path in walker.wanted)
 
 
 def decode(
-    definitions: Definitions, kind: str, fields: Sequence[str], block: Block, *, aligned: bool
+    definitions: Definitions,
+    kind: str,
+    fields: Sequence[str],
+    block: MessageBlock,
+    *,
+    aligned: bool,
 ) -> tuple[dict[str, NDArray[Any]], NDArray[np.bool_]]:
     """Return the wanted fields of a block's messages, (n,) each, and which messages were whole.
 
@@ -312,7 +317,7 @@ def decode(
             continue
         every = np.ones(len(rows), dtype=np.bool_)
         walker = _Walker(definitions, set(fields), block.buffer, every, order, aligned)
-        messages = _Messages(block.start[rows] + head, block.end[rows], np.arange(len(rows)))
+        messages = _MessageSpans(block.start[rows] + head, block.end[rows], np.arange(len(rows)))
         walker.walk((Nodetype.NAME, kind), "", messages, 0, 0)
         whole[rows] = walker.whole
         for name, values in walker.columns.items():
@@ -322,16 +327,16 @@ def decode(
 
 
 @dataclass(frozen=True)
-class _Messages:
+class _MessageSpans:
     """Start, end and row of some messages in a buffer; (n,) each."""
 
     start: Index
     end: Index
     rows: Index
 
-    def of(self, which: NDArray[Any]) -> _Messages:
+    def of(self, which: NDArray[Any]) -> _MessageSpans:
         """Return some of them."""
-        return _Messages(self.start[which], self.end[which], self.rows[which])
+        return _MessageSpans(self.start[which], self.end[which], self.rows[which])
 
 
 @dataclass
@@ -361,7 +366,7 @@ class _Walker:
     columns: dict[str, NDArray[Any]] = field(default_factory=dict)
     steps_left: int = 100_000
 
-    def walk(self, what: Any, path: str, of: _Messages, cursor: Cursor, depth: int) -> Cursor:
+    def walk(self, what: Any, path: str, of: _MessageSpans, cursor: Cursor, depth: int) -> Cursor:
         """Walk through one value at an offset from the messages' starts; return the next offset.
 
         Parameters
@@ -401,13 +406,13 @@ class _Walker:
             )
         return cursor
 
-    def _stop(self, of: _Messages) -> None:
+    def _stop(self, of: _MessageSpans) -> None:
         """Stop the walk at a part of the type that cannot be visited."""
         self.steps_left = 0
         self.whole[of.rows] = False
 
     def _numbers(
-        self, kind: str, names: Mapping[int, str], count: int, of: _Messages, cursor: Cursor
+        self, kind: str, names: Mapping[int, str], count: int, of: _MessageSpans, cursor: Cursor
     ) -> Cursor:
         """Walk through numbers of one kind; ``names`` maps positions among them to paths."""
         size = int(kind[1])
@@ -418,7 +423,7 @@ class _Walker:
                 self._put(path, self._take(at, of.end, kind, of.rows), of)
         return cursor + count * size
 
-    def _sequence(self, kind: str, path: str, of: _Messages, cursor: Cursor) -> Cursor:
+    def _sequence(self, kind: str, path: str, of: _MessageSpans, cursor: Cursor) -> Cursor:
         """Walk through a sequence of numbers after its count; a string is one of bytes."""
         count, cursor = self._length(of, cursor)
         size = int(kind[1])
@@ -437,7 +442,7 @@ class _Walker:
         return self._advance(cursor, count * size, of)
 
     def _structures(
-        self, element: Any, path: str, of: _Messages, cursor: Cursor, depth: int
+        self, element: Any, path: str, of: _MessageSpans, cursor: Cursor, depth: int
     ) -> Cursor:
         """Walk through a sequence of structures or strings after its count."""
         counts, cursor = self._length(of, cursor)
@@ -458,12 +463,12 @@ class _Walker:
         digits = {name.partition("]")[0] for name in names}
         return sorted(int(index) for index in digits if index.isdecimal() and len(index) < 6)
 
-    def _length(self, of: _Messages, cursor: Cursor) -> tuple[Index, Cursor]:
+    def _length(self, of: _MessageSpans, cursor: Cursor) -> tuple[Index, Cursor]:
         cursor = self._align(cursor, 4)
         length = self._take(of.start + cursor, of.end, "u4", of.rows).astype(np.int64)
         return length, cursor + 4
 
-    def _advance(self, cursor: Cursor, by: Index, of: _Messages) -> Cursor:
+    def _advance(self, cursor: Cursor, by: Index, of: _MessageSpans) -> Cursor:
         """Move the cursor on by lengths from the file; it stays one number if all agree."""
         if len(by) == 0:
             return cursor
@@ -492,7 +497,7 @@ class _Walker:
         spread = self.buffer[at[:, None] + np.arange(size)]
         return np.asarray(spread.view(self.order + kind)[:, 0])
 
-    def _put(self, path: str, values: NDArray[Any], of: _Messages) -> None:
+    def _put(self, path: str, values: NDArray[Any], of: _MessageSpans) -> None:
         self.wanted.discard(path)
         if len(of.rows) == len(self.whole):
             self.columns[path] = values

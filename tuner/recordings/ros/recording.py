@@ -28,8 +28,8 @@ from tuner.recordings.recording import (
     Nanoseconds,
     ReadResult,
     Recording,
-    Samples,
     Topic,
+    TopicSamples,
 )
 from tuner.recordings.ros.bag1 import Bag1
 from tuner.recordings.ros.container import (
@@ -45,9 +45,9 @@ from tuner.recordings.ros.db3 import Db3
 from tuner.recordings.ros.mcap import Mcap
 from tuner.recordings.ros.messages import (
     FIELD_LAYOUTS,
-    Block,
     Definitions,
     Fields,
+    MessageBlock,
     decode,
     missing_fields,
 )
@@ -95,7 +95,7 @@ class Folder(Container):
             for number, c in self.connections.items()
         }
 
-    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
+    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, MessageBlock]]:
         """Yield the messages of some connections, file by file."""
         for i, container in enumerate(self._files):
             here = {inner: n for n, (file, inner) in self._numbers.items() if file == i}
@@ -145,7 +145,7 @@ class Folder(Container):
         return target
 
 
-def unpacked_block(block: Block) -> Block:
+def unpacked_block(block: MessageBlock) -> MessageBlock:
     """Unpack messages that were compressed one by one, up to `MAX_CHUNK_BYTES` bytes.
 
     A damaged one becomes empty.
@@ -243,7 +243,7 @@ class RosRecording(Recording):
         for connection in self._container.connections.values():
             if connection.topic in wanted and connection.count:
                 plans[connection.id] = self._plan(connection, wanted[connection.topic], clocks)
-        parts: dict[str, list[Samples]] = {name: [] for name in wanted}
+        parts: dict[str, list[TopicSamples]] = {name: [] for name in wanted}
         broken: dict[str, int] = dict.fromkeys(wanted, 0)
         for number, block in self._container.blocks(plans):
             (fields, clock), source = plans[number], self._container.connections[number]
@@ -281,7 +281,7 @@ def _samples(
     whole: NDArray[np.bool_],
     receive: Nanoseconds,
     clock: Clock | None,
-) -> Samples:
+) -> TopicSamples:
     kept = {name: values[whole] for name, values in columns.items()}
     stamp = None
     if clock is not None:
@@ -289,14 +289,14 @@ def _samples(
     elif _SECONDS in kept:
         seconds = kept.pop(_SECONDS).astype(np.int64)
         stamp = seconds * NS_PER_SECOND + kept.pop(_NANOSECONDS).astype(np.int64)
-    return Samples(
+    return TopicSamples(
         receive[whole], stamp, {name: values.astype(np.float64) for name, values in kept.items()}
     )
 
 
-def _joined(parts: list[Samples]) -> Samples:
+def _joined(parts: list[TopicSamples]) -> TopicSamples:
     stamps = [part.stamp for part in parts if part.stamp is not None]
-    return Samples(
+    return TopicSamples(
         np.concatenate([part.receive for part in parts]),
         np.concatenate(stamps) if len(stamps) == len(parts) else None,
         {name: np.concatenate([part.fields[name] for part in parts]) for name in parts[0].fields},

@@ -21,7 +21,7 @@ from tuner.vehicle.registry import mass_factor
 
 
 @dataclass(frozen=True)
-class Pair:
+class CoefficientPair:
     """A coefficient of two jobs.
 
     Attributes
@@ -98,7 +98,7 @@ def mass_of(result: RunResult) -> float | None:
     return result.coefficients["mass"].best if "mass" in result.coefficients else None
 
 
-def pairs(a: RunResult, b: RunResult) -> list[Pair]:
+def pairs(a: RunResult, b: RunResult) -> list[CoefficientPair]:
     """Return the coefficients of both, at the first's mass, those first that lie furthest apart."""
     masses = mass_of(b), mass_of(a)
     both = [
@@ -109,11 +109,11 @@ def pairs(a: RunResult, b: RunResult) -> list[Pair]:
     return sorted(both, key=lambda pair: -(pair.sigmas or 0.0))
 
 
-def _pair(name: str, a: CoefficientResult, b: CoefficientResult, factor: float) -> Pair:
+def _pair(name: str, a: CoefficientResult, b: CoefficientResult, factor: float) -> CoefficientPair:
     scaled_error = None if b.std_error is None else factor * b.std_error
     b = b.model_copy(update={"best": factor * b.best, "std_error": scaled_error})
     error = math.hypot(a.std_error or 0.0, b.std_error or 0.0)
-    return Pair(
+    return CoefficientPair(
         name,
         a,
         b,
