@@ -68,6 +68,8 @@ CACHE_BYTES = 2**18
 MIN_STEPS_OF_TWO_VECTORS = 2**22
 """Lanes times turns from which a block without columns is two vectors wide, where LLVM optimises:
 one computes while one waits. Fewer take less time than another kernel's compilation."""
+FEW_LANES_BYTES = 32
+"""bytes of a vector for few lanes: in wider ones, empty lanes would take memory and time."""
 COLUMNS_OF_VALUES = 3
 """Columns that take as long as the values and the factors that columns share."""
 MAX_BLOCKS_ON_ONE_THREAD = 512
@@ -149,6 +151,8 @@ class Program:
         ``packages``: a program that is kept is then not traced again. None traces it.
     packages
         Whose code it runs.
+    few_lanes
+        Whether vectors are at most `FEW_LANES_BYTES` wide, as lanes do not fill wider ones.
     """
 
     def __init__(
@@ -159,6 +163,7 @@ class Program:
         name: str = "",
         made_of: Any = None,
         packages: tuple[str, ...] = (),
+        few_lanes: bool = False,
     ) -> None:
         self.function, self.name = function, name or getattr(function, "__name__", "function")
         leaves, structure = jax.tree.flatten(
@@ -172,6 +177,8 @@ class Program:
         self.moving = tuple(number for number, a in enumerate(leaves) if a.moves)
         names = {length for a in leaves for length in a.shape if isinstance(length, str)}
         self.names = tuple(sorted(names))
+        widest = FEW_LANES_BYTES if few_lanes else register_bytes()
+        self.vector_bytes = min(register_bytes(), widest)
         self._kernels: dict[int, _Compiled | None] = {}
         self._builds = Lock()
         #: Of `program_of`: what makes it again in another process, and its arguments.
@@ -254,7 +261,7 @@ class Program:
             ),
             default=8,
         )
-        return max(vectors * register_bytes() // widest, 1)
+        return max(vectors * self.vector_bytes // widest, 1)
 
     def _kernel(self, steps: int = 1) -> _Compiled | None:
         """Return the kernel for so many lanes times turns; None where something has no rule."""

@@ -21,7 +21,7 @@ import lanes.linear as lanes_linear
 import lanes.program
 from lanes import Argument, Program, dependent, joined, keep_code_in
 from lanes.lowering import LINE_BYTES
-from lanes.machine import object_code
+from lanes.machine import object_code, register_bytes
 
 RANDOM = np.random.default_rng(1)
 
@@ -104,6 +104,17 @@ def test_many_lanes_in_wider_blocks_give_what_few_do(monkeypatch, real, turns):
         jax.tree.leaves(wide.values), jax.tree.leaves(narrow.values), strict=True
     ):
         np.testing.assert_allclose(many[-5:], some, rtol=1e-14)
+
+
+@pytest.mark.parametrize("count", [1, 3, 9])
+def test_a_program_for_few_lanes_gives_what_others_do(monkeypatch, count):
+    monkeypatch.setattr(lanes.program, "FEW_LANES_BYTES", 16)
+    values, tangents = given(count, 7)
+    few, many = (Program(filtered, ARGUMENTS, few_lanes=own) for own in (True, False))
+    found = [flat(each(values, tangents, lanes=count, turns=7)) for each in (few, many)]
+    assert [few._kernel().width, many._kernel().width] == [2, register_bytes() // 8]
+    for mine, theirs in zip(*found, strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-14)
 
 
 def test_values_beside_derivatives_are_summed_up_in_the_order_that_is_written():

@@ -47,6 +47,8 @@ GATE_GROWTH = 4.0
 """Factor on the gate for each outlier in a row."""
 MAX_GATE_STEPS = 5
 """Outliers in a row after which the gate stays the same."""
+FEW_FLIGHTS = 4
+"""Flights up to which vectors for few lanes take less time."""
 MIN_VARIANCE = 1e-12
 """Least variance of a gust, (m/s)²: a thrust's mean over none has no slope at rest."""
 
@@ -159,6 +161,7 @@ def filtered(
     *,
     gains: bool = True,
     latency: float = 0.0,
+    few: bool = False,
 ) -> Filtered:
     """Return Kalman gains, innovations, and their likelihood.
 
@@ -171,10 +174,13 @@ def filtered(
     latency
         Largest latency of commands so far, s. Corrections of commands that have arrived have no
         effect: with the same number in flight, one program serves all filters.
+    few
+        Whether no more than `FEW_FLIGHTS` were recorded, though they may be filtered several times.
     """
     short, in_flight = _shortly_delayed(_undelayed(schedule), assumed, latency)
     wanted = (*[True] * 3, *[gains] * 3)
-    *rows, gain, factors, draught = _run((short, in_flight), _given(inputs, assumed), wanted).values
+    run = _run((short, in_flight), _given(inputs, assumed), wanted, few=few)
+    *rows, gain, factors, draught = run.values
     white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)
     kept = Gains(gain, factors, draught, schedule.physics_rate) if gains else None
     return Filtered(white, root, loss, kept)
@@ -208,7 +214,8 @@ def innovations(
         names = sorted(assumed.coefficients)  # the order of the leaves
         moved = [tangents["offsets"], *(tangents.get(name, still) for name in names)]
     wanted = ((True, False), (False, True)) if moved and len(moved[0]) else (True, False)
-    run = _run((_undelayed(schedule),), _given(inputs, assumed, gains), wanted, moved)
+    few = inputs.offsets.shape[-1] <= FEW_FLIGHTS
+    run = _run((_undelayed(schedule),), _given(inputs, assumed, gains), wanted, moved, few=few)
     return np.moveaxis(run.values[0], 0, -1), run.columns and run.columns[1]
 
 
@@ -239,6 +246,8 @@ def _run(
     given: _Given,
     wanted: Any,
     tangents: list[NDArray[np.float64]] | None = None,
+    *,
+    few: bool,
 ) -> Run:
     """Simulate all segments with given gains; without any, filter them."""
 
@@ -276,6 +285,7 @@ def _run(
         name=kind,
         made_of=(kind, static, moves, terms.TERMS),
         packages=CODE,
+        few_lanes=few,
     )
     count, ticks = inputs.offsets.shape[-1], len(given.order)
     return program(given, tangents, lanes=count, turns=ticks, wanted=wanted)

@@ -30,7 +30,13 @@ from tuner.disturbances.disturbances import (
     MIN_STRENGTHS,
     STRENGTHS,
 )
-from tuner.disturbances.extended_kalman_filter import GATE, Filtered, filtered, innovations
+from tuner.disturbances.extended_kalman_filter import (
+    FEW_FLIGHTS,
+    GATE,
+    Filtered,
+    filtered,
+    innovations,
+)
 from tuner.disturbances.observer import CHANNELS, AssumedModel, FilterInput
 from tuner.disturbances.ticks import (
     FLIGHT_CONTROLLER,
@@ -223,7 +229,7 @@ class Predictor:
             tiled = jax.tree.map(lambda rows, those=segments: np.asarray(rows)[..., those], inputs)
             of_segments = np.tile(strengths, len(segments) // times)
             assumed = self._assumed(objective, point, of_segments)
-            found.append(filtered(self.schedule, tiled, assumed, gains=False, latency=self.latency))
+            found.append(self._filtered(tiled, assumed, self.latency, gains=False))
         all_of = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *found)
         for number in range(times):
             yield all_of.first(ticks, slice(number, None, times))
@@ -297,8 +303,14 @@ class Predictor:
         inputs = self._inputs_at(point)
         assumed = self._assumed(objective, point)
         latency = max(float(assumed.coefficients["actuator_latency"]), self.latency)
-        found = filtered(self.schedule, inputs, assumed, latency=latency)
+        found = self._filtered(inputs, assumed, latency)
         return replace(self, inputs=inputs, found=found, latency=latency)
+
+    def _filtered(
+        self, inputs: FilterInput, assumed: AssumedModel, latency: float, *, gains: bool = True
+    ) -> Filtered:
+        few = self.inputs.offsets.shape[-1] <= FEW_FLIGHTS
+        return filtered(self.schedule, inputs, assumed, gains=gains, latency=latency, few=few)
 
     @property
     def ticks(self) -> int:
