@@ -424,9 +424,12 @@ def _innovations(
         carried = after, pushed * observer.processes.retention, before, beyond
         return carried, (white, white.astype(jnp.float32))
 
+    # what moves later has a derivative from the beginning: jax differentiates the loop once
+    still = 0.0 * first.motion.position.x
+    first = replace(first, gyro=jax.tree.map(lambda number: number + still, first.gyro))
     begin = (
         first,
-        jnp.zeros(PROCESSES),
+        jnp.zeros(PROCESSES) + still,
         observer.outputs(first, jnp.asarray(0)),
         jnp.zeros(wide, int),
     )
