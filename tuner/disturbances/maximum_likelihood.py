@@ -49,6 +49,9 @@ MIN_SHIFT = 0.25
 again: what smaller ones gain is of strengths too small to be seen."""
 NEAR_GAIN, FINAL_GAIN = 1.0, 0.3
 """Predicted gains below which a step is taken untested, and below which it is the last."""
+FINAL_SHIFT = 0.1
+"""Shift below which a step is the last; one below `MIN_SHIFT` is, too, where it gained less than
+`NEAR_GAIN`. Strengths near zero gain a little in each step."""
 
 
 def maximise_likelihood(
@@ -83,10 +86,15 @@ def maximise_likelihood(
             break
         predictor = predictor.without_gains  # memory holds those of one point
         gain, before = equations.gain(change), gain
+        loss = _loss(predictor, objective, point, criterion)
         lower = _descent(equations, predictor, objective, point, criterion, near=gain < NEAR_GAIN)
         if lower is None:
             return predictor.at(objective, point), point
         if gain < FINAL_GAIN or 0.5 * before < gain < NEAR_GAIN:  # they shrink no more
+            return lower
+        shift = equations.shift(change)
+        gained = loss - _loss(lower[0], objective, lower[1], criterion)
+        if shift < (MIN_SHIFT if gained < NEAR_GAIN else FINAL_SHIFT):
             return lower
         predictor, point = lower
         del lower
