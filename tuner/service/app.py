@@ -12,7 +12,6 @@ from http import HTTPStatus
 from types import FrameType
 
 import uvicorn
-from anyio import CapacityLimiter
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -29,14 +28,12 @@ from tuner.service import tokens
 from tuner.service.errors import ServiceError, over_http
 from tuner.service.http import api, watching
 from tuner.service.safety import Guard
-from tuner.service.service import Metrics, Service
+from tuner.service.service import Service
 from tuner.service.settings import ServiceSettings
 from tuner.service.shapes import API, Problem
 from tuner.service.web.pages import render, web
 
 logger = logging.getLogger(__name__)
-
-MAX_INSPECTIONS = 2
 
 
 def create_app(service: Service) -> FastAPI:
@@ -59,9 +56,6 @@ def create_app(service: Service) -> FastAPI:
         lifespan=lifespan,
     )
     app.state.service = service
-    app.state.metrics = Metrics(service)
-    app.state.uploads = CapacityLimiter(service.settings.limits.uploads_at_once)
-    app.state.inspections = CapacityLimiter(MAX_INSPECTIONS)
     app.include_router(api)
     app.include_router(watching)
     app.include_router(web)
@@ -69,7 +63,7 @@ def create_app(service: Service) -> FastAPI:
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http)
     app.add_exception_handler(Exception, _fault)
-    app.add_middleware(Guard, service=service, metrics=app.state.metrics, refuse=refused)
+    app.add_middleware(Guard, service=service, refuse=refused)
     return app
 
 

@@ -34,7 +34,7 @@ from tuner.service.jobs import history
 from tuner.service.recordings import FORM_FIELD, Upload, receive
 from tuner.service.request import JobRequest
 from tuner.service.safety import REPORT_POLICY
-from tuner.service.service import Metrics, Service
+from tuner.service.service import Service
 from tuner.service.shapes import (
     API,
     Accepted,
@@ -160,14 +160,7 @@ def service_of(request: Request) -> Service:
     return service
 
 
-def metrics_of(request: Request) -> Metrics:
-    """Return the counters of the service."""
-    metrics: Metrics = request.app.state.metrics
-    return metrics
-
-
 ServiceOfApp = Annotated[Service, Depends(service_of)]
-MetricsOfApp = Annotated[Metrics, Depends(metrics_of)]
 
 
 def job_of(service: ServiceOfApp, job: str) -> JobRow:
@@ -186,10 +179,9 @@ async def upload(request: Request) -> tuple[RecordingRow, bool]:
     InputError
         It cannot be taken; one line says why.
     """
-    service, metrics = service_of(request), metrics_of(request)
-    uploads: anyio.CapacityLimiter = request.app.state.uploads
+    service = service_of(request)
     try:
-        uploads.acquire_nowait()
+        service.uploads.acquire_nowait()
     except anyio.WouldBlock:
         raise TooManyError(
             "the server", "is receiving too many recordings", "try again in a minute"
@@ -198,11 +190,11 @@ async def upload(request: Request) -> tuple[RecordingRow, bool]:
         parts = (service.database, service.store, service.settings)
         await anyio.to_thread.run_sync(recordings.check_space, *parts)
         whole = await _received(request)
-        metrics.uploaded.inc(whole.size)
-        async with request.app.state.inspections:
+        service.metrics.uploaded.inc(whole.size)
+        async with service.inspections:
             return await anyio.to_thread.run_sync(recordings.store_recording, *parts, whole)
     finally:
-        uploads.release()
+        service.uploads.release()
 
 
 async def _received(request: Request) -> Upload:
@@ -396,6 +388,6 @@ def healthz(service: ServiceOfApp) -> Response:
         **{status: PROBLEMS[status] for status in (401, 403, 429)},
     },
 )
-def metrics(counted: MetricsOfApp) -> Response:
+def metrics(service: ServiceOfApp) -> Response:
     """Return counters for Prometheus."""
-    return Response(counted.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+    return Response(service.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import CursorResult, func, insert, select, update
+from sqlalchemy import ColumnElement, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session, selectinload, undefer
 
@@ -135,7 +135,7 @@ class JobQueue:
         """Enter an attempt's events, and renew its lease; False if it holds the job no more."""
         with self._database.writing() as session:
             lease = time.time() + self._lease
-            if not _update(session, claim, {**_progress(dict(events)), "lease": lease}):
+            if _change(session, {**_progress(dict(events)), "lease": lease}, *_held(claim)) is None:
                 return False
             for kind, content in events:
                 if kind != "checkpoint":
@@ -154,7 +154,7 @@ class JobQueue:
                 "seconds_left": 0.0 if outcome.state == State.DONE else None,
                 **UNCLAIMED,
             }
-            if not _update(session, claim, ending):
+            if _change(session, ending, *_held(claim)) is None:
                 return False
             for table, rows in ((FileRow, outcome.files), (PointRow, outcome.points)):
                 if rows:
@@ -172,10 +172,9 @@ class JobQueue:
                 "seconds_left": None,
                 **UNCLAIMED,
             }
-            if not _update(session, claim, waiting):
+            if _change(session, waiting, *_held(claim)) is None:
                 return False
-            add_event(session, claim.number, "message", {"text": message})
-            add_event(session, claim.number, "state", {"state": State.QUEUED})
+            _say_queued(session, claim.number, message)
             return True
 
     def recover(self, *, own: bool) -> int:
@@ -198,8 +197,7 @@ class JobQueue:
             for row in rows:
                 row.state, row.seconds_left = State.QUEUED, None
                 row.claim = row.owner = row.lease = None
-                add_event(session, row.number, "message", {"text": text})
-                add_event(session, row.number, "state", {"state": State.QUEUED})
+                _say_queued(session, row.number, text)
             return len(rows)
 
 
@@ -231,31 +229,33 @@ def _progress(latest: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 UNCLAIMED = {"claim": None, "owner": None, "lease": None}
 
 
-def _update(session: Session, claim: Claim, values: Mapping[str, Any]) -> bool:
-    """Change the row of a job if the claim still holds it."""
-    statement = (
-        update(JobRow)
-        .where(
-            JobRow.number == claim.number, JobRow.claim == claim.word, JobRow.state == State.RUNNING
-        )
-        .values(**values)
-        .execution_options(synchronize_session=False)
+def _held(claim: Claim) -> tuple[ColumnElement[bool], ...]:
+    """Return the conditions that an attempt still holds its job."""
+    return (
+        JobRow.number == claim.number,
+        JobRow.claim == claim.word,
+        JobRow.state == State.RUNNING,
     )
-    done = session.execute(statement)
-    assert isinstance(done, CursorResult)
-    return done.rowcount == 1
+
+
+def _change(
+    session: Session, values: Mapping[str, Any], *conditions: ColumnElement[bool]
+) -> int | None:
+    """Change the row of the job that fulfils conditions; return its events, None without one."""
+    statement = update(JobRow).where(*conditions).values(**values).returning(JobRow.events)
+    return session.scalar(statement.execution_options(synchronize_session=False))
+
+
+def _say_queued(session: Session, job: int, message: str) -> None:
+    """Add to a job that it waits again, and why."""
+    add_event(session, job, "message", {"text": message})
+    add_event(session, job, "state", {"state": State.QUEUED})
 
 
 def add_event(session: Session, job: int, kind: str, content: Mapping[str, Any]) -> None:
     """Add an event to a job; the row of the job orders those who add at the same time."""
     session.flush()
-    number = session.scalar(
-        update(JobRow)
-        .where(JobRow.number == job)
-        .values(events=JobRow.events + 1)
-        .returning(JobRow.events)
-        .execution_options(synchronize_session=False)
-    )
+    number = _change(session, {"events": JobRow.events + 1}, JobRow.number == job)
     assert number is not None
     if number <= MAX_EVENTS * (2 if kind in ("message", "state") else 1):
         row = {"job": job, "number": number, "kind": kind, "content": dict(content)}
@@ -496,14 +496,10 @@ def _move(
     """Change a job that is in one of some states."""
     with database.writing() as session:
         row = _row(session, name)
-        moved = session.scalar(
-            update(JobRow)
-            .where(JobRow.number == row.number, JobRow.state.in_(allowed))
-            .values(**changes)
-            .returning(JobRow.number)
-            .execution_options(synchronize_session=False)
-        )
-        if moved is None:
+        if (
+            _change(session, changes, JobRow.number == row.number, JobRow.state.in_(allowed))
+            is None
+        ):
             session.refresh(row)
             raise NotNowError(f"job {row.id}", f"is {row.state}", remedy)
         add_event(session, row.number, "state", {"state": changes["state"]})

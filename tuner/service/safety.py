@@ -29,7 +29,7 @@ from tuner.service.errors import (
     TooLargeError,
     TooManyError,
 )
-from tuner.service.service import Metrics, Service
+from tuner.service.service import Service
 from tuner.service.settings import size_in_words
 
 COOKIE = "tune_session"
@@ -69,11 +69,10 @@ class Guard:
         Makes the answer to a request that is refused.
     """
 
-    def __init__(self, app: ASGIApp, service: Service, metrics: Metrics, refuse: Answer) -> None:
+    def __init__(self, app: ASGIApp, service: Service, refuse: Answer) -> None:
         limits = service.settings.limits
         self._app = app
         self._service = service
-        self._metrics = metrics
         self._refuse = refuse
         self._rates = RateLimit(limits.requests_per_second, limits.requests_in_a_burst)
 
@@ -103,7 +102,7 @@ class Guard:
             route = getattr(scope.get("route"), "path", "none")
             is_known = route != "none" and status != HTTPStatus.METHOD_NOT_ALLOWED
             labels = (scope["method"] if is_known else "any", route, str(status))
-            self._metrics.seconds.labels(*labels).observe(time.perf_counter() - began)
+            self._service.metrics.seconds.labels(*labels).observe(time.perf_counter() - began)
 
     async def _check(self, request: Request) -> None:
         settings = self._service.settings

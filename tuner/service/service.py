@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
+from anyio import CapacityLimiter
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
@@ -25,6 +26,9 @@ from tuner.service.errors import UnavailableError
 from tuner.service.jobs import JobQueue
 from tuner.service.settings import ServiceSettings
 
+MAX_INSPECTIONS = 2
+"""Recordings that are inspected at the same time."""
+
 
 @dataclass
 class Service:
@@ -34,6 +38,8 @@ class Service:
     ----------
     stopping
         Set once the server ends, so that answers which last for long end too.
+    metrics, uploads, inspections
+        Its counters, and turns of requests that send recordings.
     """
 
     settings: ServiceSettings
@@ -42,6 +48,11 @@ class Service:
     dispatcher: Dispatcher
     stopping: threading.Event = field(default_factory=threading.Event)
     _lock: IO[str] | None = None
+
+    def __post_init__(self) -> None:
+        self.metrics = Metrics(self)
+        self.uploads = CapacityLimiter(self.settings.limits.uploads_at_once)
+        self.inspections = CapacityLimiter(MAX_INSPECTIONS)
 
     @classmethod
     def open(cls, settings: ServiceSettings, engine: Engine | None = None) -> Service:
