@@ -126,7 +126,7 @@ def find_effective(
         lacking = simulator.with_built_in(run.vehicle, members)
         return over_flights(flown(lacking if members else lawful, members))
 
-    lawful, flights = simulator.laws(run.vehicle), flown(vehicle, names)
+    lawful, flights = simulator.lawful(run.vehicle), flown(vehicle, names)
     return Effective(
         vehicle,
         EffectiveResult(
@@ -158,7 +158,7 @@ def lost_terms(run: Run, simulator: Simulator) -> dict[str, tuple[str, ...]]:
         for name, value in flight.conditions.items():
             acting[name] = max(acting.get(name, 0.0), abs(value))
     lost = simulator.lost(acting)
-    there = simulator.laws(run.vehicle)
+    there = simulator.lawful(run.vehicle)
     if there.aerodynamics != run.vehicle.aerodynamics or values_of(there) != values_of(run.vehicle):
         lost[OTHER_LAWS] = ()
     return lost

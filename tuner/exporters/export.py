@@ -15,6 +15,7 @@ from tuner.config import ExportSettings
 from tuner.core.disk import check_file, exists, file_name, inside
 from tuner.core.errors import ExportError, InputError
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse
+from tuner.exporters import laws
 from tuner.exporters.draws import draws_of, write_draws
 from tuner.exporters.effective import (
     Effective,
@@ -23,7 +24,7 @@ from tuner.exporters.effective import (
     lost_groups,
     refly,
 )
-from tuner.exporters.simulators import GAZEBO_CLASSIC, hover_command, thrust_to_weight
+from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.exporters.target import (
     Draft,
     Target,
@@ -465,10 +466,10 @@ def check_hover(wanted: VehicleFile, there: VehicleFile) -> Gate:
         The vehicle that it flies with the written file.
     """
     objections = []
-    ratio, expected = thrust_to_weight(there), thrust_to_weight(wanted)
+    ratio, expected = laws.thrust_to_weight(there), laws.thrust_to_weight(wanted)
     if not math.isclose(ratio, expected, rel_tol=RELATIVE_TOLERANCE):
         objections.append(f"full thrust is {ratio:.3g} times the weight, should be {expected:.3g}")
-    hover, wanted_hover = hover_command(there), hover_command(wanted)
+    hover, wanted_hover = laws.hover_command(there), laws.hover_command(wanted)
     if hover is None:
         objections.append(f"it cannot hover, its full thrust is {ratio:.3g} times its weight")
     elif wanted_hover is None or abs(hover - wanted_hover) > THROTTLE_TOLERANCE:

@@ -12,9 +12,9 @@ from tuner.core.errors import ExportError
 from tuner.core.shipped import EXPORT_TARGETS, configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.simulation_files import write_flights
+from tuner.exporters import laws
 from tuner.exporters.export import export_vehicle
 from tuner.exporters.external_simulator import flier_of
-from tuner.exporters.simulators import hover_command, thrust_to_weight
 from tuner.exporters.target import target_of, write
 from tuner.exporters.targets.mujoco import MUJOCO
 from tuner.options import ExportOptions
@@ -68,9 +68,9 @@ def test_laws_applied_twice_change_nothing(kind, vehicle):
 @EVERY
 def test_thrust_and_hover_are_carried(kind, vehicle):
     flown = target_of(kind).simulator.flown(vehicle)
-    assert thrust_to_weight(flown) == pytest.approx(thrust_to_weight(vehicle), rel=1e-9)
+    assert laws.thrust_to_weight(flown) == pytest.approx(laws.thrust_to_weight(vehicle), rel=1e-9)
     if kind != "px4":  # whose thrust is linear in the command
-        assert hover_command(flown) == pytest.approx(hover_command(vehicle), abs=1e-3)
+        assert laws.hover_command(flown) == pytest.approx(laws.hover_command(vehicle), abs=1e-3)
 
 
 @pytest.mark.parametrize(

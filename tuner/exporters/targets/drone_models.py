@@ -14,17 +14,9 @@ from sim_jax.constants import GRAVITY, RAD_S_PER_RPM
 from tuner.core.disk import file_name
 from tuner.core.numerics import Array
 from tuner.core.yaml_section import commented
+from tuner.exporters import laws
 from tuner.exporters.external_simulator import flier_of
-from tuner.exporters.simulators import (
-    LINEAR_DRAG,
-    Simulator,
-    drag_at_hover,
-    entries,
-    rotor_speed,
-    thrust_at,
-    with_body_torque,
-    with_linear_drag,
-)
+from tuner.exporters.simulators import Simulator, entries
 from tuner.exporters.target import PLACE_TOLERANCE_M, Target, numbers_draft, read_file
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
@@ -54,8 +46,8 @@ def params(vehicle: VehicleFile) -> dict[str, Any]:
             [-1.0 if rotor.spin == "ccw" else 1.0 for rotor in vehicle.rotors],
         ],
         "drag_matrix": np.diag(drag).tolist(),
-        "thrust_min": thrust_at(vehicle, rotor_speed(vehicle, 0.0)),
-        "thrust_max": thrust_at(vehicle, rotor_speed(vehicle, 1.0)),
+        "thrust_min": laws.thrust_at(vehicle, laws.rotor_speed(vehicle, 0.0)),
+        "thrust_max": laws.thrust_at(vehicle, laws.rotor_speed(vehicle, 1.0)),
         "prop_inertia": vehicle.effects.get("rotor_inertia", 0.0),
     }
 
@@ -85,7 +77,7 @@ def _with_square_rotors(vehicle: VehicleFile) -> VehicleFile:
         rotor.replace(position=(side(rotor.position[0]), side(rotor.position[1]), 0.0))
         for rotor in vehicle.rotors
     )
-    return with_body_torque(vehicle.replace(rotors=rotors))
+    return laws.with_body_torque(vehicle.replace(rotors=rotors))
 
 
 def _flier(vehicle: VehicleFile) -> Callable[..., Any] | None:
@@ -159,7 +151,7 @@ DRONE_MODELS = Simulator(
     ),
     entry=entries(
         "drone-models",
-        LINEAR_DRAG,
+        laws.LINEAR_DRAG,
         time_constant_up="rotor_dyn_coef",
         time_constant_down="rotor_dyn_coef",
         motor_constant="rpm2thrust",
@@ -167,7 +159,7 @@ DRONE_MODELS = Simulator(
         rotor_drag_coefficient="drag_matrix",
         rotor_inertia="prop_inertia",
     ),
-    laws=lambda vehicle: _with_square_rotors(with_linear_drag(vehicle, drag_at_hover(vehicle))),
+    laws=(laws.with_linear_drag, _with_square_rotors),
     free=("linear_drag_x", "linear_drag_y"),
 )
 TARGET = Target(

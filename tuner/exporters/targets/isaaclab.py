@@ -6,19 +6,8 @@ import math
 from typing import Any
 
 from tuner.core.yaml_section import commented
-from tuner.exporters.simulators import (
-    ANGULAR_DRAG,
-    CENTRE,
-    LINEAR_DRAG,
-    Simulator,
-    about_centre_of_mass,
-    entries,
-    hover_speed,
-    rotor_speed,
-    thrust_at,
-    with_one_damping,
-    with_one_drag,
-)
+from tuner.exporters import laws
+from tuner.exporters.simulators import Simulator, entries
 from tuner.exporters.target import Target, module_assignments, numbers_draft
 from tuner.vehicle import VehicleFile
 
@@ -46,7 +35,8 @@ def configuration(vehicle: VehicleFile) -> dict[str, dict[str, Any]]:
     return {
         "THRUSTER": {
             "thrust_range": [
-                thrust_at(vehicle, rotor_speed(vehicle, command)) for command in (0.0, 1.0)
+                laws.thrust_at(vehicle, laws.rotor_speed(vehicle, command))
+                for command in (0.0, 1.0)
             ],
             "thrust_const_range": [constant, constant],
             "tau_inc_range": [motor.time_constant_up] * 2,
@@ -74,7 +64,7 @@ def configuration(vehicle: VehicleFile) -> dict[str, dict[str, Any]]:
         "BODY": {
             "mass": vehicle.mass,
             "diagonal_inertia": [inertia.xx, inertia.yy, inertia.zz],
-            "hover_rps": hover_speed(vehicle) / RAD_PER_TURN,
+            "hover_rps": laws.hover_speed(vehicle) / RAD_PER_TURN,
         },
     }
 
@@ -99,18 +89,18 @@ ISAAC_LAB = Simulator(
     ),
     entry=entries(
         "Isaac Lab",
-        LINEAR_DRAG,
-        ANGULAR_DRAG,
+        laws.LINEAR_DRAG,
+        laws.ANGULAR_DRAG,
         time_constant_up="tau_inc_range",
         time_constant_down="tau_dec_range",
         motor_constant="thrust_const_range",
         moment_constant="torque_to_thrust_ratio",
         rotor_drag_coefficient="linear_damping",
-        **CENTRE,
+        **laws.CENTRE,
     ),
-    laws=lambda vehicle: with_one_damping(with_one_drag(about_centre_of_mass(vehicle))),
-    free=LINEAR_DRAG,
-    ties=(LINEAR_DRAG,),
+    laws=(laws.about_centre_of_mass, laws.with_one_drag, laws.with_one_damping),
+    free=laws.LINEAR_DRAG,
+    ties=(laws.LINEAR_DRAG,),
 )
 TARGET = Target(
     "isaaclab",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from tuner.exporters.simulators import full_thrust, hover_command, hover_speed, thrust_to_weight
+from tuner.exporters import laws
 from tuner.exporters.target import Target, numbers_draft, read_file
 from tuner.vehicle import COEFFICIENTS, VehicleFile, values_of
 
@@ -28,10 +28,10 @@ def json_text(vehicle: VehicleFile, provenance: str) -> str:
         "meanings": {name: COEFFICIENTS[name].meaning for name in values if name in COEFFICIENTS},
         "rotors": [rotor.model_dump(mode="json") for rotor in vehicle.rotors],
         "derived": {
-            "full_thrust_of_one_rotor_N": full_thrust(vehicle),
-            "thrust_to_weight": thrust_to_weight(vehicle),
-            "hover_rotor_speed_rad_s": hover_speed(vehicle),
-            "hover_command": hover_command(vehicle),
+            "full_thrust_of_one_rotor_N": laws.full_thrust(vehicle),
+            "thrust_to_weight": laws.thrust_to_weight(vehicle),
+            "hover_rotor_speed_rad_s": laws.hover_speed(vehicle),
+            "hover_command": laws.hover_command(vehicle),
         },
     }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 from xml.etree import ElementTree
@@ -13,22 +14,9 @@ import numpy as np
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
 from tuner.core.phrases import printable
+from tuner.exporters import laws
 from tuner.exporters.external_simulator import flier_of
-from tuner.exporters.simulators import (
-    ANGULAR_DRAG,
-    CENTRE,
-    LINEAR_DRAG,
-    MOTORS,
-    Simulator,
-    about_centre_of_mass,
-    drag_at_hover,
-    entries,
-    full_thrust,
-    rotor_speed,
-    thrust_at,
-    with_linear_thrust,
-    with_mean_lag,
-)
+from tuner.exporters.simulators import MOTORS, Simulator, entries
 from tuner.exporters.target import Target, numbers_draft, read_file, xml_comment
 from tuner.vehicle import VehicleFile
 
@@ -49,7 +37,7 @@ _USE = """
 def elements(vehicle: VehicleFile) -> dict[str, list[Attributes]]:
     """Return tag -> attributes of each of its elements, of a vehicle by MuJoCo's laws."""
     inertia, motor, aero = vehicle.inertia, vehicle.motor, vehicle.aerodynamics
-    thrusts = thrust_at(vehicle, rotor_speed(vehicle, 0.0)), full_thrust(vehicle)
+    thrusts = laws.thrust_at(vehicle, laws.rotor_speed(vehicle, 0.0)), laws.full_thrust(vehicle)
     sites: list[Attributes] = []
     actuators: list[Attributes] = []
     for number, rotor in enumerate(vehicle.rotors):
@@ -69,7 +57,7 @@ def elements(vehicle: VehicleFile) -> dict[str, list[Attributes]]:
     centre = np.mean([rotor.position for rotor in vehicle.rotors], axis=0)
     sites.append({"name": "hub", "pos": tuple(centre.tolist())})
     names = [f"{kind}_{axis}" for kind in ("drag", "damping") for axis in "xyz"]
-    for number, value in enumerate((*drag_at_hover(vehicle), *_damping(vehicle))):
+    for number, value in enumerate((*laws.drag_at_hover(vehicle), *_damping(vehicle))):
         if value:
             actuators.append(
                 {
@@ -122,7 +110,7 @@ def _damping(vehicle: VehicleFile) -> tuple[float, float, float]:
     """Return the damping of rotation, N m s/rad; about z with that of rotor drag."""
     x, y, z = (vehicle.effects.get(f"angular_drag_{axis}", 0.0) for axis in "xyz")
     arms = np.mean([np.square(rotor.position[:2]) for rotor in vehicle.rotors], axis=0)
-    drag = drag_at_hover(vehicle)
+    drag = laws.drag_at_hover(vehicle)
     body = [vehicle.effects.get(f"linear_drag_{axis}", 0.0) for axis in "xy"]
     return x, y, z + float((drag[0] - body[0]) * arms[1] + (drag[1] - body[1]) * arms[0])
 
@@ -199,8 +187,8 @@ MUJOCO = Simulator(
     ),
     entry=entries(
         "MuJoCo",
-        LINEAR_DRAG,
-        ANGULAR_DRAG,
+        laws.LINEAR_DRAG,
+        laws.ANGULAR_DRAG,
         time_constant_up="dynprm",
         time_constant_down="dynprm",
         motor_constant="gainprm, ctrlrange",
@@ -208,10 +196,12 @@ MUJOCO = Simulator(
         rotor_drag_coefficient="biasprm",
         thrust_inflow_coefficient="biasprm",
         rotor_drag_ratio_y="biasprm",
-        **CENTRE,
+        **laws.CENTRE,
     ),
-    laws=lambda vehicle: with_linear_thrust(
-        with_mean_lag(about_centre_of_mass(vehicle)), idle=True
+    laws=(
+        laws.about_centre_of_mass,
+        laws.with_mean_lag,
+        partial(laws.with_linear_thrust, idle=True),
     ),
     fixed=(*MOTORS, "time_constant_up", "time_constant_down"),
 )

@@ -11,30 +11,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import ExportError
 from tuner.core.yaml_section import commented
-from tuner.exporters.simulators import (
-    GZ_SIM,
-    LINEAR_DRAG,
-    MAX_GZ_SPEED,
-    Simulator,
-    drag_at_hover,
-    full_thrust,
-    gz_speed_unit,
-    hover_command,
-    hover_speed,
-    registry_entries,
-    rotor_speed,
-    thrust_at,
-    with_body_torque,
-    with_linear_thrust,
-    with_mean_lag,
-    with_one_damping,
-    with_one_drag,
-)
+from tuner.exporters import laws
+from tuner.exporters.simulators import GZ_SIM, Simulator, registry_entries
 from tuner.exporters.target import PLACE_TOLERANCE_M, Draft, Target, differences, read_file
 from tuner.result import Gate
 from tuner.vehicle import VehicleFile
@@ -49,14 +33,16 @@ def with_linear_hover(vehicle: VehicleFile) -> VehicleFile:
     Its moments of inertia are scaled like the slope of thrust over command in the hover, so that it
     turns like the vehicle.
     """
-    hover, step = hover_command(vehicle), 1e-4
+    hover, step = laws.hover_command(vehicle), 1e-4
     if hover is None or vehicle.aerodynamics.thrust_law == "linear":
-        return with_linear_thrust(vehicle, idle=False)
-    slope = [thrust_at(vehicle, rotor_speed(vehicle, hover + sign * step)) for sign in (-1, 1)]
+        return laws.with_linear_thrust(vehicle, idle=False)
+    slope = [
+        laws.thrust_at(vehicle, laws.rotor_speed(vehicle, hover + sign * step)) for sign in (-1, 1)
+    ]
     thrust = vehicle.mass * GRAVITY / len(vehicle.rotors)
     ratio = (slope[1] - slope[0]) / (2 * step) / (thrust / hover)
-    linear, inertia = with_linear_thrust(vehicle, idle=False), vehicle.inertia
-    full = hover_speed(vehicle) / hover
+    linear, inertia = laws.with_linear_thrust(vehicle, idle=False), vehicle.inertia
+    full = laws.hover_speed(vehicle) / hover
     return linear.replace(
         inertia=inertia.replace(**{axes: value / ratio for axes, value in inertia}),
         motor=linear.motor.replace(input_scaling=full, max_rotor_velocity=full),
@@ -75,11 +61,15 @@ SIH = Simulator(
         "one damping of rotation about all axes",
     ),
     entry=registry_entries("px4"),
-    laws=lambda vehicle: with_one_damping(
-        with_one_drag(with_mean_lag(with_linear_thrust(with_body_torque(vehicle), idle=False)))
+    laws=(
+        laws.with_body_torque,
+        partial(laws.with_linear_thrust, idle=False),
+        laws.with_mean_lag,
+        laws.with_one_drag,
+        laws.with_one_damping,
     ),
-    free=LINEAR_DRAG,
-    ties=(LINEAR_DRAG,),
+    free=laws.LINEAR_DRAG,
+    ties=(laws.LINEAR_DRAG,),
     fixed=("input_scaling", "zero_position_armed", "time_constant_up", "time_constant_down"),
     start=with_linear_hover,
 )
@@ -96,12 +86,12 @@ def parameters(vehicle: VehicleFile, simulator: Simulator) -> dict[str, float | 
         The vehicle cannot hover.
     """
     flown = simulator.flown(vehicle)
-    hover = hover_command(flown)
+    hover = laws.hover_command(flown)
     if hover is None:
         raise ExportError(
             vehicle.name,
-            f"cannot hover: it needs {hover_speed(flown):.0f} rad/s, its rotors turn at "
-            f"{rotor_speed(flown, 0):.0f} to {rotor_speed(flown, 1):.0f}",
+            f"cannot hover: it needs {laws.hover_speed(flown):.0f} rad/s, its rotors turn at "
+            f"{laws.rotor_speed(flown, 0):.0f} to {laws.rotor_speed(flown, 1):.0f}",
             "check mass, motor_constant and input_scaling",
         )
     own = _sih(flown) if simulator is SIH else _gz_speeds(flown)
@@ -116,7 +106,7 @@ def _allocation(vehicle: VehicleFile) -> dict[str, float | int]:
         x, y, z = rotor.position
         name, sign = f"CA_ROTOR{index}", 1.0 if rotor.spin == "ccw" else -1.0
         allocation |= {
-            f"{name}_CT": full_thrust(vehicle),
+            f"{name}_CT": laws.full_thrust(vehicle),
             f"{name}_KM": sign * vehicle.aerodynamics.moment_constant,
             f"{name}_PX": x,
             f"{name}_PY": -y,
@@ -130,7 +120,7 @@ def _sih(vehicle: VehicleFile) -> dict[str, float | int]:
 
     ``vehicle`` is as it flies it. Its drag is -KDV·v in all directions, its damping -KDW·ω.
     """
-    inertia, full = vehicle.inertia, full_thrust(vehicle)
+    inertia, full = vehicle.inertia, laws.full_thrust(vehicle)
     arms = [max(abs(rotor.position[axis]) for rotor in vehicle.rotors) for axis in (1, 0)]
     return {
         "SIH_MASS": vehicle.mass,
@@ -144,7 +134,7 @@ def _sih(vehicle: VehicleFile) -> dict[str, float | int]:
         "SIH_Q_MAX": full * vehicle.aerodynamics.moment_constant,
         "SIH_L_ROLL": arms[0],
         "SIH_L_PITCH": arms[1],
-        "SIH_KDV": drag_at_hover(vehicle)[0],
+        "SIH_KDV": laws.drag_at_hover(vehicle)[0],
         "SIH_KDW": vehicle.effects.get("angular_drag_x", 0.0),
         "SIH_T_TAU": vehicle.motor.time_constant_up,
     }
@@ -152,8 +142,8 @@ def _sih(vehicle: VehicleFile) -> dict[str, float | int]:
 
 def _gz_speeds(vehicle: VehicleFile) -> dict[str, float | int]:
     """Return the rotor speeds in whole rad/s between which the gz-sim bridge maps commands."""
-    unit, numbers = gz_speed_unit(vehicle), range(1, len(vehicle.rotors) + 1)
-    low, high = (round(unit * rotor_speed(vehicle, command)) for command in (0.0, 1.0))
+    unit, numbers = laws.gz_speed_unit(vehicle), range(1, len(vehicle.rotors) + 1)
+    low, high = (round(unit * laws.rotor_speed(vehicle, command)) for command in (0.0, 1.0))
     return {
         **{f"SIM_GZ_EC_MIN{number}": low for number in numbers},
         **{f"SIM_GZ_EC_MAX{number}": high for number in numbers},
@@ -200,18 +190,15 @@ def _rotor_faults(vehicle: VehicleFile, simulator: Simulator) -> Iterator[str]:
 
 def _notes(vehicle: VehicleFile, flown: VehicleFile, simulator: Simulator) -> Iterator[str]:
     """Yield remarks for a reader of the parameters."""
-    hover, there = hover_command(vehicle), hover_command(flown)
+    hover, there = laws.hover_command(vehicle), laws.hover_command(flown)
     if simulator is not SIH:
-        idle = rotor_speed(vehicle, 0.0)
+        idle = laws.rotor_speed(vehicle, 0.0)
         yield (
             f"CA_ROTOR*_CT is thrust in N at full command (idle {idle:.0f} rad/s: not CT·u² below)"
         )
-        if gz_speed_unit(flown) < 1:
-            yield (
-                f"rotors turn at up to {rotor_speed(flown, 1.0):.0f} rad/s and PX4 lets gz-sim be "
-                f"told of {MAX_GZ_SPEED:.0f} at most: speeds are scaled by "
-                f"{gz_speed_unit(flown):.6g}, as the gz-sim export scales its model"
-            )
+        if laws.gz_speed_unit(flown) < 1:
+            scaled = laws.scaling_in_words(laws.rotor_speed(flown, 1.0))
+            yield f"{scaled}, as the gz-sim export scales its model"
     if hover is not None and there is not None and abs(hover - there) > 0.005:
         yield (
             f"MPC_THR_HOVER {there:.3f} is the hover of {simulator.title}; with the squared "

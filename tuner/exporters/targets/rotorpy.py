@@ -9,15 +9,9 @@ import numpy as np
 
 from tuner.core.numerics import Array
 from tuner.core.yaml_section import commented
+from tuner.exporters import laws
 from tuner.exporters.external_simulator import flier_of
-from tuner.exporters.simulators import (
-    CENTRE,
-    Simulator,
-    about_centre_of_mass,
-    entries,
-    rotor_speed,
-    with_mean_lag,
-)
+from tuner.exporters.simulators import Simulator, entries
 from tuner.exporters.target import Target, module_assignments, numbers_draft
 from tuner.vehicle import VehicleFile
 
@@ -46,8 +40,8 @@ def quad_params(vehicle: VehicleFile) -> dict[str, Any]:
         "k_h": 0.0,
         "k_flap": vehicle.effects.get("flapping_moment_coefficient", 0.0),
         "tau_m": motor.time_constant_up,
-        "rotor_speed_min": rotor_speed(vehicle, 0.0),
-        "rotor_speed_max": rotor_speed(vehicle, 1.0),
+        "rotor_speed_min": laws.rotor_speed(vehicle, 0.0),
+        "rotor_speed_max": laws.rotor_speed(vehicle, 1.0),
         "motor_noise_std": 0.0,
     }  # fmt: skip
 
@@ -114,9 +108,9 @@ ROTORPY = Simulator(
         thrust_inflow_coefficient="k_z",
         fuselage_drag="c_Dx, c_Dy, c_Dz",
         flapping_moment_coefficient="k_flap",
-        **CENTRE,
+        **laws.CENTRE,
     ),
-    laws=lambda vehicle: with_mean_lag(about_centre_of_mass(vehicle)),
+    laws=(laws.about_centre_of_mass, laws.with_mean_lag),
     ties=(("time_constant_up", "time_constant_down"),),
 )
 TARGET = Target(

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from tuner.core.errors import ExportError
 from tuner.core.numerics import Array
+from tuner.exporters import laws
 from tuner.exporters.sdf import spans
 from tuner.exporters.sdf.model import (
     MAX_ROTORS,
@@ -28,15 +29,7 @@ from tuner.exporters.sdf.model import (
     sdf_of,
 )
 from tuner.exporters.sdf.spans import Edit, Element, parse, without_jinja
-from tuner.exporters.simulators import (
-    GAZEBO_CLASSIC,
-    GZ_SIM,
-    MAX_GZ_SPEED,
-    Simulator,
-    gz_speed_unit,
-    rotor_speed,
-    with_speed_unit,
-)
+from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM, Simulator
 from tuner.exporters.target import (
     PLACE_TOLERANCE_M,
     Draft,
@@ -200,7 +193,7 @@ def sdf_or_snippet(
     if into is not None:
         return sdf_draft(into, vehicle, provenance)
     flown = simulator.flown(vehicle)
-    scaled = with_speed_unit(flown, gz_speed_unit(flown) if simulator is GZ_SIM else 1.0)
+    scaled = laws.with_speed_unit(flown, laws.gz_speed_unit(flown) if simulator is GZ_SIM else 1.0)
     wanted = numbers_of(scaled, channels=simulator is not GZ_SIM)
 
     def faults(path: Path, _: object) -> list[str]:
@@ -257,8 +250,8 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     model = read_sdf(path, rotors, prepare=lambda text, _: without_jinja(text))
     whole = read_sdf(path, rotors)
     flown = (GZ_SIM if whole.is_gz else GAZEBO_CLASSIC).flown(vehicle)
-    unit = gz_speed_unit(flown) if whole.is_gz else 1.0
-    scaled = with_speed_unit(flown, unit)
+    unit = laws.gz_speed_unit(flown) if whole.is_gz else 1.0
+    scaled = laws.with_speed_unit(flown, unit)
     wanted = numbers_of(scaled, channels=bool(whole.channels()))
     base = _base_body(whole, scaled)
     edits = [*_edits(model, whole, scaled, base)]
@@ -436,7 +429,7 @@ def _notes(
     if model.included:
         yield f"the mass of what the model includes is not counted: {', '.join(model.included)}"
     if model.is_gz:
-        low, high = (rotor_speed(vehicle, command) for command in (0.0, 1.0))
+        low, high = (laws.rotor_speed(vehicle, command) for command in (0.0, 1.0))
         last = len(vehicle.rotors)
         yield (
             "gz-sim has no control channels, PX4's parameters map commands: set "
@@ -444,10 +437,10 @@ def _notes(
             "--format px4 --simulator gz-sim does"
         )
     if unit < 1:
+        scaled = laws.scaling_in_words(laws.rotor_speed(vehicle, 1.0) / unit)
         yield (
-            f"rotors turn at up to {rotor_speed(vehicle, 1.0) / unit:.0f} rad/s and PX4 lets "
-            f"gz-sim be told of {MAX_GZ_SPEED:.0f} at most: speeds are scaled by {unit:.6g} and "
-            "motorConstant and rotorDragCoefficient to match, which moves nothing otherwise"
+            f"{scaled} and motorConstant and rotorDragCoefficient to match, which moves nothing "
+            "otherwise"
         )
     if center_of_mass(vehicle):
         place = ", ".join(as_text(round(number, 9)) for number in base.pose.position)
