@@ -25,7 +25,7 @@ from tuner.recordings.content import PER_MOTOR
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.interpolation import resample
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.unit_detection import UNIT_PHRASES, UNITS, to_si
+from tuner.recordings.unit_detection import UNITS, to_si
 from tuner.vehicle import VehicleFile
 from tuner.vehicle.motor_orders import columns_of
 
@@ -424,7 +424,7 @@ def dshot_lift(flight: Flight, vehicle: VehicleFile) -> tuple[float, float] | No
     Values between 1000 and 2000 may be either. None where commands were not read as pulses by their
     range, or lift as pulses is near the weight, or nearer than as DShot.
     """
-    read = ("command", UNIT_PHRASES["pwm_us"])
+    read = ("command", UNITS["pwm_us"].phrase)
     if not any(n.code is NoteCode.UNIT_READ and n.names == read for n in flight.notes):
         return None
     pulses = flight.signals["command"]
@@ -456,7 +456,7 @@ def with_speeds_in_si(flight: Flight, vehicle: VehicleFile) -> Flight:
         return flight
     (assumed,) = note.names
     ratios = _ratios(flight, vehicle)
-    factors = {unit: UNITS[unit][0] / UNITS[assumed][0] for unit in SPEED_UNITS}
+    factors = {unit: UNITS[unit].factor / UNITS[assumed].factor for unit in SPEED_UNITS}
 
     def fits(unit: str) -> bool:
         fastest = UNIT_TOLERANCE * vehicle.motor.max_rotor_velocity

@@ -36,9 +36,9 @@ from tuner.recordings.topics import (
 )
 from tuner.recordings.unit_detection import (
     MIN_SAMPLES,
-    UNIT_PHRASES,
-    is_too_slow,
+    UNITS,
     quaternion_of,
+    quicker,
     scales_of,
     to_enu_flu,
     to_si,
@@ -193,9 +193,10 @@ def read_signals(options: ReadOptions) -> RecordedSignals:
         *contents.notes,
         *noticed,
     ]
-    if is_tabular(recording.format) and not any(clock.unit for clock in chosen.time):
-        raw, quicker = _with_times_in_us(raw)
-        notes += quicker
+    infers = is_tabular(recording.format) and not any(clock.unit for clock in chosen.time)
+    if infers and (in_us := quicker(raw)) is not None:
+        raw = in_us
+        notes.append(NoteCode.TIME_READ.note(count=len(next(iter(raw.values())).time)))
     if order is not None and set(PER_MOTOR) & set(raw):
         columns = columns_of(order)
         for name in set(PER_MOTOR) & set(raw):
@@ -272,14 +273,6 @@ def content_of(signals: RecordedSignals, sidecar: Sidecar) -> Content:
     notes = (*signals.notes, *shifted, *turned, *stale, *dead)
     read = vars(signals) | {"series": series, "notes": notes}
     return Content(**read, missions=missions)
-
-
-def _with_times_in_us(raw: dict[str, RawSeries]) -> tuple[dict[str, RawSeries], list[Note]]:
-    """Return signals with times divided by 1000, if gravity shows that their unit is us, not ms."""
-    if not is_too_slow(raw):
-        return raw, []
-    quick = {name: replace(data, time=1e-3 * data.time) for name, data in raw.items()}
-    return quick, [NoteCode.TIME_READ.note(count=len(next(iter(raw.values())).time))]
 
 
 def _clean(
@@ -375,8 +368,7 @@ def extract(
     """
     wanted: dict[str, dict[str, None]] = {}
     for place in places.values():
-        fields = [*place.fields, *([place.source.rotor] if place.source.rotor else ())]
-        wanted.setdefault(place.topic, {}).update(dict.fromkeys(fields))
+        wanted.setdefault(place.topic, {}).update(dict.fromkeys(place.read))
     contents = recording.read({topic: tuple(names) for topic, names in wanted.items()}, clocks)
     receive_only = {p.topic for p in places.values() if p.source.stamp == "receive"}
     kinds = {t: {s for s, place in places.items() if place.topic == t} for t in wanted}
@@ -401,7 +393,7 @@ def extract(
         raw = _in_seconds(time, recorded, epoch)
         unit = _recorded_unit(recording, signal, place, raw, position)
         if unit and unit != place.unit:
-            phrase, count = UNIT_PHRASES[unit], len(time)
+            phrase, count = UNITS[unit].phrase, len(time)
             inferred.append(NoteCode.UNIT_READ.note(signal, phrase, topic=place.topic, count=count))
         values = _in_flight_axes(samples, signal, place, to_si(recorded, unit or "si"))
         if is_tabular(recording.format):  # a row without the signal is no sample of it

@@ -104,11 +104,7 @@ class MicroSdRecording(Recording):
         return (Damage(Cause.END_MISSING, bytes_lost=self._lost),)
 
     def _samples(self, topic: str, fields: tuple[str, ...]) -> TopicSamples:
-        event, missing = self._events[topic], self.missing_fields(topic, fields)
-        if missing:
-            raise RecordingError(
-                self.path, f"{topic} has no variable '{missing[0]}'", "correct the topic map"
-            )
+        event = self._events[topic]
         places = np.frombuffer(event.places, dtype=np.uint32).astype(np.intp)
         data = np.frombuffer(self._data, dtype=np.uint8)
         rows = data[places[:, None] + np.arange(event.layout.itemsize)].reshape(-1)

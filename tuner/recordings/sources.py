@@ -19,20 +19,18 @@ from tuner.recordings.formats import is_tabular
 from tuner.recordings.notes import Note, NoteCode, note_text
 from tuner.recordings.recording import Clock, Recording
 from tuner.recordings.topics import Source, TopicMap
+from tuner.recordings.unit_detection import UNITS
 
-#: Unit as written -> unit of a topic map.
-UNIT_SPELLINGS: Mapping[str, str] = {
-    "s": "s", "sec": "s", "secs": "s", "seconds": "s", "second": "s",
-    "ms": "ms", "msec": "ms", "milliseconds": "ms", "us": "us", "µs": "us", "usec": "us",
-    "microseconds": "us", "ns": "ns", "nsec": "ns", "nanoseconds": "ns",
-    "m": "si", "m/s": "si", "m/s2": "si", "m/s^2": "si", "m/s²": "si", "m/s/s": "si",
-    "rad": "si", "rad/s": "si", "rads": "si", "radians": "si", "v": "si", "volt": "si",
-    "volts": "si", "mm": "mm", "mm/s": "mm", "cm": "cm", "cm/s": "cm", "deg": "deg", "°": "deg",
-    "degrees": "deg", "deg/s": "deg/s", "°/s": "deg/s", "dps": "deg/s", "degs": "deg/s",
-    "g": "g", "gs": "g", "mg": "mg", "mv": "mV", "%": "percent", "percent": "percent",
-    "rpm": "rpm", "hz": "hz", "rps": "hz", "1/min": "rpm", "pwm": "pwm_us",
-}  # fmt: skip
-TIME_UNITS = {"s", "ms", "us", "ns"}
+TIME_UNITS: Mapping[str, str] = {
+    "s": "s sec secs seconds second",
+    "ms": "ms msec milliseconds",
+    "us": "us µs usec microseconds",
+    "ns": "ns nsec nanoseconds",
+}
+"""Unit of times -> its spellings."""
+_SPELLINGS = {name: unit.spellings for name, unit in UNITS.items()} | dict(TIME_UNITS)
+UNIT_SPELLINGS = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
+"""Unit as written -> unit of a topic map."""
 
 #: Words that mean each quantity.
 _POSITION = {"position", "pos", "p", "translation", "xyz"}
@@ -270,6 +268,11 @@ class Place:
     unit: str
     frame: str
 
+    @property
+    def read(self) -> tuple[str, ...]:
+        """The fields, and that which names a message's rotor, if one does."""
+        return self.fields if self.source.rotor is None else (*self.fields, self.source.rotor)
+
 
 def choose_map(recording: Recording, candidates: Iterable[TopicMap]) -> TopicMap:
     """Return the map that finds a pose and most signals, then the one of higher priority.
@@ -351,18 +354,19 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
         kind = next(known.type for known in recording.topics if known.name == topic)
         wild = "*" in source.topic
         return None if wild else NoteCode.LAYOUT_UNKNOWN.note(kind, signal, topic=topic)
-    missing = recording.missing_fields(topic, fields)
+    unit = source.unit or (usual.unit if usual and not source.fields else "si")
+    frame = source.frame or (usual.frame if usual else "enu_flu")
+    missing = recording.missing_fields(topic, Place(source, topic, fields, unit, frame).read)
     if missing:
         # a table, or any topic at all, need not hold every signal of a map
         anywhere = is_tabular(recording.format) or source.topic == "*"
-        absent = anywhere and len(missing) == len(fields)
+        absent = anywhere and set(fields) <= set(missing)
         near = difflib.get_close_matches(missing[0], recording.fields(topic), n=1)
         note = NoteCode.FIELD_MISSING.note(missing[0], signal, *near, topic=topic)
         return None if absent else note
     if source.quaternion == "xyzw" and SIGNALS[signal].axes == "attitude":
         fields = (fields[3], *fields[:3])
-    unit = source.unit or (usual.unit if usual and not source.fields else "si")
-    return Place(source, topic, fields, unit, source.frame or (usual.frame if usual else "enu_flu"))
+    return Place(source, topic, fields, unit, frame)
 
 
 def unread_columns(
@@ -371,7 +375,7 @@ def unread_columns(
     """Return a note on the columns of a table that the map does not name, if there are any."""
     if not is_tabular(recording.format):
         return ()
-    read = {field for place in places.values() for field in place.fields}
+    read = {field for place in places.values() for field in place.read}
     read |= {clock.field for clock in topics.time}
     columns = [name for topic in recording.topics for name in recording.fields(topic.name)]
     others = tuple(name for name in columns if name not in read)

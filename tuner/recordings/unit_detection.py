@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,31 +28,51 @@ from tuner.recordings.flight import SIGNALS, RawSeries
 from tuner.recordings.interpolation import both_known, rotate, upward
 from tuner.recordings.notes import Note, NoteCode
 
-#: Unit name in a topic map -> (factor, offset): SI value = factor * recorded + offset.
-UNITS: Mapping[str, tuple[float, float]] = {
-    "si": (1.0, 0.0),
-    "rpm": (math.tau / 60, 0.0),
-    "hz": (math.tau, 0.0),
-    "deg": (math.pi / 180, 0.0),
-    "deg/s": (math.pi / 180, 0.0),
-    "g": (9.80665, 0.0),
-    "mg": (9.80665e-3, 0.0),
-    "mm": (1e-3, 0.0),
-    "cm": (1e-2, 0.0),
-    "ft": (0.3048, 0.0),
-    "mV": (1e-3, 0.0),
-    "percent": (1e-2, 0.0),
-    "pwm_us": (1e-3, -1.0),
-    "pwm_16bit": (1 / 65535, 0.0),
-    "dshot": (1 / 1999, -48 / 1999),
-    "signed": (0.5, 0.5),
+
+class Unit(NamedTuple):
+    """A unit of recorded numbers: SI value = factor * recorded + offset.
+
+    Attributes
+    ----------
+    phrase
+        As sentences on an inferred unit name it; empty of one that is not inferred.
+    spellings
+        As names of columns and rows of units write it, in small letters between blanks.
+    """
+
+    factor: float
+    offset: float = 0.0
+    phrase: str = ""
+    spellings: str = ""
+
+
+UNITS: Mapping[str, Unit] = {
+    "si": Unit(
+        *(1.0, 0.0, "in SI units"),
+        "m m/s m/s2 m/s^2 m/s² m/s/s rad rad/s rads radians v volt volts",
+    ),
+    "rpm": Unit(math.tau / 60, spellings="rpm 1/min"),
+    "hz": Unit(math.tau, spellings="hz rps"),
+    "deg": Unit(math.pi / 180, 0.0, "in degrees", "deg ° degrees"),
+    "deg/s": Unit(math.pi / 180, 0.0, "in degrees per second", "deg/s °/s dps degs"),
+    "g": Unit(9.80665, 0.0, "in g", "g gs"),
+    "mg": Unit(9.80665e-3, 0.0, "in thousandths of g", "mg"),
+    "mm": Unit(1e-3, 0.0, "in millimetres", "mm mm/s"),
+    "cm": Unit(1e-2, 0.0, "in centimetres", "cm cm/s"),
+    "ft": Unit(0.3048, 0.0, "in feet"),
+    "mV": Unit(1e-3, 0.0, "in millivolts", "mv"),
+    "percent": Unit(1e-2, 0.0, "in percent", "% percent"),
+    "pwm_us": Unit(1e-3, -1.0, "in microseconds of PWM", "pwm"),
+    "pwm_16bit": Unit(1 / 65535, 0.0, "of 16 bits"),
+    "dshot": Unit(1 / 1999, -48 / 1999),
+    "signed": Unit(0.5, 0.5, "from -1 to 1"),
 }
+"""Name in a topic map -> unit."""
 
 
 def to_si(values: Array, unit: str) -> Array:
     """Convert recorded numbers of any shape to SI."""
-    factor, offset = UNITS[unit]
-    return factor * values + offset
+    return UNITS[unit].factor * values + UNITS[unit].offset
 
 
 def to_enu_flu(values: Array, signal: str) -> Array:
@@ -139,7 +160,7 @@ READINGS: Mapping[str, tuple[SignalReading, ...]] = {
         SignalReading("in body axes", lambda v, q: rotate(q, v)),
         SignalReading("in NED axes", lambda v, _: to_enu_flu(v, "velocity")),
         SignalReading(  # gravity alone does not tell these two apart
-            "in kilometres per hour, not feet per second", lambda v, _: v / 3.6 / UNITS["ft"][0]
+            "in kilometres per hour, not feet per second", lambda v, _: v / 3.6 / UNITS["ft"].factor
         ),
     ),
     "acceleration": (
@@ -158,8 +179,8 @@ READINGS: Mapping[str, tuple[SignalReading, ...]] = {
 
 LENGTH_SIGNALS = {"position": False, "velocity": True}
 """Signals that may be in another unit than metres -> whether they are speeds."""
-LENGTH_UNITS = {"ft": "in feet", "cm": "in centimetres", "mm": "in millimetres"}
-"""Units of length that are inferred -> their phrase in a sentence."""
+LENGTH_UNITS = ("ft", "cm", "mm")
+"""Units of length that are inferred."""
 
 BIN_S = 0.1
 """Medians over bins remove noise, bursts of stamps and single corrupt samples."""
@@ -184,19 +205,6 @@ MIN_OTHER_UNIT_SCALE = 2.0
 """No flight in metres has a larger apparent scale."""
 MAX_SPEED_RATIO = 3.0
 """The largest ratio of recorded speed to the position's derivative in the same unit."""
-UNIT_PHRASES = {
-    "si": "in SI units",
-    "deg": "in degrees",
-    "deg/s": "in degrees per second",
-    "g": "in g",
-    "mg": "in thousandths of g",
-    "mV": "in millivolts",
-    "percent": "in percent",
-    "pwm_us": "in microseconds of PWM",
-    "pwm_16bit": "of 16 bits",
-    "signed": "from -1 to 1",
-}
-"""Units that are inferred -> their phrase in a sentence."""
 GRAVITY_RANGE = (0.75, 1.4)
 """The range of the mean specific force over gravity, in flight or at rest."""
 MAX_TURN_RATE = 40.0
@@ -247,21 +255,21 @@ def scales_of(recorded: Mapping[str, RawSeries]) -> dict[str, Scale]:
     return scales
 
 
-def is_too_slow(recorded: Mapping[str, RawSeries]) -> bool:
-    """Return whether times are a thousand times too long, by gravity.
+def quicker(recorded: Mapping[str, RawSeries]) -> dict[str, RawSeries] | None:
+    """Return signals with a thousandth of their times, if gravity shows that; None if it does not.
 
     The step of a table's times does not tell slow microseconds from quick milliseconds.
     """
     if not {"position", "attitude"} <= set(recorded):
-        return False
+        return None
     step = np.diff(np.sort(recorded["position"].time))
     if not len(step) or np.median(step) < MIN_SLOW_STEP_S:
-        return False
+        return None
     quick = {name: replace(samples, time=1e-3 * samples.time) for name, samples in recorded.items()}
     slowly, quickly = (
         fits_gravity(signals["position"], signals["attitude"]) for signals in (recorded, quick)
     )
-    return quickly and not slowly
+    return quick if quickly and not slowly else None
 
 
 def fits_gravity(
@@ -269,7 +277,7 @@ def fits_gravity(
 ) -> bool:
     """Return whether positions in one of some units accelerate along the tilt."""
     scale, (low, high) = scale_of(position, attitude), SCALE_RANGE
-    return scale.sure and any(low < scale.per_metre * UNITS[unit][0] < high for unit in units)
+    return scale.sure and any(low < scale.per_metre * UNITS[unit].factor < high for unit in units)
 
 
 def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
@@ -277,10 +285,9 @@ def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
     if not scale.sure or scale.per_metre < MIN_OTHER_UNIT_SCALE:
         return "si", None
     low, high = SCALE_RANGE
-    for unit, name in LENGTH_UNITS.items():
-        factor, _ = UNITS[unit]
-        if low < scale.per_metre * factor < high:
-            return unit, NoteCode.UNIT_READ.note(signal, name, topic=topic)
+    for unit in LENGTH_UNITS:
+        if low < scale.per_metre * UNITS[unit].factor < high:
+            return unit, NoteCode.UNIT_READ.note(signal, UNITS[unit].phrase, topic=topic)
     return "si", NoteCode.UNIT_DOUBTED.note(signal, topic=topic, times=scale.per_metre)
 
 
@@ -296,7 +303,7 @@ def units_of_references(
         return {}
     names = ("position", "reference_position")
     flown, wanted = (math.sqrt(np.nanmean(np.square(recorded[name].values))) for name in names)
-    if wanted < flown * math.sqrt(UNITS[unit][0]):
+    if wanted < flown * math.sqrt(UNITS[unit].factor):
         return {}
     return {
         name: (unit, replace(note, names=(name, note.names[1])))

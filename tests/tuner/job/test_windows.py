@@ -16,7 +16,7 @@ from tuner.job.prepare import check_information, check_recordings
 from tuner.job.run import run
 from tuner.options import Options
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.unit_detection import UNIT_PHRASES, UNITS, to_si
+from tuner.recordings.unit_detection import UNITS, to_si
 from tuner.search.estimation import search
 from tuner.search.listener import Listener, Reporter
 from tuner.search.problem import job_of
@@ -177,10 +177,10 @@ def test_settings_of_coefficients_that_are_not_fitted_are_named(full_flight, ful
 
 @pytest.mark.parametrize("unit", ["dshot", "pwm_us"])
 def test_steps_of_dshot_that_were_taken_for_pulses_are_named(unit, full_flight, full_bag, updated):
-    factor, offset = UNITS[unit]
+    factor, offset, *_ = UNITS[unit]
     command = (full_flight.signals["command"] - offset) / factor  # as logged
     taken = to_si(command, "pwm_us")
-    note = Note(NoteCode.UNIT_READ, "warning", names=("command", UNIT_PHRASES["pwm_us"]))
+    note = Note(NoteCode.UNIT_READ, "warning", names=("command", UNITS["pwm_us"].phrase))
     signals = full_flight.signals | {"command": taken}
     read = replace(full_flight, signals=signals, notes=(note,))
     job = job_through("rotor_speed", read, full_bag, updated)

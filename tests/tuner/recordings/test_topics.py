@@ -279,6 +279,20 @@ def test_single_tachometers_of_four_rotors_are_put_in_their_columns(
     assert not any(note.code is NoteCode.NO_TACHOMETER for note in got.notes)
 
 
+def test_a_field_that_names_the_rotor_is_looked_for_and_counts_as_read(tmp_path: Path) -> None:
+    rows = [f"{t / 100},0,0,{1 + t / 300},1,0,0,0,6000,{t % 4}" for t in range(600)]
+    path = tmp_path / "f.csv"
+    path.write_text("\n".join(["t,x,y,z,qw,qx,qy,qz,rpm,motor", *rows]))
+    text = "name: own\nformat: table\ntime: t\nsignals:\n  position: [x, y, z]\n"
+    text += "  attitude: [qw, qx, qy, qz]\n  rotor_speed: {fields: [rpm], rotor: motr, unit: rpm}\n"
+    (tmp_path / "own.yaml").write_text(text)
+    with pytest.raises(RecordingError, match="'motr' for the rotor_speed, did you mean 'motor'"):
+        load_flight(path, topics=tmp_path / "own.yaml")
+    (tmp_path / "own.yaml").write_text(text.replace("motr", "motor"))
+    notes = load_flight(path, topics=tmp_path / "own.yaml").notes
+    assert not any(note.code is NoteCode.COLUMNS_UNREAD for note in notes)
+
+
 def test_a_format_without_a_shipped_map_asks_for_one(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setattr("tuner.recordings.content.shipped_maps", lambda _: ())
     (tmp_path / "a.csv").write_text("t,x\n0,1\n1,2\n")
