@@ -32,7 +32,7 @@ from tuner.vehicle import VehicleFile
 
 if TYPE_CHECKING:
     from tuner.evaluate.closed_loop import Simulation
-    from tuner.evaluate.records import Table
+    from tuner.evaluate.records import RmseTable
     from tuner.exporters.export import Exported
     from tuner.job.sensitivity import SensitivityResult
     from tuner.service.client import Client
@@ -105,7 +105,7 @@ def compare(
     *,
     out: Sequence[Named] = (),
     **options: Any,
-) -> Table:
+) -> RmseTable:
     """Simulate recorded flights with several vehicles and tabulate the RMSE, as ``tune compare``.
 
     Parameters
@@ -121,7 +121,7 @@ def compare(
 
     Returns
     -------
-    Table
+    RmseTable
         ``table.best`` is the closest set, ``table.of(vehicle, flight)`` its RMSE.
 
     Raises
@@ -130,7 +130,7 @@ def compare(
         The input cannot be used.
     """
     configure()
-    from tuner.evaluate.comparison import compare as compare_vehicles  # noqa: PLC0415 (jax)
+    from tuner.report.comparison import compare as compare_vehicles  # noqa: PLC0415 (jax)
 
     given = RecordingOptions.of(flights=flights, **options)
     names = [vehicles] if isinstance(vehicles, Named) else vehicles

@@ -24,7 +24,6 @@ from tuner.options import (
 )
 
 if TYPE_CHECKING:
-    from tuner.evaluate.comparison import FlightErrors
     from tuner.vehicle.scaling_laws import Airframe
 
 
@@ -107,23 +106,14 @@ def compare(
     from tuner.core.runtime import configure
 
     configure()
-    from tuner.evaluate.comparison import compare as compare_vehicles
-    from tuner.report.paper import check_figure, comparison_figure, write_figure
-
-    written = list(out or ())
-    if plot is not None:
-        check_figure(plot)
-        written.append(plot)
-
-    def draw(flown: Mapping[str, Mapping[str, FlightErrors]]) -> None:
-        if plot is not None:
-            write_figure(comparison_figure(flown), plot)
+    from tuner.report.comparison import compare as compare_vehicles
 
     with progress_on_terminal(quiet=quiet, verbose=True) as listener:
         table, settings = compare_vehicles(
-            recordings, vehicle, out or (), on_flown=draw, on_message=listener.on_message
+            recordings, vehicle, out or (), plot, on_message=listener.on_message
         )
     if not quiet:
+        written = [*(out or ()), *([] if plot is None else [plot])]
         print_comparison(table, settings, laps=laps, written=written)
 
 

@@ -19,8 +19,7 @@ from tuner.report.section import Cell, Table
 
 if TYPE_CHECKING:
     from tuner.config import Settings
-    from tuner.evaluate.records import Row
-    from tuner.evaluate.records import Table as Comparison
+    from tuner.evaluate.records import RmseTable
     from tuner.evaluate.simulation_files import Summary
     from tuner.exporters.export import Exported
     from tuner.job.bench import BenchResult
@@ -67,7 +66,6 @@ STYLE_OF_LOOK = {
     "not": "red",
     "worse": "red",
     "failure": "red",
-    "best": "bold",
 }
 """Class of the page's style -> of the terminal's."""
 
@@ -137,31 +135,17 @@ def print_estimates(estimates: Mapping[str, ScaledEstimate], path: Path) -> None
 
 
 def print_comparison(
-    comparison: Comparison, settings: Settings, *, laps: bool, written: Sequence[Path]
+    table: RmseTable, settings: Settings, *, laps: bool, written: Sequence[Path]
 ) -> None:
-    """Print the RMSE of every vehicle and flight, the lowest in bold and starred."""
+    """Print the RMSE of every vehicle and flight, the lowest marked."""
+    from tuner.report.comparison import best_in_words, comparison_table
+
     screen = console()
     screen.print(f"controller: {settings.origin['controller']}")
-    columns = ("flight", "vehicle", *(f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()))
-    rows = [_cells(row, comparison) for row in comparison.rows if laps or row.lap is None]
-    screen.print(rich_table(Table(columns, rows, words=("flight", "vehicle"))))
-    screen.print(f"best over all flights: {comparison.best or 'none, all of them crashed'}")
+    screen.print(rich_table(comparison_table(table, laps=laps)))
+    screen.print(best_in_words(table))
     for path in written:
         screen.print(f"written to {path}")
-
-
-def _cells(row: Row, comparison: Comparison) -> list[Cell | str]:
-    stretch = "all flights" if row.flight == "all" else row.flight
-    first = stretch if row.lap is None else f"{stretch} lap {row.lap}"
-    if row.crash_time is not None:
-        return [first, row.vehicle, f"crashed at {row.crash_time:.2f} s"]
-    winners = comparison.winners(row.flight, row.lap)
-    cells: list[Cell | str] = []
-    for axis, value in row.rmse:
-        best = winners.get(axis) == row.vehicle and len(comparison.vehicles) > 1
-        text = "-" if value is None else f"{value:.4f}"
-        cells.append(Cell(f"{text}*", look="best") if best else f"{text} ")
-    return [first, row.vehicle, *cells]
 
 
 WIDTH, LINES = 100, 30

@@ -15,21 +15,17 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.state import AIRBORNE
-from tuner.config import InletName, Settings, resolve_settings
-from tuner.core.errors import InputError
+from tuner.config import InletName
 from tuner.core.numerics import Array
-from tuner.core.shipped import find_config
 from tuner.evaluate.closed_loop import Forces, forces_of_terms
-from tuner.evaluate.records import RMSE_UNITS, AxesRmse, Row, Table, check_table_file, write_table
+from tuner.evaluate.records import RMSE_UNITS, AxesRmse, RmseRow, RmseTable
 from tuner.evaluate.simulation_files import roll_pitch_yaw
-from tuner.findings.findings import one_line
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.inlets import INLETS, window_seconds
@@ -48,13 +44,12 @@ from tuner.objective.segments import (
 from tuner.objective.simulation import BODY_ATTITUDE, MOTION, TRUE_ROTOR_SPEED, Flown, fly
 from tuner.objective.space import Space
 from tuner.objective.windows import Window
-from tuner.options import RecordingOptions
 from tuner.recordings.flight import Flight
-from tuner.search.job_flights import JobFlight, read_recordings, with_logged_parameters
+from tuner.search.job_flights import JobFlight
 from tuner.search.optimisers import MAX_STATE_SD
 from tuner.search.problem import limits_of
 from tuner.search.progress import plain_criterion
-from tuner.vehicle import ControllerFile, VehicleFile, check_rotors, read_vehicle
+from tuner.vehicle import ControllerFile, VehicleFile, check_rotors
 from tuner.vehicle.model import Model, model_of, schedule_of
 
 Pose = Literal["position", "attitude"]
@@ -482,69 +477,7 @@ OVERALL = "all"
 MIN_POSES = 10
 
 
-def compare(
-    options: RecordingOptions,
-    vehicles: Sequence[str] | Mapping[str, str | VehicleFile],
-    out: Sequence[Path] = (),
-    *,
-    on_flown: Callable[[Mapping[str, Mapping[str, FlightErrors]]], None] = lambda _: None,
-    on_message: Callable[[str], None] = lambda _: None,
-) -> tuple[Table, Settings]:
-    """Simulate recorded flights with several vehicles, and tabulate the RMSE of each.
-
-    Parameters
-    ----------
-    options
-        Flights, controller, job file and topics; the vehicle's mass is each vehicle file's own.
-    vehicles
-        Vehicle files or names of shipped ones; or label -> one of those, or a vehicle.
-    out
-        Files to write, by suffix .csv, .json or .html.
-    on_flown
-        Called with vehicle -> flight -> errors.
-    on_message
-        Called with a line on each flight that is left out, or simulated with another inlet.
-
-    Returns
-    -------
-    tuple
-        The table, and the settings.
-
-    Raises
-    ------
-    InputError
-        A named input does not exist or cannot be used, or a file cannot be written.
-    """
-    for path in out:
-        check_table_file(path)
-    settings, logged = with_logged_parameters(resolve_settings(options, fits=False))
-    read = {flight.resolve() for flight in settings.flights}
-    for path in out:
-        if path.resolve() in read:
-            raise InputError("--out", f"{path} is one of the flights", "name another file")
-    if not vehicles:
-        raise InputError("--vehicle", "names no vehicle", "name the vehicles to compare")
-    if not isinstance(vehicles, Mapping):
-        vehicles = {name: name for name in vehicles}
-    sets = {
-        label: named
-        if isinstance(named, VehicleFile)
-        else read_vehicle(find_config("vehicles", named, Path()))
-        for label, named in vehicles.items()
-    }
-    recordings, noticed = read_recordings(settings, fits=False)
-    for finding in (*logged, *noticed):
-        on_message(one_line(finding))
-    comparison = Comparison(recordings, settings.controller, window=settings.job.search.window)
-    flown = {label: comparison.fly(vehicle) for label, vehicle in sets.items()}
-    table = table_of(flown)
-    on_flown(flown)
-    for path in out:
-        write_table(table, path)
-    return table, settings
-
-
-def table_of(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Table:
+def table_of(flown: Mapping[str, Mapping[str, FlightErrors]]) -> RmseTable:
     """Return the table of vehicle -> flight -> errors."""
     rows = [
         row
@@ -553,12 +486,12 @@ def table_of(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Table:
         )
         for row in stretch
     ]
-    return Table(vehicles=tuple(flown), best=_best_vehicle(rows), rows=tuple(rows))
+    return RmseTable(vehicles=tuple(flown), best=_best_vehicle(rows), rows=tuple(rows))
 
 
-def _rows(vehicle: str, flights: Mapping[str, FlightErrors]) -> list[Row]:
-    def row(flight: str, lap: int | None, rmse: AxesRmse, crash_time: float | None) -> Row:
-        return Row(flight=flight, lap=lap, vehicle=vehicle, rmse=rmse, crash_time=crash_time)
+def _rows(vehicle: str, flights: Mapping[str, FlightErrors]) -> list[RmseRow]:
+    def row(flight: str, lap: int | None, rmse: AxesRmse, crash_time: float | None) -> RmseRow:
+        return RmseRow(flight=flight, lap=lap, vehicle=vehicle, rmse=rmse, crash_time=crash_time)
 
     rows = []
     for name, errors in flights.items():
@@ -577,7 +510,7 @@ def _rows(vehicle: str, flights: Mapping[str, FlightErrors]) -> list[Row]:
     return rows
 
 
-def _best_vehicle(rows: Sequence[Row]) -> str | None:
+def _best_vehicle(rows: Sequence[RmseRow]) -> str | None:
     """Return the vehicle whose overall RMSE has the smallest product over the axes."""
     scores = {}
     for row in rows:

@@ -1,14 +1,10 @@
-"""Records of flights' errors in ``result.json``, and their table as CSV, JSON or HTML."""
+"""Records of flights' errors, in ``result.json`` and in a table by vehicle and stretch."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from pathlib import Path
 
-from tuner.core.disk import check_file, write_text
-from tuner.core.errors import InputError
-from tuner.core.files import FiniteOrNone, Part, ResultFile, csv_text
+from tuner.core.files import FiniteOrNone, Part, ResultFile
 
 RMSE_UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
 AXES = {"position": ("x", "y", "z"), "attitude": ("roll", "pitch", "yaw")}
@@ -53,10 +49,7 @@ class PredictedErrors(Part):
     body_rate: FiniteOrNone
 
 
-TEMPLATE = Path(__file__).parent / "comparison.html.jinja"
-
-
-class Row(Part):
+class RmseRow(Part):
     """The RMSE of one vehicle over one stretch.
 
     Attributes
@@ -80,7 +73,7 @@ class Row(Part):
     crash_time: float | None
 
 
-class Table(ResultFile):
+class RmseTable(ResultFile):
     """The rows of all stretches and vehicles, and the vehicle closest to the recordings.
 
     ``best`` is None if each vehicle crashed on some flight. A run writes a table of its initial and
@@ -92,7 +85,7 @@ class Table(ResultFile):
     units: dict[str, str] = RMSE_UNITS
     vehicles: tuple[str, ...]
     best: str | None
-    rows: tuple[Row, ...]
+    rows: tuple[RmseRow, ...]
 
     def of(self, vehicle: str, flight: str, lap: int | None = None) -> AxesRmse:
         """Return the RMSE of a vehicle over a stretch."""
@@ -115,65 +108,3 @@ class Table(ResultFile):
             if known:
                 winners[axis] = min(known)[1]
         return winners
-
-
-def write_table(table: Table, path: Path) -> None:
-    """Write a comparison in the format that the file's suffix names.
-
-    Raises
-    ------
-    InputError
-        The suffix is none of .csv, .json and .html, or the file cannot be written.
-    """
-    write_text(path, _writer(path)(table))
-
-
-def check_table_file(path: Path) -> None:
-    """Refuse a file that `write_table` could not write, before anything is computed."""
-    _writer(path)
-    check_file(path)
-
-
-def _writer(path: Path) -> Callable[[Table], str]:
-    writers = {
-        ".csv": _csv,
-        ".json": lambda table: table.model_dump_json(indent=2) + "\n",
-        ".html": _html,
-    }
-    if path.suffix not in writers:
-        raise InputError(
-            path, f"a table cannot be written as '{path.suffix}'", "name a .csv, .json or .html"
-        )
-    return writers[path.suffix]
-
-
-def _csv(table: Table) -> str:
-    header = ("flight", "lap", "vehicle", "axis", "unit", "rmse", "best", "crash_time")
-    rows = []
-    for row in table.rows:
-        winners = table.winners(row.flight, row.lap)
-        for axis, unit in RMSE_UNITS.items():
-            first, rmse = int(winners.get(axis) == row.vehicle), getattr(row.rmse, axis)
-            place = (row.flight, row.lap, row.vehicle, axis, unit)
-            rows.append((*place, rmse, first, row.crash_time))
-    return csv_text(header, rows)
-
-
-def _html(table: Table) -> str:
-    from jinja2 import Environment, StrictUndefined  # noqa: PLC0415 (for HTML alone)
-
-    environment = Environment(undefined=StrictUndefined, autoescape=True)
-    stretches = dict.fromkeys((row.flight, row.lap) for row in table.rows)
-    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        table=table,
-        units=RMSE_UNITS,
-        stretches=[
-            {
-                "flight": flight,
-                "lap": lap,
-                "winners": table.winners(flight, lap),
-                "rows": [row for row in table.rows if (row.flight, row.lap) == (flight, lap)],
-            }
-            for flight, lap in stretches
-        ],
-    )

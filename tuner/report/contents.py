@@ -14,7 +14,7 @@ from tuner.core.disk import file_name, whole_file
 from tuner.core.files import Part, ResultFile, read_arrays
 from tuner.core.numerics import Array
 from tuner.design.proposals import Proposals
-from tuner.evaluate.records import Table
+from tuner.evaluate.records import RmseTable
 from tuner.findings.findings import Finding
 from tuner.ground.measurement import BenchRecord
 from tuner.result import (
@@ -56,7 +56,7 @@ class Contents:
     profiles: Profiles | None
     bench: BenchRecord | None
     search: SearchRecord | None
-    laps: Table | None
+    laps: RmseTable | None
     exports: Sequence[ExportRecord]
     traces: Mapping[str, Mapping[str, Array]]
 
@@ -91,7 +91,7 @@ def read_contents(folder: str | Path) -> Contents:
         profiles=Profiles.read_if_any(folder),
         bench=BenchRecord.read_if_any(folder),
         search=SearchRecord.read_if_any(folder),
-        laps=Table.read_if_any(folder),
+        laps=RmseTable.read_if_any(folder),
         exports=() if exported is None else tuple(exported.exports.values()),
         traces={names.get(key, key): arrays for key, arrays in read_traces(folder).items()},
     )

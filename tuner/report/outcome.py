@@ -112,7 +112,7 @@ class FlightOutcome:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FitOutcome:
     """The outcome of a fit.
 
     Attributes
@@ -142,7 +142,7 @@ class Outcome:
 
 def outcome(
     result: RunResult, bench: BenchRecord | None = None, exports: Sequence[ExportRecord] = ()
-) -> Outcome:
+) -> FitOutcome:
     """Return the outcome of a fit; it is usable with care if no export passed."""
     flights = sorted(
         (_flight_outcome(flight, result) for flight in result.flights),
@@ -152,7 +152,7 @@ def outcome(
     usability = _usability(result, checks, flights)
     if usability is Usability.USABLE and _refusal(exports):
         usability = Usability.WITH_CARE
-    return Outcome(
+    return FitOutcome(
         usability,
         _fit_summary(result) if bench is None else bench_in_words(bench),
         _uses(result, usability),
@@ -183,7 +183,7 @@ def warnings_of(findings: Sequence[Finding]) -> list[Cell]:
 
 
 def next_step(
-    result: RunResult, found: Outcome, folder: Path, exports: Sequence[ExportRecord] = ()
+    result: RunResult, found: FitOutcome, folder: Path, exports: Sequence[ExportRecord] = ()
 ) -> tuple[str, str]:
     """Return the next step after a fit: in words, and the command.
 

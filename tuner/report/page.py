@@ -27,7 +27,7 @@ from tuner.report.outcome import (
     warnings_of,
 )
 from tuner.report.paper import write_plots
-from tuner.report.section import Section, charts_json
+from tuner.report.section import PageSection, charts_json
 from tuner.report.sections.coefficients import bench, coefficients, effective, refits, sources
 from tuner.report.sections.flights import flights, forces
 from tuner.report.sections.search import provenance, remarks, search, selection
@@ -46,13 +46,13 @@ LIBRARIES = ("d3.min.js", "plot.umd.min.js")
 """Observable Plot and what it draws with."""
 
 
-Maker = Callable[[Contents], Section | None]
+Maker = Callable[[Contents], PageSection | None]
 
 
-def _of(part: Callable[[Contents], Any], section: Callable[[Any], Section | None]) -> Maker:
+def _of(part: Callable[[Contents], Any], section: Callable[[Any], PageSection | None]) -> Maker:
     """Return the section on one part of a folder; None where it is lacking or empty."""
 
-    def made(contents: Contents) -> Section | None:
+    def made(contents: Contents) -> PageSection | None:
         found = part(contents)
         return section(found) if found else None
 
@@ -82,7 +82,7 @@ SECTIONS: tuple[Maker, ...] = (
 )
 
 
-def sections_of(contents: Contents) -> tuple[Section, ...]:
+def sections_of(contents: Contents) -> tuple[PageSection, ...]:
     """Return the sections that apply."""
     sections = (section(contents) for section in SECTIONS)
     return tuple(
@@ -111,26 +111,23 @@ def render(folder: str | Path, *, plots: bool = False) -> Path:
     path = contents.folder / REPORT_FILE
     try:
         sections = sections_of(contents)
-        charts = [chart for section in sections for chart in section.charts]
-        page = _page(contents, sections, charts_json(charts))
+        page = _page(contents, sections)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         what = f"has files that do not go together ({type(error).__name__}: {error})"
         remedy = "was one edited? run tune again; report this where none was"
         raise InputError(contents.folder, what, remedy) from error
     if plots:
-        write_plots(charts, contents.folder)
+        write_plots([chart for section in sections for chart in section.charts], contents.folder)
     write_text(path, page)
     return path
 
 
-def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
-    environment = templates("tuner.report")
-    script = _source(environment, "figures.js") + _source(environment, "page.js")
-    library, compressed = _library()
+def _page(contents: Contents, sections: Sequence[PageSection]) -> str:
     run = contents.run
     found = None if run is None else outcome(run.result, contents.bench, contents.exports)
-    return environment.get_template("page.html.jinja").render(
-        about=contents.about,
+    return page_of(
+        contents.about.vehicle,
+        sections,
         outcome=found,
         checks=flights_table(found.checks if found else ()),
         next=next_step(run.result, found, contents.folder, contents.exports)
@@ -139,12 +136,31 @@ def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
         said=_examination_sentences(contents),
         warnings=warnings_of(contents.about.findings),
         exports=contents.exports,
+    )
+
+
+def page_of(title: str, sections: Sequence[PageSection], **first_screen: Any) -> str:
+    """Return a page of sections that works without a network.
+
+    Parameters
+    ----------
+    first_screen
+        What stands above them, by the names of ``page.html.jinja``.
+    """
+    environment = templates("tuner.report")
+    script = _source(environment, "figures.js") + _source(environment, "page.js")
+    library, compressed = _library()
+    charts = [chart for section in sections for chart in section.charts]
+    return environment.get_template("page.html.jinja").render(
+        title=title,
         sections=sections,
+        charts=charts,
         policy=_policy(script, library),
         style=Markup(_source(environment, "page.css")),
         script=Markup(script),
-        figures=Markup(_compressed(figures)),
+        figures=Markup(_compressed(charts_json(charts))),
         library=Markup(compressed),
+        **{"outcome": None, "said": (), "warnings": (), **first_screen},
     )
 
 

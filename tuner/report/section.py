@@ -55,7 +55,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """One part of a report.
 
     Attributes

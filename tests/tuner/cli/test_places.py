@@ -150,7 +150,7 @@ def test_ground_measurements_into_the_folder_of_a_fit(lab, capsys):
 
 
 def test_a_table_over_a_flight(lab, capsys, monkeypatch):
-    monkeypatch.setattr("tuner.evaluate.comparison.check_table_file", lambda _: None)
+    monkeypatch.setattr("tuner.report.comparison.check_table_file", lambda _: None)
     refused((*COMPARE, "--out", "{bag}"), "spin.bag is one of the flights", lab, capsys)
 
 

@@ -10,8 +10,9 @@ from tests.tuner.evaluate.test_comparison import errors
 from tuner.cli import main
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
-from tuner.evaluate.comparison import Comparison, compare, table_of, write_table
+from tuner.evaluate.comparison import Comparison, table_of
 from tuner.options import Options
+from tuner.report.comparison import compare, write_table
 from tuner.search.job_flights import JobFlight
 from tuner.vehicle import ControllerFile
 
@@ -86,16 +87,16 @@ def test_html_marks_the_best_and_needs_no_network(table, tmp_path):
     path = tmp_path / "t.html"
     write_table(table, path)
     page = html.parse(path)
-    first = page.xpath("//tbody/tr")[0]
-    assert [cell.text for cell in first.xpath("td[@class='best']")] == [
-        "0.1000",
-        "0.1000",
-        "1.0000",
-        "1.0000",
-        "1.0000",
+    first = page.xpath("//tr")[1]
+    assert [cell.text for cell in first.xpath("td/span[@class='badge well']")] == [
+        "0.1000*",
+        "0.1000*",
+        "1.0000*",
+        "1.0000*",
+        "1.0000*",
     ]
     assert "crashed at 30.00 s" in path.read_text()
-    assert "http" not in path.read_text()
+    assert "://" not in path.read_text()
 
 
 def test_names_are_escaped_in_html(tmp_path):
@@ -148,7 +149,7 @@ def test_the_command_prints_the_table(bag, capsys):
     assert main([*arguments, "--laps"]) == 0
     out = capsys.readouterr().out
     assert "small_circle lap 2" in out
-    assert "best over all flights: hovergames_updated" in out
+    assert "Best over all flights: hovergames_updated." in out
     assert main([*arguments, "--quiet"]) == 0
     assert capsys.readouterr().out == ""
 

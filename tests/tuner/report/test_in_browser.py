@@ -15,7 +15,8 @@ from playwright.sync_api import Browser
 
 from tests.tuner.evaluate.test_compare import GOOD
 from tests.tuner.report.browser import CHROMIUM, PATIENCE, Reading, chromium, reading
-from tuner.evaluate.comparison import table_of, write_table
+from tuner.evaluate.comparison import table_of
+from tuner.report.comparison import write_table
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium or Chrome on the path")
 

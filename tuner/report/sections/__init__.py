@@ -1,1 +1,1 @@
-"""The page's sections: of what the result folder holds, a `Section`; None if that is nothing."""
+"""The page's sections, each of a part of the result folder; None for a part that is lacking."""

@@ -32,8 +32,8 @@ from tuner.report.section import (
     Chart,
     Line,
     Look,
+    PageSection,
     Panel,
-    Section,
     Table,
     figures,
     short,
@@ -64,7 +64,7 @@ MAX_PERCENT = 1000.0
 """% at which a bar of the figure ends."""
 
 
-def coefficients(contents: Contents) -> Section | None:
+def coefficients(contents: Contents) -> PageSection | None:
     """Return the table, how wide the intervals are, and what makes them so."""
     knowledge = {} if contents.knowledge is None else contents.knowledge.coefficients
     charts = _intervals(knowledge)
@@ -83,7 +83,7 @@ def coefficients(contents: Contents) -> Section | None:
         "± 95 % is the longer side of the 95 % interval: that holds the true value in 95 of 100 "
         f"such experiments, if the model is right. {calibration_in_words(calibration())}"
     )
-    return Section("coefficients", "Coefficients", tables=tables, charts=charts, note=note)
+    return PageSection("coefficients", "Coefficients", tables=tables, charts=charts, note=note)
 
 
 def _name(name: str) -> Cell:
@@ -217,7 +217,7 @@ def _intervals(known: Mapping[str, CoefficientKnowledge]) -> list[Chart]:
     ]
 
 
-def refits(result: RunResult) -> Section | None:
+def refits(result: RunResult) -> PageSection | None:
     """Return a table of the errors by jackknife and bootstrap, where they were asked for."""
     rows: list[tuple[Cell | str, ...]] = [
         (
@@ -232,7 +232,7 @@ def refits(result: RunResult) -> Section | None:
     if not rows:
         return None
     columns = ("coefficient", "best", "±, this fit", "±, jackknife", "±, bootstrap", "unit")
-    return Section(
+    return PageSection(
         "refits",
         "Refits to other flights",
         refits_in_words(result),
@@ -242,7 +242,7 @@ def refits(result: RunResult) -> Section | None:
     )
 
 
-def sources(found: Mapping[str, Sources]) -> Section:
+def sources(found: Mapping[str, Sources]) -> PageSection:
     """Return a table of what the ground, the flights and both give."""
     rows: list[tuple[Cell | str, ...]] = []
     for name, source in found.items():
@@ -262,7 +262,7 @@ def sources(found: Mapping[str, Sources]) -> Section:
         "do they agree?",
     )
     words = ("coefficient", "unit", "do they agree?")
-    return Section(
+    return PageSection(
         "sources",
         "Ground and flights",
         tables=(Table(columns, rows, words=words),),
@@ -273,7 +273,7 @@ def sources(found: Mapping[str, Sources]) -> Section:
     )
 
 
-def effective(result: RunResult) -> Section | None:
+def effective(result: RunResult) -> PageSection | None:
     """Return both answers beside each other, and what each term that is lost is worth."""
     found = result.effective
     if found is None:
@@ -309,7 +309,9 @@ def effective(result: RunResult) -> Section | None:
         "unless the job file has target: physical. RMSE is over all flights, in position and in "
         "attitude."
     )
-    return Section("effective", "In Gazebo", (effective_in_words(found),), tables=tables, note=note)
+    return PageSection(
+        "effective", "In Gazebo", (effective_in_words(found),), tables=tables, note=note
+    )
 
 
 def _change(before: float, after: float) -> str:
@@ -328,7 +330,7 @@ NOT_USED = Look(GREY, marks=True)
 RESIDUAL = Look(PALETTE[1], marks=True)
 
 
-def bench(record: BenchRecord) -> Section:
+def bench(record: BenchRecord) -> PageSection:
     """Return a table of the experiments and a picture of each: data, law, residuals."""
     experiments = record.experiments
     rows = [
@@ -341,7 +343,7 @@ def bench(record: BenchRecord) -> Section:
         chart for number, experiment in enumerate(experiments)
         for chart in _experiment_charts(number, experiment)
     ]  # fmt: skip
-    return Section(
+    return PageSection(
         "bench",
         "Flights without a pose" if flown else "Ground measurements",
         sentences=(agreement_in_words(record),),

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.numerics import Array
-from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse
-from tuner.evaluate.records import Table as RmseTable
+from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse, RmseTable
 from tuner.findings.sentences import PREDICTED_UNITS
 from tuner.report.contents import Contents
 from tuner.report.outcome import flights_table, outcome
@@ -25,8 +24,8 @@ from tuner.report.section import (
     Dash,
     Line,
     Look,
+    PageSection,
     Panel,
-    Section,
     Table,
     rounded,
     short,
@@ -54,7 +53,7 @@ MIN_DRAWN_FORCE = 1e-9
 DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 
 
-def flights(contents: Contents) -> Section | None:
+def flights(contents: Contents) -> PageSection | None:
     """Return the RMSE of each flight, and four charts of each; held-out flights first."""
     result = contents.result
     found = [] if result is None else list(result.flights)
@@ -73,7 +72,7 @@ def flights(contents: Contents) -> Section | None:
         else "and simulated."
     )
     tables = [] if result is None else _tables(contents, result)
-    return Section(
+    return PageSection(
         "flights",
         "Flights",
         starts_in_words(found),
@@ -242,7 +241,7 @@ def _laps(table: RmseTable) -> list[tuple[Cell | str, ...]]:
     ]
 
 
-def forces(contents: Contents) -> Section | None:
+def forces(contents: Contents) -> PageSection | None:
     """Return two charts: forces and moments of each term, along each body axis.
 
     Of the flight that accelerates most: the others' curves are much the same.
@@ -268,7 +267,9 @@ def forces(contents: Contents) -> Section | None:
         "its curve. tune simulate --forces FILE.csv writes the same at full rate for any "
         "trajectory."
     )
-    return Section("forces", "Forces and moments by term", charts=charts, note=note, folded=True)
+    return PageSection(
+        "forces", "Forces and moments by term", charts=charts, note=note, folded=True
+    )
 
 
 def _weight_of(of_term: Mapping[str, Array]) -> float:

@@ -25,14 +25,14 @@ from tuner.report.section import (
     Chart,
     Line,
     Look,
+    PageSection,
     Panel,
-    Section,
     Table,
 )
 from tuner.vehicle.selection_table import SelectionRow
 
 
-def search(contents: Contents) -> Section | None:
+def search(contents: Contents) -> PageSection | None:
     """Return the waterfall of starts and the search's trace."""
     if contents.result is None or not contents.result.flights:
         return None
@@ -49,7 +49,7 @@ def search(contents: Contents) -> Section | None:
             " Loss (half the mean squared residual in σ) "
             f"{result.cost_initial:.4g} → {result.cost_best:.4g}."
         )
-    return Section("search", "Search", sentences=(how,), charts=charts, folded=True)
+    return PageSection("search", "Search", sentences=(how,), charts=charts, folded=True)
 
 
 def _waterfall(record: SearchRecord) -> list[Chart]:
@@ -123,7 +123,7 @@ def _trace(record: SearchRecord) -> list[Chart]:
     ]
 
 
-def selection(rows: Sequence[SelectionRow]) -> Section:
+def selection(rows: Sequence[SelectionRow]) -> PageSection:
     """Return the table of the selection and its figure."""
     shown = [row for row in rows if row.kept or nearly_kept(row)]
     table = [
@@ -153,7 +153,7 @@ def selection(rows: Sequence[SelectionRow]) -> Section:
     )
     charts = _figure(shown)
     title = "Terms beyond the motor model"
-    return Section("selection", title, sentences, tables=tables, charts=charts, note=note)
+    return PageSection("selection", title, sentences, tables=tables, charts=charts, note=note)
 
 
 def _figure(rows: Sequence[SelectionRow]) -> list[Chart]:
@@ -187,7 +187,7 @@ def _figure(rows: Sequence[SelectionRow]) -> list[Chart]:
 PROVENANCE_KEYS = ("command", "origin", "starts")
 
 
-def remarks(contents: Contents) -> Section | None:
+def remarks(contents: Contents) -> PageSection | None:
     """Return the findings that are no warnings; warnings are beside the outcome."""
     points = [
         Cell(f"{found.subject}: {sentence(found)} {remedy(found)}".strip())
@@ -195,10 +195,10 @@ def remarks(contents: Contents) -> Section | None:
         if found.level == "info"
     ]
     title = f"{len(points)} remark{'' if len(points) == 1 else 's'}"
-    return Section("remarks", title, points=points, folded=True) if points else None
+    return PageSection("remarks", title, points=points, folded=True) if points else None
 
 
-def provenance(contents: Contents) -> Section:
+def provenance(contents: Contents) -> PageSection:
     """Return everything that decides the numbers."""
     about, origins = contents.about, contents.about.settings.get("origin")
     rows: list[tuple[Cell | str, ...]] = [
@@ -227,7 +227,7 @@ def provenance(contents: Contents) -> Section:
         for name, value in settings.items()
     ]
     said = (f"Command: {about.command}",) if about.command else ()
-    return Section("provenance", "Provenance", said, tables=tables, folded=True)
+    return PageSection("provenance", "Provenance", said, tables=tables, folded=True)
 
 
 def _digest(value: object) -> str:

@@ -18,8 +18,8 @@ from tuner.report.section import (
     Heat,
     Line,
     Look,
+    PageSection,
     Panel,
-    Section,
     Table,
     figures,
 )
@@ -37,14 +37,14 @@ MIN_DRAWN_SHARE = 1e-4
 """Changes smaller than this share of the present RMSE are drawn as this."""
 
 
-def effects(knowledge: Knowledge) -> Section | None:
+def effects(knowledge: Knowledge) -> PageSection | None:
     """Return heat maps of the change for +1 %."""
     if not knowledge.outputs:
         return None
     names = [name for name in knowledge.coefficients if name in knowledge.outputs[0].change]
     charts = (_by_signal(knowledge, names), *_over_time(knowledge, names))
     note = "The RMSE for −10 % and +10 % of each coefficient is in sensitivity.csv."
-    return Section("effects", "Local sensitivity", charts=charts, note=note, folded=True)
+    return PageSection("effects", "Local sensitivity", charts=charts, note=note, folded=True)
 
 
 def _pose_rmse(rmse: Sequence[float | None]) -> float | None:
@@ -143,7 +143,7 @@ MAX_ANNOTATED = 14
 """Rows up to which a correlation is written into its cell."""
 
 
-def information(knowledge: Knowledge) -> Section:
+def information(knowledge: Knowledge) -> PageSection:
     """Return shares, worst directions, correlations, and the debts of what is fixed."""
     points = [
         Cell(direction_in_words(d), look="failure" if d.null else "") for d in knowledge.directions
@@ -151,7 +151,7 @@ def information(knowledge: Knowledge) -> Section:
     charts = _shares(knowledge)
     if len(knowledge.names) > 1:
         charts.append(_correlation(knowledge))
-    return Section(
+    return PageSection(
         "information",
         "Information and correlation",
         sentences=("The worst-determined combinations of coefficients:",),
@@ -259,7 +259,7 @@ def _correlation(knowledge: Knowledge) -> Chart:
     )
 
 
-def residuals(known: Sequence[Residual]) -> Section:
+def residuals(known: Sequence[Residual]) -> PageSection:
     """Return a table of the residuals and their autocorrelation."""
     panels = []
     for number, channel in enumerate(dict.fromkeys(r.channel for r in known)):
@@ -303,7 +303,7 @@ def residuals(known: Sequence[Residual]) -> Section:
         "noise means that the flights hold no more information; anything else is an effect that "
         "the model lacks, and standard errors are widened for it."
     )
-    return Section(
+    return PageSection(
         "residuals", "Residuals", tables=(table,), charts=(chart,), note=note, folded=True
     )
 
@@ -312,7 +312,7 @@ MAX_CHI_SQUARE = 12.0
 """Of the drawn χ² above the lowest."""
 
 
-def profiles(profiles: Sequence[Profile]) -> Section:
+def profiles(profiles: Sequence[Profile]) -> PageSection:
     """Return a chart a profile."""
     charts = [_chart(profile) for profile in profiles]
     note = (
@@ -321,7 +321,7 @@ def profiles(profiles: Sequence[Profile]) -> Section:
         "flights do not distinguish the values."
     )
     points = [Cell(_interval(profile)) for profile in profiles]
-    return Section("profiles", "Profile likelihood", points=points, charts=charts, note=note)
+    return PageSection("profiles", "Profile likelihood", points=points, charts=charts, note=note)
 
 
 def _interval(profile: Profile) -> str:
@@ -353,7 +353,7 @@ def _chart(profile: Profile) -> Chart:
     )
 
 
-def global_sensitivity(indices: GlobalSensitivity) -> Section:
+def global_sensitivity(indices: GlobalSensitivity) -> PageSection:
     """Return the indices over all and for each channel of each flight."""
     charts = (_over_all(indices), _each(indices))
     crashed = (
@@ -371,7 +371,7 @@ def global_sensitivity(indices: GlobalSensitivity) -> Section:
         note += " Most crashed: a narrower --span would show more."
     rows = [(name, figures(low), figures(high)) for name, (low, high) in indices.bounds.items()]
     table = Table(("coefficient", "from", "to"), rows, words=("coefficient",), fold="ranges")
-    return Section(
+    return PageSection(
         "global_sensitivity", "Global sensitivity", tables=(table,), charts=charts, note=note
     )
 
@@ -419,7 +419,7 @@ def _each(indices: GlobalSensitivity) -> Chart:
     )
 
 
-def next_flight(proposals: Proposals) -> Section:
+def next_flight(proposals: Proposals) -> PageSection:
     """Return the proposals, best first."""
     points = [Cell(sentence) for sentence in proposals_in_words(proposals)]
     known = (
@@ -465,10 +465,10 @@ def next_flight(proposals: Proposals) -> Section:
                 fold="each flight, each coefficient",
             )
         )
-    return Section("next_flight", "What to fly next", points=points, charts=charts, note=note)
+    return PageSection("next_flight", "What to fly next", points=points, charts=charts, note=note)
 
 
-def next_log(proposals: Sequence[LogProposal]) -> Section:
+def next_log(proposals: Sequence[LogProposal]) -> PageSection:
     """Return the effects of further signals, or of more samples, on intervals."""
     points = [Cell(log_in_words(proposal)) for proposal in proposals]
     note = (
@@ -476,4 +476,4 @@ def next_log(proposals: Sequence[LogProposal]) -> Section:
         "simulated and weighed with the noise named; what twice the samples of an input would "
         "bring follows from leaving out some of them."
     )
-    return Section("next_log", "What to log next time", points=points, note=note)
+    return PageSection("next_log", "What to log next time", points=points, note=note)
