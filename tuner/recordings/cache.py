@@ -42,6 +42,11 @@ def cache_root() -> Path:
     return Path(named) if named else cache_folder()
 
 
+def sidecar_path(recording: Path) -> Path:
+    """Return the path of a recording's side-car, whether or not it exists."""
+    return recording / "flight.yaml" if recording.is_dir() else recording.with_suffix(".yaml")
+
+
 def digest(path: Path) -> str:
     """Return the SHA-256 of a file, or of all the files in a folder with their names.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.numerics import Array
+from tuner.recordings.cache import sidecar_path
 from tuner.recordings.clocks import align_pose, message_times
 from tuner.recordings.consistency import DOUBTS, contradiction, correct_frames
 from tuner.recordings.defects import clean, is_position_frozen, without_stale_end
@@ -32,7 +33,6 @@ from tuner.recordings.topics import (
     load_topic_map,
     read_sidecar,
     shipped_maps,
-    sidecar_path,
 )
 from tuner.recordings.unit_detection import (
     MIN_SAMPLES,

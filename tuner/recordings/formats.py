@@ -17,9 +17,6 @@ from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
 from tuner.recordings.recording import Recording
 
-BINARY_SUFFIXES = (".bag", ".db3", ".mcap", ".ulg")
-"""Suffixes of binary recordings."""
-
 
 @dataclass(frozen=True)
 class Reader:
@@ -37,6 +34,8 @@ class Reader:
     open
         Opens a recording, given ``.msg`` files for types that it does not define. It imports the
         format's library on demand: all of them together take half a second.
+    suffixes
+        Those by which its files are known; a table of text has none of another format's.
     tabular
         Whether a recording is one table whose columns are named by the topic map alone.
     """
@@ -45,6 +44,7 @@ class Reader:
     files: str
     matches: Callable[[Path, bytes], bool]
     open: Callable[[Path, tuple[Path, ...]], Recording]
+    suffixes: tuple[str, ...] = ()
     tabular: bool = False
 
 
@@ -59,8 +59,11 @@ def _is_ros(path: Path, start: bytes) -> bool:
 
 def _is_table(path: Path, start: bytes) -> bool:
     """Return whether a file is Parquet, or a text with cells that is not called a bag or a log."""
-    is_text = path.suffix.lower() not in BINARY_SUFFIXES and is_table(start)
-    return start.startswith(b"PAR1") or is_text
+    return start.startswith(b"PAR1") or (not _is_called_binary(path) and is_table(start))
+
+
+def _is_called_binary(path: Path) -> bool:
+    return any(path.suffix.lower() in r.suffixes for r in READERS if not r.tabular)
 
 
 def _lazy_reader(module: str, name: str) -> Callable[[Path, tuple[Path, ...]], Recording]:
@@ -80,12 +83,14 @@ READERS: tuple[Reader, ...] = (
         "ROS 1 .bag, ROS 2 folders, .db3 and .mcap",
         _is_ros,
         _lazy_reader("ros.recording", "RosRecording"),
+        (".bag", ".db3", ".mcap"),
     ),
     Reader(
         "ulog",
         "PX4 .ulg",
         lambda _, start: start.startswith(b"ULog"),
         _lazy_reader("ulog", "ULogRecording"),
+        (".ulg",),
     ),
     Reader(
         "micro_sd",
@@ -98,6 +103,7 @@ READERS: tuple[Reader, ...] = (
         "MATLAB .mat",
         lambda _, start: start.startswith((b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")),
         _lazy_reader("matlab", "MatlabRecording"),
+        (".mat",),
         tabular=True,
     ),
     Reader(
@@ -105,6 +111,7 @@ READERS: tuple[Reader, ...] = (
         ".csv and .parquet",
         _is_table,
         _lazy_reader("table", "TableRecording"),
+        (".csv", ".tsv", ".parquet"),
         tabular=True,
     ),
 )
@@ -143,7 +150,7 @@ def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
         raise RecordingError(path, "is packed", "unpack it first")
     known = "; ".join(reader.files for reader in READERS)
     what = "is of no known format" if start else "is empty"
-    if path.suffix.lower() in BINARY_SUFFIXES and is_table(start):
+    if _is_called_binary(path) and is_table(start):
         what = f"is a text, and no {path.suffix}"
     raise RecordingError(path, what, f"known formats are {known}")
 

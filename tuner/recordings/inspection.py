@@ -16,7 +16,7 @@ from pydantic_core import to_jsonable_python
 
 from tuner.core.disk import exists
 from tuner.core.errors import InputError, RecordingError
-from tuner.recordings.cache import cache_file, digest, load_or_compute
+from tuner.recordings.cache import cache_file, digest, load_or_compute, sidecar_path
 from tuner.recordings.notes import Damage, Note
 
 if TYPE_CHECKING:
@@ -218,8 +218,7 @@ def _inspect(
 
         return inspect_recording(path, topics, namespace, keep=cache)
 
-    beside = path / "flight.yaml" if path.is_dir() else path.with_suffix(".yaml")
-    if not cache or topics is not None or beside.is_file():
+    if not cache or topics is not None or sidecar_path(path).is_file():
         return found()
     before = load_or_compute(Inspection, cache_file("inspection", digest(path), namespace), found)
     return dataclasses.replace(before, path=str(path))

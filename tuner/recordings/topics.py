@@ -17,6 +17,7 @@ from tuner.core.errors import ConfigError, did_you_mean
 from tuner.core.shipped import configs_folder, find_config
 from tuner.core.yaml_section import Number, Section, Whole, read_model, refuse
 from tuner.recordings import formats as recording_formats
+from tuner.recordings.cache import sidecar_path
 from tuner.recordings.flight import SIGNALS
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.recording import Clock
@@ -243,11 +244,6 @@ class Sidecar(Section):
     topics: str | None = None
     namespace: str = ""
     motor_order: MotorOrder | None = None
-
-
-def sidecar_path(recording: Path) -> Path:
-    """Return the path of a recording's side-car, whether or not it exists."""
-    return recording / "flight.yaml" if recording.is_dir() else recording.with_suffix(".yaml")
 
 
 def read_sidecar(recording: Path) -> Sidecar:

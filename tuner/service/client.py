@@ -28,6 +28,7 @@ from tuner.core.shipped import KINDS, configs_folder, find_config
 from tuner.core.yaml_section import Section, read_yaml
 from tuner.options import FILES, MODELS, FitOptions, taking
 from tuner.recordings.cache import digest
+from tuner.recordings.formats import READERS
 from tuner.recordings.topics import TopicMap, load_topic_map
 from tuner.result import Run, RunResult, forget, place_for, read_run
 from tuner.vehicle import read_vehicle
@@ -446,7 +447,7 @@ def _content_of(key: str, named: str | Section | None, base: Path) -> str | dict
         path = find_config(KINDS[key], named, base)
         if path.resolve().parent == (configs_folder() / KINDS[key]).resolve():
             return path.stem
-        named = READERS[key](path)
+        named = PARAMETER_FILES[key](path)
     return None if named is None else named.model_dump(mode="json", exclude_none=True)
 
 
@@ -460,7 +461,7 @@ def _read_topics(path: Path) -> TopicMap:
     return topics.replace(extends=None)
 
 
-READERS: Mapping[str, Callable[[Path], Section]] = {
+PARAMETER_FILES: Mapping[str, Callable[[Path], Section]] = {
     "vehicle": read_vehicle,
     "controller": read_controller,
     "topics": _read_topics,
@@ -468,7 +469,8 @@ READERS: Mapping[str, Callable[[Path], Section]] = {
 """Key of a job file -> reader of a file that it names."""
 
 
-SUFFIXES = (".bag", ".mcap", ".db3", ".ulg", ".csv", ".tsv", ".mat", ".parquet")
+SUFFIXES = {suffix for reader in READERS for suffix in reader.suffixes}
+"""Of recordings in a folder that is watched."""
 LOOK_INTERVAL_S = 2.0
 """Between two looks into the folder."""
 Marks = tuple[int, int]

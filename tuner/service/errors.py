@@ -90,9 +90,12 @@ def full_disk() -> Iterator[None]:
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise
-        raise NoSpaceError(
-            "the server", "has no space left", "free some space and try again"
-        ) from None
+        raise no_space() from None
+
+
+def no_space() -> NoSpaceError:
+    """Return the refusal of what would fill the disk."""
+    return NoSpaceError("the server", "has no space left", "free some space and try again")
 
 
 FIELD_PHRASES: Mapping[str, str] = {
@@ -110,20 +113,12 @@ FIELD_PHRASES: Mapping[str, str] = {
 }
 """Option of `tune` that a job has, too -> the same on the page where a job begins."""
 
-
 KEYS: Mapping[str, str] = {"config": "settings"}
 """Option of `tune` -> key of a request, where that is not its name."""
 
-
 _OPTION = re.compile(rf"--({'|'.join(FIELD_PHRASES)})\b(?!-)( [A-Z]+\b)?")
-
-
 _ANY_OPTION = re.compile(r"--([a-z]+(?:-[a-z]+)*)\b")
-
-
 _REQUEST_FIELDS = {field.name for field in fields(Options)}
-
-
 _COMMAND = re.compile(r",? which tune inspect FILE --suggest begins")
 
 
@@ -140,6 +135,11 @@ def over_http(text: str) -> str:
 def on_the_web(text: str) -> str:
     """Return a message with fields of the page in place of options of the command line."""
     return _OPTION.sub(lambda found: FIELD_PHRASES[found[1]], _COMMAND.sub("", text))
+
+
+def is_plain_name(name: str) -> bool:
+    """Return whether a visitor's name for something is printable, and not long."""
+    return bool(name.strip()) and name.isprintable() and len(name) <= 100
 
 
 def shown(name: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import secrets
@@ -25,7 +24,7 @@ from tuner.core.content_store import ContentStore
 from tuner.core.disk import inside
 from tuner.core.errors import InputError
 from tuner.service.database import Database, RecordingRow
-from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, full_disk, shown
+from tuner.service.errors import NotKnownError, TooManyError, full_disk, no_space, shown
 from tuner.service.inspection import inspect
 from tuner.service.request import recording_name, shown_name, stems
 from tuner.service.settings import ServiceSettings
@@ -113,7 +112,7 @@ class _Receiver:
         """Hash and write the buffer, unless others need what is free on the disk."""
         with full_disk():
             if shutil.disk_usage(self.path.parent).free < self._free_bytes:
-                raise OSError(errno.ENOSPC, "")
+                raise no_space()
             if self._file is None:
                 self._file = self.path.open("xb")
             self.hash.update(self.buffer)
@@ -187,7 +186,7 @@ def check_space(database: Database, store: ContentStore, settings: ServiceSettin
     limits = settings.limits
     free = (store.free_bytes(), shutil.disk_usage(settings.incoming).free)
     if any(left is not None and left < limits.free_bytes for left in free):
-        raise NoSpaceError("the server", "has no space left", "free some space and try again")
+        raise no_space()
     with database.reading() as session:
         stored = session.scalar(select(func.count()).select_from(RecordingRow)) or 0
     if stored >= limits.recordings:

@@ -18,6 +18,7 @@ from tuner.core.shipped import KINDS, shipped
 from tuner.core.yaml_section import Section, build, dump_yaml, refuse, section_of
 from tuner.options import FILES, FitOptions, Options
 from tuner.recordings.topics import TopicMap
+from tuner.service.errors import is_plain_name
 from tuner.vehicle import ControllerFile, VehicleFile
 
 FLIGHTS = "flights"
@@ -170,7 +171,7 @@ def check_request(
                 *(_remove_keys(folder, text) for text in (error.where, error.what, error.remedy))
             ) from None
     name = settled.vehicle.name
-    if not (name.strip() and name.isprintable() and len(name) <= 100):
+    if not is_plain_name(name):
         raise ConfigError("vehicle", "name is no plain name", "give one of up to 100 letters")
     return asked, name, frozenset(settled.job.holdout)
 

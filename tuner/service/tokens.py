@@ -11,6 +11,7 @@ from sqlalchemy import delete, select
 
 from tuner.core.errors import InputError
 from tuner.service.database import Database, SessionRow, TokenRow
+from tuner.service.errors import is_plain_name
 
 TOKEN_PREFIX = "tune_"
 """The prefix of tokens, by which a leaked one is recognised."""
@@ -26,7 +27,7 @@ def add(database: Database, name: str) -> str:
     InputError
         The name is taken, or no name.
     """
-    if not (name.strip() and name.isprintable() and len(name) <= 100):
+    if not is_plain_name(name):
         raise InputError("token", "needs a plain name of up to 100 letters", "say whose it is")
     token = TOKEN_PREFIX + secrets.token_urlsafe(32)
     with database.writing() as session:

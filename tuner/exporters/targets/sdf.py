@@ -85,8 +85,7 @@ def _tagged(model: SdfModel, vehicle: VehicleFile) -> Iterator[tuple[Element, di
 
 def center_of_mass(vehicle: VehicleFile) -> dict[str, float]:
     """Return name -> m from the origin of rotor positions to the centre of mass; empty if equal."""
-    names = [f"center_of_mass_{axis}" for axis in "xyz"]
-    offset = {name: vehicle.effects.get(name, 0.0) for name in names}
+    offset = {name: vehicle.effects.get(name, 0.0) for name in laws.CENTRE}
     return offset if any(offset.values()) else {}
 
 
