@@ -93,6 +93,13 @@ class FieldLayout:
     unit: str = "si"
     frame: str = "enu_flu"
 
+    @classmethod
+    def of(cls, pattern: str, unit: str = "si", frame: str = "enu_flu") -> FieldLayout:
+        """Return the layout with the fields of a pattern: ``v[{0,1}]`` is ``v[0]``, ``v[1]``."""
+        before, _, rest = pattern.partition("{")
+        parts, _, behind = rest.partition("}")
+        return cls(tuple(f"{before}{part}{behind}" for part in parts.split(",")), unit, frame)
+
 
 @dataclass(frozen=True)
 class ReadResult:

@@ -15,6 +15,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -296,21 +297,14 @@ MIN_RATE_SHARE = 0.8
 """A smaller share of the needed rate is too slow."""
 
 
-def _fields(*names: str, unit: str = "si") -> FieldLayout:
-    return FieldLayout(names, unit, "ned_frd")
-
-
-def _array(name: str, *, count: int = 3, unit: str = "si") -> FieldLayout:
-    return _fields(*(f"{name}[{i}]" for i in range(count)), unit=unit)
-
-
-_LOCAL_POSITION = {"position": _fields("x", "y", "z"), "velocity": _fields("vx", "vy", "vz")}
-_ATTITUDE = {"attitude": _array("q", count=4)}
+_ned = partial(FieldLayout.of, frame="ned_frd")
+_LOCAL_POSITION = {"position": _ned("{x,y,z}"), "velocity": _ned("{vx,vy,vz}")}
+_ATTITUDE = {"attitude": _ned("q[{0,1,2,3}]")}
 _ODOMETRY = {
-    "position": _array("position"),
-    "attitude": _array("q", count=4),
-    "velocity": _array("velocity"),
-    "body_rate": _array("angular_velocity"),
+    "position": _ned("position[{0,1,2}]"),
+    "attitude": _ned("q[{0,1,2,3}]"),
+    "velocity": _ned("velocity[{0,1,2}]"),
+    "body_rate": _ned("angular_velocity[{0,1,2}]"),
 }
 
 FIELD_LAYOUTS: Mapping[str, Mapping[str, FieldLayout]] = {
@@ -321,34 +315,34 @@ FIELD_LAYOUTS: Mapping[str, Mapping[str, FieldLayout]] = {
     "vehicle_odometry": _ODOMETRY,
     "vehicle_visual_odometry": _ODOMETRY,
     "vehicle_mocap_odometry": _ODOMETRY,
-    "vehicle_angular_velocity": {"body_rate": _array("xyz")},
-    "vehicle_acceleration": {"acceleration": _array("xyz")},
+    "vehicle_angular_velocity": {"body_rate": _ned("xyz[{0,1,2}]")},
+    "vehicle_acceleration": {"acceleration": _ned("xyz[{0,1,2}]")},
     "sensor_combined": {
-        "body_rate": _array("gyro_rad"),
-        "acceleration": _array("accelerometer_m_s2"),
+        "body_rate": _ned("gyro_rad[{0,1,2}]"),
+        "acceleration": _ned("accelerometer_m_s2[{0,1,2}]"),
     },
-    "actuator_motors": {"command": _array("control", count=4)},
-    "actuator_outputs": {"command": _array("output", count=4, unit="pwm_us")},
-    "esc_status": {"rotor_speed": _fields(*(f"esc[{i}].esc_rpm" for i in range(4)), unit="rpm")},
+    "actuator_motors": {"command": _ned("control[{0,1,2,3}]")},
+    "actuator_outputs": {"command": _ned("output[{0,1,2,3}]", unit="pwm_us")},
+    "esc_status": {"rotor_speed": _ned("esc[{0,1,2,3}].esc_rpm", unit="rpm")},
     "vehicle_rates_setpoint": {
-        "rate_setpoint": _fields("roll", "pitch", "yaw"),
-        "thrust_setpoint": _fields("thrust_body[2]"),
+        "rate_setpoint": _ned("{roll,pitch,yaw}"),
+        "thrust_setpoint": _ned("thrust_body[2]"),
     },
     "vehicle_attitude_setpoint": {
-        "attitude_setpoint": _array("q_d", count=4),
-        "thrust_setpoint": _fields("thrust_body[2]"),
+        "attitude_setpoint": _ned("q_d[{0,1,2,3}]"),
+        "thrust_setpoint": _ned("thrust_body[2]"),
     },
     "trajectory_setpoint": {
-        "reference_position": _array("position"),
-        "reference_velocity": _array("velocity"),
-        "reference_acceleration": _array("acceleration"),
+        "reference_position": _ned("position[{0,1,2}]"),
+        "reference_velocity": _ned("velocity[{0,1,2}]"),
+        "reference_acceleration": _ned("acceleration[{0,1,2}]"),
     },
     "vehicle_local_position_setpoint": {
-        "reference_position": _fields("x", "y", "z"),
-        "reference_velocity": _fields("vx", "vy", "vz"),
-        "reference_acceleration": _array("acceleration"),
+        "reference_position": _ned("{x,y,z}"),
+        "reference_velocity": _ned("{vx,vy,vz}"),
+        "reference_acceleration": _ned("acceleration[{0,1,2}]"),
     },
-    "battery_status": {"battery_voltage": _fields("voltage_v")},
+    "battery_status": {"battery_voltage": _ned("voltage_v")},
 }
 """Message, named as in a log -> signal -> its fields."""
 

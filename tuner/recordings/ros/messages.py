@@ -46,8 +46,8 @@ MOTION_CAPTURE = {
     ),
     "motion_capture_tracking_interfaces/msg/NamedPose": ("string name\ngeometry_msgs/Pose pose\n"),
 }
-_XYZ = ("x", "y", "z")
-_WXYZ = ("w", "x", "y", "z")
+_XYZ, _WXYZ, _ROTORS = "{x,y,z}", "{w,x,y,z}", "[{0,1,2,3}]"
+_layout = FieldLayout.of
 
 
 @dataclass
@@ -142,35 +142,31 @@ def _read(path: Path) -> MessageDefinition:
     return MessageDefinition(MessageDefinitionFormat.MSG, text)
 
 
-def _layout(prefix: str, fields: tuple[str, ...] = _XYZ) -> FieldLayout:
-    return FieldLayout(tuple(f"{prefix}.{name}" for name in fields))
-
-
 def _pose(prefix: str) -> dict[str, FieldLayout]:
     return {
-        "position": _layout(f"{prefix}position"),
-        "attitude": _layout(f"{prefix}orientation", _WXYZ),
-        "reference_position": _layout(f"{prefix}position"),
+        "position": _layout(f"{prefix}position.{_XYZ}"),
+        "attitude": _layout(f"{prefix}orientation.{_WXYZ}"),
+        "reference_position": _layout(f"{prefix}position.{_XYZ}"),
     }
 
 
 def _twist(prefix: str) -> dict[str, FieldLayout]:
     return {
-        "velocity": _layout(f"{prefix}linear"),
-        "body_rate": _layout(f"{prefix}angular"),
-        "reference_velocity": _layout(f"{prefix}linear"),
+        "velocity": _layout(f"{prefix}linear.{_XYZ}"),
+        "body_rate": _layout(f"{prefix}angular.{_XYZ}"),
+        "reference_velocity": _layout(f"{prefix}linear.{_XYZ}"),
     }
 
 
 _TRANSFORM = {
-    "position": _layout("transform.translation"),
-    "attitude": _layout("transform.rotation", _WXYZ),
+    "position": _layout(f"transform.translation.{_XYZ}"),
+    "attitude": _layout(f"transform.rotation.{_WXYZ}"),
 }
 _FIRST_BODY = _pose("rigidbodies[0].pose.")
 _VECTOR = {
-    "velocity": _layout("vector"),
-    "body_rate": _layout("vector"),
-    "acceleration": _layout("vector"),
+    "velocity": _layout(f"vector.{_XYZ}"),
+    "body_rate": _layout(f"vector.{_XYZ}"),
+    "acceleration": _layout(f"vector.{_XYZ}"),
 }
 
 #: Message type -> signal -> its fields, in the order of the signal's columns. The axes of a twist,
@@ -182,54 +178,50 @@ FIELD_LAYOUTS: Mapping[str, Mapping[str, FieldLayout]] = {
     "geometry_msgs/msg/TwistStamped": _twist("twist."),
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist("twist.twist."),
     "geometry_msgs/msg/Vector3Stamped": _VECTOR,
-    "geometry_msgs/msg/AccelStamped": {"acceleration": _layout("accel.linear")},
+    "geometry_msgs/msg/AccelStamped": {"acceleration": _layout(f"accel.linear.{_XYZ}")},
     # of several rigid bodies the first; a topic map names another
     "mocap4r2_msgs/msg/RigidBodies": _FIRST_BODY,
     "mocap_msgs/msg/RigidBodies": _FIRST_BODY,
     "motion_capture_tracking_interfaces/msg/NamedPoseArray": _pose("poses[0].pose."),
     "nav_msgs/msg/Odometry": {**_pose("pose.pose."), **_twist("twist.twist.")},
     "sensor_msgs/msg/Imu": {
-        "attitude": _layout("orientation", _WXYZ),
-        "body_rate": _layout("angular_velocity"),
-        "acceleration": _layout("linear_acceleration"),
+        "attitude": _layout(f"orientation.{_WXYZ}"),
+        "body_rate": _layout(f"angular_velocity.{_XYZ}"),
+        "acceleration": _layout(f"linear_acceleration.{_XYZ}"),
     },
     "gazebo_msgs/msg/LinkState": {**_pose("pose."), **_twist("twist.")},
     "gazebo_msgs/msg/ModelState": {**_pose("pose."), **_twist("twist.")},
-    "mavros_msgs/msg/RCOut": {
-        "command": FieldLayout(tuple(f"channels[{rotor}]" for rotor in range(4)), unit="pwm_us")
-    },
-    "mavros_msgs/msg/ESCStatus": {
-        "rotor_speed": FieldLayout(tuple(f"esc_status[{r}].rpm" for r in range(4)), unit="rpm")
-    },
+    "mavros_msgs/msg/RCOut": {"command": _layout(f"channels{_ROTORS}", unit="pwm_us")},
+    "mavros_msgs/msg/ESCStatus": {"rotor_speed": _layout(f"esc_status{_ROTORS}.rpm", unit="rpm")},
     "mavros_msgs/msg/ESCTelemetry": {
-        "rotor_speed": FieldLayout(tuple(f"esc_telemetry[{r}].rpm" for r in range(4)), unit="rpm")
+        "rotor_speed": _layout(f"esc_telemetry{_ROTORS}.rpm", unit="rpm")
     },
     "mavros_msgs/msg/AttitudeTarget": {
-        "attitude_setpoint": _layout("orientation", _WXYZ),
-        "rate_setpoint": _layout("body_rate"),
-        "thrust_setpoint": FieldLayout(("thrust",)),
+        "attitude_setpoint": _layout(f"orientation.{_WXYZ}"),
+        "rate_setpoint": _layout(f"body_rate.{_XYZ}"),
+        "thrust_setpoint": _layout("thrust"),
     },
     "mavros_msgs/msg/PositionTarget": {
-        "reference_position": _layout("position"),
-        "reference_velocity": _layout("velocity"),
-        "reference_acceleration": _layout("acceleration_or_force"),
+        "reference_position": _layout(f"position.{_XYZ}"),
+        "reference_velocity": _layout(f"velocity.{_XYZ}"),
+        "reference_acceleration": _layout(f"acceleration_or_force.{_XYZ}"),
     },
     "mav_msgs/msg/Actuators": {
-        "rotor_speed": FieldLayout(tuple(f"angular_velocities[{rotor}]" for rotor in range(4))),
-        "command": FieldLayout(tuple(f"normalized[{rotor}]" for rotor in range(4))),
+        "rotor_speed": _layout(f"angular_velocities{_ROTORS}"),
+        "command": _layout(f"normalized{_ROTORS}"),
     },
     "actuator_msgs/msg/Actuators": {
-        "rotor_speed": FieldLayout(tuple(f"velocity[{rotor}]" for rotor in range(4))),
-        "command": FieldLayout(tuple(f"normalized[{rotor}]" for rotor in range(4))),
+        "rotor_speed": _layout(f"velocity{_ROTORS}"),
+        "command": _layout(f"normalized{_ROTORS}"),
     },
     "controller_msgs/msg/FlatTarget": {
-        "reference_position": _layout("position"),
-        "reference_velocity": _layout("velocity"),
-        "reference_acceleration": _layout("acceleration"),
+        "reference_position": _layout(f"position.{_XYZ}"),
+        "reference_velocity": _layout(f"velocity.{_XYZ}"),
+        "reference_acceleration": _layout(f"acceleration.{_XYZ}"),
     },
-    "sensor_msgs/msg/BatteryState": {"battery_voltage": FieldLayout(("voltage",))},
-    "std_msgs/msg/Int32": {"lap": FieldLayout(("data",))},
-    "std_msgs/msg/UInt32": {"lap": FieldLayout(("data",))},
+    "sensor_msgs/msg/BatteryState": {"battery_voltage": _layout("voltage")},
+    "std_msgs/msg/Int32": {"lap": _layout("data")},
+    "std_msgs/msg/UInt32": {"lap": _layout("data")},
 }
 
 
