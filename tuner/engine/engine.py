@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import partial
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 from annotated_types import Interval
@@ -323,11 +324,7 @@ def engine_for(workers: int | None = None, cluster: str | None = None) -> Iterat
         with using(HERE) as engine:
             yield engine
         return
-    with extra("cluster", *DASK):
-        _quiet_dask()
-        from tuner.engine.dask_engine import on_dask  # noqa: PLC0415 (slow to import)
-
-    with on_dask(chosen) as engine, using(engine):
+    with _dask_engine().on_dask(chosen) as engine, using(engine):
         yield engine
 
 
@@ -344,15 +341,15 @@ def job_script_for(cluster: str | None) -> str:
         raise ConfigError(
             "--dry-run", "prints the job script of a batch system", "name one with --cluster FILE"
         )
+    script: str = _dask_engine().job_script(file, file.jobs)
+    return script
+
+
+def _dask_engine() -> ModuleType:
+    """Import the engine on Dask, which logs nothing unless the user has set that otherwise."""
     with extra("cluster", *DASK):
-        _quiet_dask()
-        from tuner.engine.dask_engine import job_script  # noqa: PLC0415 (slow to import)
+        import dask.config  # noqa: PLC0415 (an extra)
 
-    return job_script(file, file.jobs)
-
-
-def _quiet_dask() -> None:
-    """Have Dask log nothing, unless the user has set that otherwise: what fails is raised."""
-    import dask.config  # noqa: PLC0415 (an extra)
-
-    dask.config.update_defaults({"logging": {"distributed": logging.CRITICAL + 1}})
+        dask.config.update_defaults({"logging": {"distributed": logging.CRITICAL + 1}})
+        from tuner.engine import dask_engine  # noqa: PLC0415 (slow to import)
+    return dask_engine

@@ -335,9 +335,6 @@ def coefficient_reports(
     )
     climb = float(np.nanmax(np.abs(vertical))) if len(vertical) else 0.0
     driven = bool(has & {"command", "rotor_speed", "rate_setpoint", "reference_position"})
-    quick = {
-        n for n in ("command", "rotor_speed") if n in series and series[n].rate >= MIN_LAG_RATE_HZ
-    }
     tachometer, commands = "rotor_speed" in has, "command" in has
 
     def turning(axis: int, limit: float, name: str) -> tuple[str, str]:
@@ -347,41 +344,40 @@ def coefficient_reports(
             return "no", "nothing recorded drives the simulation"
         return _grade(float(rates[axis]), limit, f"{name} rate varies by {rates[axis]:.2f} rad/s")
 
-    curve = (
-        ("yes", "commands and rotor speed show the curve")
-        if tachometer and commands and command > CLEAR_COMMAND_SPREAD
-        else ("weakly", "only together with the motor constant")
-    )
-    lag = (
-        ("yes", "rotor speed recorded quickly enough")
-        if "rotor_speed" in quick
-        else ("weakly", "through the body rates only" if driven else "no rotor speed")
-    )
-    loop = {"reference_position"} <= has and "rate_setpoint" in has
+    def either(holds: bool, yes: str, otherwise: str, how: str = "weakly") -> tuple[str, str]:
+        return ("yes", yes) if holds else (how, otherwise)
+
     rules = {
         "weighing": ("no", "weigh it: forces and inertias scale with it"),
         "nothing": ("no", "such flights do not show it"),
         "roll": turning(0, CLEAR_ROLL_PITCH_RATE, "roll"),
         "pitch": turning(1, CLEAR_ROLL_PITCH_RATE, "pitch"),
         "yaw": turning(2, CLEAR_YAW_RATE, "yaw"),
-        "thrust curve": curve,
-        "rotor lag": lag,
-        "thrust": (
-            ("yes", "rotor speed against the weight")
-            if tachometer
-            else ("weakly", "only together with the RPM curve")
+        "thrust curve": either(
+            tachometer and commands and command > CLEAR_COMMAND_SPREAD,
+            "commands and rotor speed show the curve",
+            "only together with the motor constant",
+        ),
+        "rotor lag": either(
+            tachometer and series["rotor_speed"].rate >= MIN_LAG_RATE_HZ,
+            "rotor speed recorded quickly enough",
+            "through the body rates only" if driven else "no rotor speed",
+        ),
+        "thrust": either(
+            tachometer, "rotor speed against the weight", "only together with the RPM curve"
         ),
         "speed": _grade(speed, CLEAR_SPEED, f"flown at up to {speed:.1f} m/s"),
         "climb": _grade(climb, CLEAR_VERTICAL_SPEED, f"climbs at {climb:.1f} m/s"),
-        "closed loop": (
-            ("yes", "reference and set-points close the loop")
-            if loop
-            else ("no", "the loop's reference or set-points are missing")
+        "closed loop": either(
+            {"reference_position", "rate_setpoint"} <= has,
+            "reference and set-points close the loop",
+            "the loop's reference or set-points are missing",
+            "no",
         ),
-        "commands and rotor speed": (
-            ("yes", "commands and rotor speed recorded")
-            if tachometer and commands
-            else ("weakly", "no commands beside rotor speeds")
+        "commands and rotor speed": either(
+            tachometer and commands,
+            "commands and rotor speed recorded",
+            "no commands beside rotor speeds",
         ),
     }
     return tuple(
