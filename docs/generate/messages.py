@@ -109,8 +109,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "intervals hold that, and which terms are of that kind.",
     Code.CONTROLLER_ANSWERS: "Recorded commands follow from rate set-points and gyro with another "
     "P or I than the controller file's, or later or earlier than its filters and D let them. "
-    "Compare it with the autopilot's parameters; intervals hold what the difference moves. Where "
-    "one flight alone has another P, the line names it: leave it out.",
+    "Compare it with the autopilot's parameters, and the vehicle file's arms with the vehicle's; "
+    "intervals hold what the difference moves. Where one flight alone has another P, the line "
+    "names it: leave it out.",
     Code.ROTOR_SPEEDS_LATE: "Recorded rotor speeds come after the turning that they make, or "
     "before it: they were filtered, or are stamped otherwise than the gyro. Intervals hold what "
     "that moves.",

@@ -361,7 +361,8 @@ class Code(Worded):
         "controller_answers",  # AXIS, AXIS_error; names: P, I or late, the AXES
         sentences.controller_gains_differ,
         lambda finding: (
-            "Compare the controller file with the autopilot's parameters, as they are now."
+            "Compare the controller file with the autopilot's parameters, and the vehicle file's "
+            "arms with the vehicle's, as they are now."
             if finding.subject == sentences.CONTROLLER_FILE
             else "Leave it out, or fit it by itself with the gains that flew."
         ),

@@ -234,10 +234,10 @@ def controller_gains_differ(finding: Finding) -> str:
             f"{'later' if numbers[axis] > 0.0 else 'earlier'}"
             for axis in axes
         ]
-        than = "than the controller file's filters and D let it"
+        than = "than the simulated filters and D let it"
     else:
         parts = [f"{axis} reacts as if its {part} were {_excess(numbers, axis)}" for axis in axes]
-        than = "than in the controller file"
+        than = "than simulated"
     difference = f"{listed(parts)} {than}, by the recorded commands"
     if finding.subject != CONTROLLER_FILE:
         return as_sentence(f"{difference}, and the other flights do not")

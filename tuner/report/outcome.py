@@ -12,6 +12,7 @@ from pathlib import Path
 
 from tuner.core.phrases import as_sentence, listed, listed_within, metres
 from tuner.findings.findings import Code, Finding, remedy, sentence
+from tuner.findings.sentences import CONTROLLER_FILE
 from tuner.ground.measurement import BenchRecord, bench_in_words
 from tuner.report.result_texts import simulator_lacks
 from tuner.report.section import Cell, Table
@@ -28,6 +29,8 @@ MIN_UNCHANGED_RATIO = 0.8
 """An RMSE above this share of the initial one is unchanged."""
 MAX_PRIOR_DEVIATIONS = 3.0
 """A coefficient so many prior standard deviations from a default vehicle's is another vehicle's."""
+MAX_GAIN_RATIO = 1.2
+"""Gains of the recorded rate loop further off than this factor are another loop's."""
 Errors = tuple[float | None, float | None, float | None]
 """RMSE before and after a fit, and of the noise."""
 WRONG_VEHICLE_CODES = frozenset(
@@ -50,7 +53,11 @@ WRONG_INPUT_CODES = WRONG_VEHICLE_CODES | {
     Code.STAMPED_LATE,
 }
 """Warnings of inputs other than the flown ones: all numbers depend on them."""
-CONFLICT_CODES = WRONG_INPUT_CODES | {Code.GROUND_CONFLICT, Code.BENCH_CONFLICT}
+CONFLICT_CODES = WRONG_INPUT_CODES | {
+    Code.GROUND_CONFLICT,
+    Code.BENCH_CONFLICT,
+    Code.CONTROLLER_ANSWERS,
+}
 """Warnings of inputs or measurements that contradict the flights, to be resolved next."""
 CAUSE_CODES = WRONG_INPUT_CODES | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS, Code.INLET_CHOSEN}
 """Warnings that cause others."""
@@ -62,7 +69,6 @@ DOUBT_CODES = CONFLICT_CODES | frozenset(
         Code.FLIGHT_WORSE,
         Code.FLIGHT_NOT_FLOWN,
         Code.LAW_LACKING,
-        Code.CONTROLLER_ANSWERS,
         Code.HOLDING_BETTER,
         Code.TURNING_UNEXPLAINED,
         Code.TURNING_REGRESSED,
@@ -310,6 +316,8 @@ def _usability(
         return Usability.UNUSABLE
     if _is_unfounded(result, flights) or _not_of_default_vehicle(result):
         return Usability.UNUSABLE
+    if _is_of_another_loop(result):
+        return Usability.UNUSABLE
     fitted = [row for row in result.coefficients.values() if row.fitted]
     unsure = (
         "unchanged" in words,
@@ -330,6 +338,26 @@ def _is_unfounded(result: RunResult, flights: Sequence[FlightOutcome]) -> bool:
     ]
     unknown = bool(base) and all(identifiable is False for identifiable in base)
     return unknown and bool(flights) and not any(one.held_out for one in flights)
+
+
+def _is_of_another_loop(result: RunResult) -> bool:
+    """Return whether recorded commands have both P and I of another rate loop than the fitted one.
+
+    A fit finds gains that differ from the file's alone; one that contradicts the commands of all
+    its flights has put the error of a vehicle file, or of a controller file, into its coefficients.
+    """
+    parts = {
+        found.names[0]
+        for found in result.findings
+        if found.code is Code.CONTROLLER_ANSWERS
+        and found.subject == CONTROLLER_FILE
+        and any(
+            abs(math.log(found.numbers[axis])) > math.log(MAX_GAIN_RATIO)
+            for axis in found.names[1:]
+            if found.names[0] != "late"
+        )
+    }
+    return parts == {"P", "I"}
 
 
 def _not_of_default_vehicle(result: RunResult) -> list[str]:
@@ -412,6 +440,11 @@ def _reasons(result: RunResult, checks: Sequence[FlightOutcome]) -> tuple[str, .
     if others := _not_of_default_vehicle(result):
         sentences.append(
             f"Another vehicle than the default one flew: {listed(others)} ended far from its."
+        )
+    if _is_of_another_loop(result):
+        sentences.append(
+            "The recorded commands contradict the fitted rate loop: the vehicle file or the "
+            "controller file is another's."
         )
     if not result.search.converged:
         sentences.append("The search stopped at its limit of iterations: resume it.")

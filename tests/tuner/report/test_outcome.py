@@ -1,12 +1,14 @@
 """Whether a fit can be used: the held-out flights and what was noticed decide."""
 
 import math
+from pathlib import Path
 
 import pytest
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.evaluate.records import AxesRmse
 from tuner.findings.findings import Code, Finding, remedy
+from tuner.findings.sentences import CONTROLLER_FILE
 from tuner.report.outcome import (
     Usability,
     flights_table,
@@ -126,6 +128,32 @@ def test_a_fit_that_leaves_a_vehicle_that_was_not_given_is_not_usable(result):
             "Another vehicle than the default one flew: inertia_xx ended far from its."
         )
     assert outcome(noticing(ended(0.4), default)).usability is Usability.WITH_CARE
+
+
+def answering(part, roll, flight=CONTROLLER_FILE):
+    numbers = {"roll": roll, "roll_error": 0.005, "pitch": 1.0, "pitch_error": 0.004}
+    return Finding(Code.CONTROLLER_ANSWERS, "warning", flight, numbers, (part, "roll", "pitch"))
+
+
+@pytest.mark.parametrize(
+    ("answers", "expected"),
+    [
+        ((("P", 0.77), ("I", 0.74)), Usability.UNUSABLE),
+        ((("P", 1.25), ("I", 1.3), ("late", 0.004)), Usability.UNUSABLE),
+        ((("P", 0.9), ("I", 0.74)), Usability.WITH_CARE),
+        ((("I", 0.7), ("late", -0.004)), Usability.WITH_CARE),
+        ((("P", 0.77, "circle"), ("I", 0.74, "circle")), Usability.WITH_CARE),
+    ],
+)
+def test_commands_of_another_rate_loop_than_the_fitted_one_forbid_it(result, answers, expected):
+    """As of a vehicle file with arms half as long again, whose terms made up for them."""
+    answering_all = noticing(result, *(answering(*each) for each in answers))
+    found = outcome(answering_all)
+    assert found.usability is expected
+    assert ("another's" in found.reasons[-1]) == (expected is Usability.UNUSABLE)
+    words, command = next_step(answering_all, found, Path("x"))
+    assert words == remedy(answering_all.findings[0])
+    assert command == "tune report x --open"
 
 
 def test_flights_that_tell_nothing_of_the_vehicle_and_check_nothing_are_not_usable(result):
