@@ -73,7 +73,9 @@ class Bag1(ChunkedFile):
                 elif kind == bytes([INDEX]):
                     found = ChunkIndex(_number(header, b"conn", 4), begin, end)
                 elif kind == bytes([MESSAGE]):
-                    found = _number(header, b"conn", 4), _time(header.get(b"time", b""))
+                    time = _number(header, b"time", 8)  # seconds, and nanoseconds above them
+                    nanoseconds = (time & 0xFFFF_FFFF) * NS_PER_SECOND + (time >> 32)
+                    found = _number(header, b"conn", 4), nanoseconds
                 elif kind == bytes([CONNECTION]) and end <= min(
                     len(data), begin + MAX_RECORD_BYTES
                 ):
@@ -148,13 +150,6 @@ def _number(header: Header, name: bytes, size: int) -> int:
     if len(value) != size:
         raise DamagedError(f"a record lacks its '{name.decode()}'")
     return int.from_bytes(value, "little")
-
-
-def _time(value: bytes) -> int:
-    if len(value) != 8:
-        raise DamagedError("a message lacks its time")
-    seconds, nanoseconds = struct.unpack("<II", value)
-    return int(seconds) * NS_PER_SECOND + int(nanoseconds)
 
 
 def _connection(header: Header, data: bytes) -> Connection:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
-from rosbags.interfaces import MessageDefinition
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.messages import Bytes, Index, MessageBlock
@@ -24,6 +24,15 @@ MAX_CHUNK_BYTES = 128 << 20
 LOOSE_PER_CHUNK = 4096
 #: Pieces of an uncompressed chunk that are this near are read together.
 MAX_READ_GAP_BYTES = 1 << 16
+
+
+DEFINITION_FORMATS = {
+    "ros2msg": MessageDefinitionFormat.MSG,
+    "ros1msg": MessageDefinitionFormat.MSG,
+    "ros2idl": MessageDefinitionFormat.IDL,
+    "omgidl": MessageDefinitionFormat.IDL,
+}
+NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
 class FileBytes:

@@ -18,11 +18,18 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import MessageDefinition
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
-from tuner.recordings.ros.container import MAX_CHUNK_BYTES, Connection, Container, block_of
+from tuner.recordings.ros.container import (
+    DEFINITION_FORMATS,
+    MAX_CHUNK_BYTES,
+    NO_DEFINITION,
+    Connection,
+    Container,
+    block_of,
+)
 from tuner.recordings.ros.messages import MessageBlock
 
 #: Messages and bytes that are decoded together.
@@ -34,8 +41,6 @@ MAX_QUERY_STEPS = 5_000
 MAX_ATTEMPTS = 24
 #: Errors of a damaged file; SQLite takes absurd sizes for a lack of memory, and quotes any bytes.
 DAMAGE_ERRORS = (sqlite3.Error, MemoryError, OverflowError, UnicodeDecodeError)
-
-_NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
 @dataclass
@@ -121,18 +126,17 @@ class Db3(Container):
     def _read_definitions(self, database: sqlite3.Connection, has_definitions: bool) -> None:
         texts = {}
         if has_definitions:
-            forms = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
             for kind, encoding, text in database.execute(
                 "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             ):
-                if encoding in forms and isinstance(text, str):
-                    texts[kind] = MessageDefinition(forms[encoding], text)
+                if encoding in DEFINITION_FORMATS and isinstance(text, str):
+                    texts[kind] = MessageDefinition(DEFINITION_FORMATS[encoding], text)
         counts = self._counts(database)
         for number, topic, kind, encoding in database.execute(
             "SELECT id, name, type, serialization_format FROM topics"
         ):
             if encoding == "cdr" and isinstance(topic, str) and isinstance(kind, str):
-                definition = texts.get(kind, _NO_DEFINITION)
+                definition = texts.get(kind, NO_DEFINITION)
                 messages = counts.get(number, 0)
                 self.connections[number] = Connection(number, topic, kind, definition, messages)
 

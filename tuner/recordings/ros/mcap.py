@@ -14,19 +14,20 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import MessageDefinition
 from rosbags.typesys.msg import normalize_msgtype
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause
 from tuner.recordings.ros.container import (
+    DEFINITION_FORMATS,
     MAX_CHUNK_BYTES,
+    NO_DEFINITION,
     Chunk,
     ChunkedFile,
     ChunkIndex,
     Connection,
     Content,
-    DamagedError,
     FileBytes,
     Record,
     RecordContent,
@@ -42,12 +43,6 @@ MESSAGE_HEAD_BYTES = 9 + 22
 #: Channel, sequence and time of a message. The time is read with a sign, as in the indexes: a
 #: damaged one beyond 2^63 then fits into an array, centuries before the others.
 _HEAD = struct.Struct("<HIq")
-_FORMATS = {
-    "ros2msg": MessageDefinitionFormat.MSG,
-    "ros1msg": MessageDefinitionFormat.MSG,
-    "ros2idl": MessageDefinitionFormat.IDL,
-    "omgidl": MessageDefinitionFormat.IDL,
-}
 
 
 @dataclass
@@ -87,33 +82,28 @@ class Mcap(ChunkedFile):
                 number, _, time = _HEAD.unpack(data[begin : begin + _HEAD.size])
                 found = number, time
             elif op in (SCHEMA, CHANNEL) and whole and end - begin < MAX_CHUNK_BYTES:
-                with contextlib.suppress(DamagedError):
+                with contextlib.suppress(struct.error, ValueError):  # of a damaged one
                     self._read_definitions(op, data[begin:end])
             yield begin - 9, end, found
 
     def _read_definitions(self, op: int, content: bytes) -> None:
         """Read a schema or a channel."""
-        try:
-            if op == SCHEMA:
-                (number,) = struct.unpack_from("<H", content)
-                name, at = _string(content, 2)
-                encoding, at = _string(content, at)
-                text, _ = _string(content, at)
-                form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
-                kind = normalize_msgtype(name) if "/" in name else name
-                self._schemas[number] = (kind, MessageDefinition(form, text))
-            elif op == CHANNEL:
-                number, schema = struct.unpack_from("<HH", content)
-                topic, at = _string(content, 4)
-                encoding, _ = _string(content, at)
-                kind, definition = self._schemas.get(
-                    schema, ("", MessageDefinition(MessageDefinitionFormat.NONE, ""))
-                )
-                if encoding in ("cdr", "ros1") and kind:
-                    self.aligned = encoding == "cdr"
-                    self.connections[number] = Connection(number, topic, kind, definition, 0)
-        except (struct.error, ValueError):
-            raise DamagedError("a channel makes no sense") from None
+        if op == SCHEMA:
+            (number,) = struct.unpack_from("<H", content)
+            name, at = _string(content, 2)
+            encoding, at = _string(content, at)
+            text, _ = _string(content, at)
+            form = DEFINITION_FORMATS.get(encoding, NO_DEFINITION.format)
+            kind = normalize_msgtype(name) if "/" in name else name
+            self._schemas[number] = (kind, MessageDefinition(form, text))
+        elif op == CHANNEL:
+            number, schema = struct.unpack_from("<HH", content)
+            topic, at = _string(content, 4)
+            encoding, _ = _string(content, at)
+            kind, definition = self._schemas.get(schema, ("", NO_DEFINITION))
+            if encoding in ("cdr", "ros1") and kind:
+                self.aligned = encoding == "cdr"
+                self.connections[number] = Connection(number, topic, kind, definition, 0)
 
     def _entries(self, content: bytes) -> tuple[Index, Index]:
         entries = np.frombuffer(content, dtype="<i8").reshape(-1, 2)
