@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -147,6 +147,9 @@ CHECKPOINT = "checkpoint.npz"
 SECOND_CHECKPOINT = "checkpoint_hybrid.npz"
 FAR_OFF_RATIO = 3.0
 """Residuals over noise beyond which a flight is too far off for a polish before terms are tried."""
+FAR_OFF_TOLERANCE = 0.1
+"""Share of the loss below which a step is not worth the next one while most flights are far off
+and terms are still to be tried."""
 SAME_MINIMUM_TOLERANCE = 0.01
 """Relative difference of losses below which starts have reached the same minimum."""
 BOUND_MARGIN = 0.02
@@ -258,6 +261,8 @@ def _attempt(
     stages = stages_of(job, job.objective, method)
     if job.windows is not None:  # windows replace the stages of short horizons
         stages = tuple(stage for stage in stages if stage.horizon == job.objective.samples)
+    if provisional:
+        stages = with_far_off_tolerance(stages)
     free = free_parameters(job)
     start, spent = initial_progress(job.objective, starts), 0.0
     progress = start
@@ -341,6 +346,16 @@ def stages_of(job: Job, objective: Objective, method: str = "gradient") -> tuple
         windows=objective.segments.windowed,
         robust=settings.robust == "huber",
         steps=settings.max_iterations,
+    )
+
+
+def with_far_off_tolerance(stages: Sequence[Stage]) -> tuple[Stage, ...]:
+    """Return stages of which the long ones end early where most flights stay far off."""
+    return tuple(
+        replace(stage, far_off_tolerance=FAR_OFF_TOLERANCE)
+        if stage.offsets and not stage.drops_offsets
+        else stage
+        for stage in stages
     )
 
 

@@ -304,6 +304,7 @@ def _has_converged(
     # windows with residuals far above the noise have no sharp minimum
     vague = problem.objective.segments.windowed & (worst > MATCHED_RATIO)
     least = np.where(vague, max(stage.tolerance, WINDOW_TOLERANCE), stage.tolerance)
+    least = np.where(worst > MATCHED_RATIO, np.maximum(least, stage.far_off_tolerance), least)
     if stage.rough:
         little = predicted <= stage.tolerance
     elif not problem.last:

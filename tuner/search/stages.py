@@ -69,6 +69,9 @@ class Stage:
         Whether the loop's choices are tried both ways.
     rough
         Whether it ends where the normal equations predict a gain below the tolerance.
+    far_off_tolerance
+        The least tolerance where most flights are far off: a model that lacks terms has no minimum
+        worth the way.
     """
 
     name: str
@@ -85,6 +88,7 @@ class Stage:
     target_loss: float = 0.0
     tries_choices: bool = False
     rough: bool = False
+    far_off_tolerance: float = 0.0
 
 
 def horizon_stages(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:

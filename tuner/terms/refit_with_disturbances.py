@@ -19,7 +19,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.information import with_start_values
 from tuner.objective.space import Space
-from tuner.search.estimation import LAST_POLISH, free_parameters, polished
+from tuner.search.estimation import LAST_POLISH, ROUGH_TOLERANCE, free_parameters, polished
 from tuner.search.findings import UNMATCHED_CODES, outlying_flights, unmatched_findings
 from tuner.search.listener import Reporter
 from tuner.search.problem import Job
@@ -174,13 +174,15 @@ def with_disturbances(
         better = True  # a fit of simulated flights that lacks a significant lag refutes nothing
     else:
         if set(seen.selected.kept) != set(had):
-            # the fit with other terms is one of another model: not comparable
+            # the fit with other terms is one of another model: not comparable. It is compared, not
+            # kept: what a rough fit leaves is less than its errors
             fitted = polished(
                 job,
                 again,
                 free=free_parameters(job),
                 title="simulated",
                 on_progress=partial(reporter.on_progress, job),
+                left=ROUGH_TOLERANCE,
             )
         alternatives = alternatives_of(fitted.objective, fitted.point)
         before = examine(

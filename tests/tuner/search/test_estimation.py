@@ -283,6 +283,14 @@ def test_what_is_held_keeps_its_value_and_the_others_are_fitted():
     }
 
 
+def test_long_stages_before_the_polish_end_early_where_flights_stay_far_off():
+    stages = plan("gradient", 4000, 400.0, windows=False, robust=True, steps=9)
+    early = estimation.with_far_off_tolerance(stages)
+    long = {"first 5 s", "first 8 s", "whole length"}
+    assert {stage.name for stage in early if stage.far_off_tolerance} == long
+    assert [replace(stage, far_off_tolerance=0.0) for stage in early] == list(stages)
+
+
 @pytest.mark.parametrize("own", [Loop(0.0, 1.0), Loop(1.0, 0.0)])
 def test_a_search_begins_with_the_set_ups_own_loop(own):
     objective = with_loop(problem(PLAIN), own)

@@ -120,7 +120,7 @@ def test_a_loss_that_is_no_number_is_never_better(advanced):
 
 def ends(last, gain, accepted, worst, *, step_reduction=1.0, tries=1):
     """Return whether a stage ends after so many tries at a loss of 1."""
-    stage = SimpleNamespace(tolerance=1e-4, rough=False, target_loss=0.0)
+    stage = SimpleNamespace(tolerance=1e-4, rough=False, target_loss=0.0, far_off_tolerance=0.0)
     segments = SimpleNamespace(windowed=False)
     problem = SimpleNamespace(stage=stage, last=last, objective=SimpleNamespace(segments=segments))
     step = SimpleNamespace(
@@ -154,6 +154,30 @@ def test_rejected_tries_end_the_last_stage_once_the_next_promises_nothing(
 ):
     ended = ends(last, 0.1, False, 2.0 * MATCHED_RATIO, step_reduction=step_reduction, tries=tries)
     assert ended is (tries == 4 and not (last and step_reduction > 1e-4))
+
+
+@pytest.mark.parametrize("far_off", [0.0, 0.1])
+@pytest.mark.parametrize("fall", [0.08, 0.12])
+@pytest.mark.parametrize("accepted", [False, True])
+@pytest.mark.parametrize("worst", [0.9 * MATCHED_RATIO, 1.1 * MATCHED_RATIO])
+def test_a_stage_ends_before_its_minimum_where_most_flights_are_far_off(
+    far_off, fall, accepted, worst
+):
+    stage = Stage("first 8 s", 3200, tolerance=1e-4, far_off_tolerance=far_off)
+    segments = SimpleNamespace(windowed=False)
+    problem = SimpleNamespace(stage=stage, last=False, objective=SimpleNamespace(segments=segments))
+    step = SimpleNamespace(
+        predicted_reduction=np.array([0.5]),
+        step_reduction=np.array([0.5]),
+        accepted=np.array([accepted]),
+        loss=np.array([1.0]),
+        stalled=np.array([False]),
+        sums=SimpleNamespace(compared=np.array([1000.0])),
+    )
+    ended = optimisers._has_converged(
+        problem, step, np.array([worst]), [step.loss + fall, step.loss]
+    )
+    assert ended is (far_off > fall and accepted and worst > MATCHED_RATIO)
 
 
 # CMA-ES on two short simulated flights whose truth is known

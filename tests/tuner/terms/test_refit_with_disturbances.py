@@ -218,8 +218,9 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     def with_lag_terms(found: Any, there: Fitted, own: Any, _: Any) -> Any:
         return (seen(replace(found.selected)) if lag else found), there, own
 
-    def polish(_: Job, fit: Fitted, *, title: str, **__: Any) -> Fitted:
+    def polish(_: Job, fit: Fitted, *, title: str, left: Any = None, **__: Any) -> Fitted:
         polished.append(title)
+        assert (left is not None) == (title == "simulated"), "rough where it is not kept"
         return replace(fit, wall_time=float(len(polished)))
 
     def examine(fit: Fitted, *, selection_shifts: Any, predictor: Any = None, **_: Any) -> Any:
