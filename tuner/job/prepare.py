@@ -135,6 +135,7 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
         ),
         *_recorded_twice(job),
         *_default_mass(job),
+        *_no_tachometer(job),
         *_wrong_vehicle(job),
         *_commands_as_dshot(job),
         *_lift_changes(job),
@@ -218,6 +219,14 @@ def _default_mass(job: Job) -> Iterator[Finding]:
     default = _is_default(settings.origin, "vehicle")
     code = Code.VEHICLE_NOT_GIVEN if default else Code.MASS_NOT_GIVEN
     yield code.warning(settings.vehicle.name, mass=settings.vehicle.mass)
+
+
+def _no_tachometer(job: Job) -> Iterator[Finding]:
+    """Warn of rotor speeds by the vehicle file alone, which motor_constant goes with."""
+    if any(flight.has("rotor_speed") for flight in job.fitted):
+        return
+    if "input_scaling" not in {*job.space.free, *bypassed_by(job.inlets, job.fitted)}:
+        yield Code.NO_TACHOMETER.warning("input_scaling")
 
 
 def _wrong_vehicle(job: Job) -> Iterator[Finding]:

@@ -202,6 +202,31 @@ def test_a_mass_that_no_user_gave_is_named(full_flight, full_bag, updated):
         assert (said.code, said.numbers["mass"]) == (code, job.settings.vehicle.mass)
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (("actuator", False, FREE), True),
+        (("actuator", True, FREE), False),
+        (("actuator", False, (*FREE, "input_scaling")), False),
+        (("rotor_speed", True, FREE), False),
+    ],
+)
+def test_rotor_speeds_that_are_the_files_alone_are_named(
+    given, said, full_flight, full_bag, updated
+):
+    inlet, tachometer, free = given
+
+    def without(by_signal):
+        return {n: v for n, v in by_signal.items() if tachometer or n != "rotor_speed"}
+
+    flight = replace(
+        full_flight, series=without(full_flight.series), signals=without(full_flight.signals)
+    )
+    job = job_through(inlet, flight, full_bag, updated, free=free)
+    codes = {finding.code for finding in check_recordings(job)}
+    assert (Code.NO_TACHOMETER in codes) is said
+
+
 def test_a_vehicle_that_was_not_given_is_said_before_the_search(full_bag, tmp_path):
     class ToldError(Exception):
         """Ends the run where it is told."""
