@@ -492,13 +492,15 @@ def test_rows_that_enter_a_loop_linearly_are_what_they_are_one_by_one(monkeypatc
             np.testing.assert_allclose(mine, theirs, rtol=1e-11, atol=1e-11)
 
 
-def looping(given):
+def looping(given, call=lambda function: function):
     """Return rows times what a loop in a branch finds, which takes time only where it is taken."""
 
-    def found():
-        return lax.fori_loop(0, 2, lambda _, x: jnp.sin(x), given["x"])
+    @call
+    def found(x):
+        return lax.fori_loop(0, 2, lambda _, x: jnp.sin(x), x)
 
-    return lambda row: lax.cond(given["slot"] > 0, lambda: row * found(), lambda: row)
+    x = given["x"]
+    return lambda row: lax.cond(given["slot"] > 0, lambda: row * found(x), lambda: row)
 
 
 @pytest.mark.parametrize(
@@ -509,8 +511,9 @@ def looping(given):
         lambda _: lambda row: jnp.where(row > 0.0, row, 0.0),
         lambda _: lambda row: row.astype(int).astype(float),
         looping,
+        lambda given: looping(given, jax.jit),
     ],
-    ids=["squares", "quotients", "signs", "whole numbers", "loops"],
+    ids=["squares", "quotients", "signs", "whole numbers", "loops", "loops in calls"],
 )
 def test_rows_that_do_not_enter_linearly_stay_rows(monkeypatch, body):
     size, lanes = 24, 3
@@ -534,6 +537,42 @@ def test_rows_that_do_not_enter_linearly_stay_rows(monkeypatch, body):
     program = Program(function, arguments)
     assert program.is_kernel
     np.testing.assert_allclose(program(values, lanes=lanes).values, program.by_xla(values).values)
+
+
+def test_a_table_that_rows_change_is_as_it_was_after_them():
+    """Each changes a copy of it: what a map reads is not changed in place."""
+    size = 24
+
+    def function(given, _):
+        slot, ones = given["slot"], jnp.ones(size)
+
+        def with_ones(i, table):
+            return lax.dynamic_update_index_in_dim(table, ones, i, 0)
+
+        table = lax.fori_loop(0, 9, with_ones, given["table"])
+
+        def row(_, row):
+            changed = lax.dynamic_update_index_in_dim(table, 2.0 * given["x"], slot, 0)
+            return None, row * changed[slot] + row * changed[slot + 1]
+
+        return lax.scan(row, None, given["matrix"])[1], table
+
+    arguments = {
+        "matrix": Argument((size, size), float, lanes=True),
+        "table": Argument((size, size), float, lanes=True),
+        "x": Argument((size,), float, lanes=True),
+        "slot": Argument((), int, lanes=False),
+    }
+    random = np.random.default_rng(6)
+    values = {name: random.normal(size=(size, size, 2)) for name in ("matrix", "table")}
+    values["x"] = random.normal(size=(size, 2))
+    values["slot"] = np.array(3)
+    program = Program(function, arguments)
+    assert program.is_kernel
+    for mine, theirs in zip(
+        program(values, lanes=2).values, program.by_xla(values).values, strict=True
+    ):
+        np.testing.assert_allclose(mine, theirs)
 
 
 def test_a_transposed_matrix_is_the_one_before_a_change_in_place():
