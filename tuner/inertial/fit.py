@@ -321,9 +321,8 @@ def _prior(problem: _Problem, name: str, gain: float | None) -> Array:
 
 def _filter(tables: Sequence[Array], kernel: Array) -> Array:
     """Return the filtered rows (n, k) of all stretches, without the filter's first."""
-    shape = (-1, *(1,) * (tables[0].ndim - 1))
     parts = [
-        signal.oaconvolve(table, kernel.reshape(shape), "valid", axes=0)
+        signal.lfilter(kernel, [1.0], table, axis=0)[len(kernel) - 1 :]
         for table in tables
         if len(table) >= len(kernel)
     ]
