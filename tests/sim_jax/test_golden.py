@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -56,18 +56,18 @@ def test_not_a_number_never_passes() -> None:
     assert deviation("x", np.array([3.0]), np.array([np.nan]), 1.0).passed
 
 
-def test_command_exits_1_on_a_deviation_and_on_an_unknown_file(tmp_path: Path) -> None:
+def test_command_exits_1_on_a_deviation_and_on_an_unknown_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     frame = read(FILES["motor_command_map"]).frame.copy()
     frame.loc[0, "ref0_f32_min"] += 1.0
     frame.to_csv(tmp_path / "motor_command_map.csv.gz", index=False)
     pd.DataFrame({"a": [1]}).to_csv(tmp_path / "surprise.csv.gz", index=False)
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.golden_check", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 1
-    assert "reference speed, single precision" in done.stdout
-    assert "no check is known" in done.stdout
-    assert "2 out of tolerance" in done.stdout
+    monkeypatch.setattr(sys, "argv", ["golden_check", str(tmp_path)])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module("tests.golden_check", run_name="__main__")
+    assert ended.value.code == 1
+    said = capsys.readouterr().out
+    assert "reference speed, single precision" in said
+    assert "no check is known" in said
+    assert "2 out of tolerance" in said

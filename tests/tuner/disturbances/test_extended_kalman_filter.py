@@ -27,8 +27,6 @@ from tuner.disturbances.ticks import TickSamples
 from tuner.objective.segments import Segments
 from tuner.vehicle.model import coefficients_in, model_of, schedule_of
 
-pytestmark = pytest.mark.usefixtures("optimised")
-
 TICKS = 6
 ROOT = Path(__file__).parents[3]
 SD = {"position": 1e-3, "attitude": 2e-3, "body_rate": 0.02, "rotor_speed": 100.0}
@@ -107,7 +105,6 @@ def folder(tmp_path_factory):
     keep_code_in(KERNELS)
 
 
-@pytest.mark.usefixtures("folder")
 def test_commands_that_once_took_longer_change_nothing() -> None:
     """Only how many are corrected on their way: one more is one that has reached the motors."""
     schedule, inputs, expected = hovering()
@@ -120,7 +117,7 @@ def test_commands_that_once_took_longer_change_nothing() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("folder")
+@pytest.mark.usefixtures("folder", "optimised")
 def test_innovations_are_those_of_a_filter_in_matrices() -> None:
     schedule, inputs, expected = hovering()
     white = told(schedule, inputs, expected)[0][..., 0]
@@ -171,6 +168,7 @@ def test_innovations_are_those_of_a_filter_in_matrices() -> None:
         covariance = follow @ (covariance - gain.T @ gain) @ follow.T + fresh
 
 
+@pytest.mark.usefixtures("optimised")
 def test_another_process_traces_nothing_again(folder) -> None:
     sums = [float(np.sum(each)).hex() for each in told(*hovering())]
     assert len(list(folder.glob("*.o"))) >= 2
