@@ -435,6 +435,14 @@ def test_an_array_is_laid_out_without_a_warning():
         assert Argument.of(jnp.zeros(3, jnp.float32), lanes=True).dtype == jnp.float32
 
 
+ROWS = 24
+WITH_ROWS = {
+    "x": Argument((ROWS,), float, lanes=True),
+    "matrix": Argument((ROWS, ROWS), float, lanes=True),
+    "slot": Argument((), int, lanes=False),
+}
+
+
 def pushed(given, _):
     """Return a matrix times a map's Jacobian from both sides: choices, delay lines, divisions."""
     x, matrix, slot = given["x"], given["matrix"], given["slot"]
@@ -469,20 +477,15 @@ def pushed(given, _):
 
 
 def test_rows_that_enter_a_loop_linearly_are_what_they_are_one_by_one(monkeypatch):
-    size, lanes, maps = 24, 5, []
+    lanes, maps = 5, []
     make = lanes_linear._Map.__init__
     monkeypatch.setattr(lanes_linear._Map, "__init__", lambda *a: (maps.append(a), make(*a))[1])
     random = np.random.default_rng(3)
     values = {
-        "x": random.normal(size=(size, lanes)),
-        "matrix": random.normal(size=(size, size, lanes)),
+        "x": random.normal(size=(ROWS, lanes)),
+        "matrix": random.normal(size=(ROWS, ROWS, lanes)),
     }
-    arguments = {
-        "x": Argument((size,), float, lanes=True),
-        "matrix": Argument((size, size), float, lanes=True),
-        "slot": Argument((), int, lanes=False),
-    }
-    program = Program(pushed, arguments)
+    program = Program(pushed, WITH_ROWS)
     assert program.is_kernel
     assert len(maps) == 3, "one of both products, one in a branch, one after it"
     for slot in range(3):
@@ -516,35 +519,29 @@ def looping(given, call=lambda function: function):
     ids=["squares", "quotients", "signs", "whole numbers", "loops", "loops in calls"],
 )
 def test_rows_that_do_not_enter_linearly_stay_rows(monkeypatch, body):
-    size, lanes = 24, 3
+    lanes = 3
 
     def function(given, _):
         row = body(given)
         return lax.scan(lambda _, r: (None, row(r)), None, given["matrix"])[1]
 
     monkeypatch.setattr(lanes_linear, "_Map", None)
-    arguments = {
-        "x": Argument((size,), float, lanes=True),
-        "matrix": Argument((size, size), float, lanes=True),
-        "slot": Argument((), int, lanes=False),
-    }
     random = np.random.default_rng(4)
     values = {
-        "x": random.normal(size=(size, lanes)),
-        "matrix": random.normal(size=(size, size, lanes)),
+        "x": random.normal(size=(ROWS, lanes)),
+        "matrix": random.normal(size=(ROWS, ROWS, lanes)),
         "slot": np.array(1),
     }
-    program = Program(function, arguments)
+    program = Program(function, WITH_ROWS)
     assert program.is_kernel
     np.testing.assert_allclose(program(values, lanes=lanes).values, program.by_xla(values).values)
 
 
 def test_a_table_that_rows_change_is_as_it_was_after_them():
     """Each changes a copy of it: what a map reads is not changed in place."""
-    size = 24
 
     def function(given, _):
-        slot, ones = given["slot"], jnp.ones(size)
+        slot, ones = given["slot"], jnp.ones(ROWS)
 
         def with_ones(i, table):
             return lax.dynamic_update_index_in_dim(table, ones, i, 0)
@@ -557,17 +554,11 @@ def test_a_table_that_rows_change_is_as_it_was_after_them():
 
         return lax.scan(row, None, given["matrix"])[1], table
 
-    arguments = {
-        "matrix": Argument((size, size), float, lanes=True),
-        "table": Argument((size, size), float, lanes=True),
-        "x": Argument((size,), float, lanes=True),
-        "slot": Argument((), int, lanes=False),
-    }
     random = np.random.default_rng(6)
-    values = {name: random.normal(size=(size, size, 2)) for name in ("matrix", "table")}
-    values["x"] = random.normal(size=(size, 2))
+    values = {name: random.normal(size=(ROWS, ROWS, 2)) for name in ("matrix", "table")}
+    values["x"] = random.normal(size=(ROWS, 2))
     values["slot"] = np.array(3)
-    program = Program(function, arguments)
+    program = Program(function, WITH_ROWS | {"table": WITH_ROWS["matrix"]})
     assert program.is_kernel
     for mine, theirs in zip(
         program(values, lanes=2).values, program.by_xla(values).values, strict=True
