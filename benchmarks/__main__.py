@@ -18,7 +18,7 @@ import tomllib
 from pathlib import Path
 
 from benchmarks.table import (
-    Section,
+    ResultSection,
     sections_of,
     table,
     update_bars,
@@ -45,7 +45,7 @@ BY_NAME = {"large": "large", "lab": "lab", "calibration": "calibration", "fast":
 RESULTS = Path(__file__).with_name("RESULTS.md")
 
 
-def page(sections: list[Section], where: str, minutes: float, before: str = "") -> str:
+def page(sections: list[ResultSection], where: str, minutes: float, before: str = "") -> str:
     """Return the page: the bars first, then every table; what was not measured stays as it was."""
     bars = [bar.row() for section in sections for bar in section.bars]
     how = (
@@ -72,14 +72,14 @@ def main() -> None:
     target_of.add_argument("--out", type=Path)
     target_of.add_argument("--update", action="store_true")
     arguments = parser.parse_args()
-    began, where, sections = time.perf_counter(), machine(), list[Section]()
+    began, where, sections = time.perf_counter(), machine(), list[ResultSection]()
     runtime.configure()
     whole = not arguments.parts and not arguments.update
     target = arguments.out or (RESULTS if whole or arguments.update else None)
     text = before = target.read_text(encoding="utf-8") if target and target.exists() else ""
     for part in arguments.parts or PARTS:
         module = importlib.import_module(f"benchmarks.{(PARTS | BY_NAME)[part]}")
-        section: Section = getattr(module, part if hasattr(module, part) else "measure")()
+        section: ResultSection = getattr(module, part if hasattr(module, part) else "measure")()
         sections.append(section)
         bars = [" | ".join(bar.row()) for bar in section.bars]
         print(section.markdown(), *bars, sep="\n", flush=True)

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.stats import binom, norm
 
 from benchmarks.oracle import oracle_error, simulate_like
-from benchmarks.table import Section, figure
+from benchmarks.table import ResultSection, figure
 from benchmarks.timing import ROOT
 from sim_jax.inlet import ReferenceInlet
 from tuner.config import resolve_settings
@@ -107,7 +107,7 @@ class RankedSet:
     converged: bool
 
 
-def measure() -> Section:
+def measure() -> ResultSection:
     """Draw, fly, fit and rank every kind of flight; keep what is found for the report's page."""
     seeds = range(FIRST_SEED, FIRST_SEED + DRAWS)
     tasks = [(number, seed) for number in range(len(KINDS)) for seed in seeds]
@@ -123,7 +123,7 @@ def measure() -> Section:
     return section(found, today)
 
 
-def section(found: Mapping[str, Sequence[RankedSet]], date: str) -> Section:
+def section(found: Mapping[str, Sequence[RankedSet]], date: str) -> ResultSection:
     """Return the table of what was found of each kind of flight."""
     rows = [row for name, sets in found.items() for row in _rows(name, _converged(sets))]
     left = [sum(not ranked.converged for ranked in sets) for sets in found.values()]
@@ -146,7 +146,7 @@ def section(found: Mapping[str, Sequence[RankedSet]], date: str) -> Section:
     )
     head = ["flights", "coefficient", "sets", *(f"{level} %" for level in COVERAGE_LEVELS)]
     head += ["mean", "RMS", "of an oracle's"]
-    return Section("Calibration of the intervals", text, head, rows)
+    return ResultSection("Calibration of the intervals", text, head, rows)
 
 
 def _task(task: tuple[int, int], _: Report) -> RankedSet:

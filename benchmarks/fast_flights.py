@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.air import gauss_markov
-from benchmarks.table import Section, figure
+from benchmarks.table import ResultSection, figure
 from sim_jax.constants import GRAVITY
 from tuner.config import resolve_settings
 from tuner.core.disk import write_text
@@ -337,7 +337,7 @@ AHEAD = (0.1, 0.5)
 """s."""
 
 
-def measure() -> Section:
+def measure() -> ResultSection:
     """Fit every laboratory, and hold what is found and predicted against the truth."""
     head = ["seed", "rotors", "fit", *PHYSICAL, "intervals that hold"]
     head += [
@@ -356,7 +356,7 @@ def measure() -> Section:
         "a steady part, added up along the recorded motion, where rotor speeds were recorded; "
         "*hold* lets the rate be."
     )
-    return Section("Fast flights by rotor speed or command", text, head, rows)
+    return ResultSection("Fast flights by rotor speed or command", text, head, rows)
 
 
 def _row(seed: int, rate: float, fed: Fed, folder: Path) -> Iterator[str]:

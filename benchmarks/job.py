@@ -14,7 +14,7 @@ from math import nan
 from pathlib import Path
 
 from benchmarks.lab_flights import drawn, write
-from benchmarks.table import Bar, Section, figure, seconds
+from benchmarks.table import Bar, ResultSection, figure, seconds
 from benchmarks.timing import ROOT, Spread, environment
 
 FOLDER = ROOT / "reference_flights"
@@ -69,7 +69,7 @@ def command(*arguments: str | Path, cache: Path) -> Cost:
     return Cost(time.perf_counter() - began, usage.ru_maxrss * 1024.0, first, processor)
 
 
-def measure() -> Section:
+def measure() -> ResultSection:
     """Run the job in a cache of its own, then again."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -84,7 +84,7 @@ def measure() -> Section:
     whole = Spread.of([run.seconds for run in warm])
     first = Spread.of([run.first_results for run in warm])
     gib = 2.0**30
-    return Section(
+    return ResultSection(
         "From command to result",
         "The four reference flights from the original coefficients to converged, validated and "
         "reported, default settings. Cold: nothing cached, neither flights nor code. Then two "

@@ -36,7 +36,7 @@ from benchmarks.lab_flights import (
     write,
 )
 from benchmarks.oracle import oracle_error
-from benchmarks.table import Section, figure, table
+from benchmarks.table import ResultSection, figure, table
 from sim_jax.schedule import Schedule
 from tuner.config import resolve_settings
 from tuner.core.numerics import Array
@@ -78,8 +78,8 @@ class Trial:
         Coefficient -> what an oracle would quote, in the estimate's standard errors.
     voltage
         V at which the fit's motors were taken to run, if it has a battery.
-    said
-        What a run would have said of the vehicle and its flights.
+    findings
+        On the vehicle and its flights, as of a run.
     """
 
     lab: Lab
@@ -88,7 +88,7 @@ class Trial:
     oracle: Mapping[str, float]
     seconds: float
     voltage: float | None = None
-    said: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     def true(self, name: str) -> float:
         """Return the true value of a coefficient, at the voltage of the fit."""
@@ -99,7 +99,7 @@ class Trial:
         return float(value * (self.voltage / VOLTS) ** known.get("battery_exponent", 0.0))
 
 
-class Kept(BaseModel):
+class TrialRecord(BaseModel):
     """A trial in a line of a file."""
 
     model_config = ConfigDict(ser_json_inf_nan="constants")
@@ -109,10 +109,10 @@ class Kept(BaseModel):
     trial: Trial
 
 
-def measure() -> Section:
+def measure() -> ResultSection:
     """Fly, fit and compare every seed."""
     file = None if KEPT is None else Path(KEPT)
-    had = {} if file is None else kept(file, CHOICE)
+    had = {} if file is None else read_trials(file, CHOICE)
     trials = {seed: had[seed] for seed in SEEDS if seed in had}
     for seed, trial in trials.items():
         print(_line(seed, trial), flush=True)
@@ -122,24 +122,24 @@ def measure() -> Section:
             trials[seed] = trial
             print(_line(seed, trial), flush=True)
             if file is not None:
-                keep(file, Kept(seed=seed, effect=CHOICE, trial=trial))
+                append_trial(file, TrialRecord(seed=seed, effect=CHOICE, trial=trial))
     return section([trials[seed] for seed in SEEDS])
 
 
-def keep(file: Path, one: Kept) -> None:
+def append_trial(file: Path, one: TrialRecord) -> None:
     """Append a trial to a file."""
     with file.open("a", encoding="utf-8") as lines:
         lines.write(one.model_dump_json() + "\n")
 
 
-def kept(file: Path, effect: str) -> dict[int, Trial]:
+def read_trials(file: Path, effect: str) -> dict[int, Trial]:
     """Return seed -> trial of those that a file keeps for an effect; none if there is no file."""
     lines = file.read_bytes().splitlines() if file.exists() else []
-    every = [Kept.model_validate_json(line) for line in lines]
+    every = [TrialRecord.model_validate_json(line) for line in lines]
     return {one.seed: one.trial for one in every if one.effect == effect}
 
 
-def section(trials: Sequence[Trial]) -> Section:
+def section(trials: Sequence[Trial]) -> ResultSection:
     """Return the page's section about some trials."""
     missed = [group for trial in trials for group in trial.lab.groups if group not in trial.found]
     false = [group for trial in trials for group in trial.found if group not in trial.lab.groups]
@@ -181,7 +181,7 @@ def section(trials: Sequence[Trial]) -> Section:
     title = "Simulated lab flights"
     if effects:
         title += " with several effects" if several else " with effects"
-    return Section(title, text, head, list(_rows(trials)))
+    return ResultSection(title, text, head, list(_rows(trials)))
 
 
 def _held_of_all(trials: Sequence[Trial]) -> str:
@@ -219,7 +219,7 @@ def _by_effect(trials: Sequence[Trial]) -> str:
         errors, worst = max(off, key=lambda one: abs(one[0]))
         inside = sum(_holds(trial, key) for trial in having for key in trial.estimates)
         far = [coefficient for by, coefficient in off if abs(by) > CONFIDENT]
-        said = Counter(word for trial in having for word in _words(trial))
+        warnings = Counter(word for trial in having for word in _warnings(trial))
         rows.append(
             [
                 name.replace("_", " ") or "none",
@@ -229,19 +229,19 @@ def _by_effect(trials: Sequence[Trial]) -> str:
                 f"{inside} of {len(off)}",
                 f"{len(far)}{_named('', far)}",
                 f"{worst} {errors:+.1f}",
-                ", ".join(f"{word} {n} ×" for word, n in said.most_common()),
+                ", ".join(f"{word} {n} ×" for word, n in warnings.most_common()),
             ]
         )
     head = ["effect", "in the registry", "laboratories", "found", "intervals hold"]
-    head += [f"beyond {CONFIDENT:g} quoted errors", "worst, in quoted errors", "said of the model"]
+    head += [f"beyond {CONFIDENT:g} quoted errors", "worst, in quoted errors", "warnings"]
     return table(head, rows)
 
 
-def _words(trial: Trial) -> set[str]:
-    """Return what was said of the model's structure: codes, of terms their group."""
+def _warnings(trial: Trial) -> set[str]:
+    """Return the warnings of a trial: codes, of terms their group."""
     return {
         finding.subject if finding.code is Code.TERM_SHOWS else str(finding.code)
-        for finding in trial.said
+        for finding in trial.findings
         if finding.level == "warning"
     }
 
@@ -265,7 +265,7 @@ def _task(seed: int, report: Report) -> Trial:
 
 
 def job_at(lab: Lab, folder: Path, *, seed: int) -> tuple[Job, tuple[Finding, ...]]:
-    """Fly a laboratory; return the job of fitting its flights, and what is said before."""
+    """Fly a laboratory; return the job of fitting its flights, and its findings."""
     paths = write(lab, folder, seed=seed)
     return prepare(
         resolve_settings(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
@@ -282,7 +282,7 @@ def trial_of(seed: int) -> Trial:
     effect = effect_of(seed, seconds=SECONDS, flights=len(TRAJECTORIES) - 1, log_rate=RATE)
     lab = drawn(seed, effect)
     with tempfile.TemporaryDirectory() as name:
-        job, said = job_at(lab, Path(name), seed=seed)
+        job, findings = job_at(lab, Path(name), seed=seed)
         clock = time.process_time()
         selected = searched(job, Path(name))
         reporter = Reporter()
@@ -298,15 +298,15 @@ def trial_of(seed: int) -> Trial:
     }
     found = tuple(row.group for row in selected.rows if row.kept)
     reference = selected.job.settings.vehicle.battery.reference_voltage
-    said = (
-        *said,
+    findings = (
+        *findings,
         *fitted.findings,
         *reporter.findings,
         *model_error_findings(examination.model_errors, examination.uncertainty),
         *flights_disagree(fitted, examination),
         *term_findings(fitted, examination.uncertainty, selected.substitutes),
     )
-    trial = Trial(lab, found, free, {}, seconds, reference, said)
+    trial = Trial(lab, found, free, {}, seconds, reference, findings)
     volts = _voltages(selected.job.fitted, fitted.objective.schedule)
     return replace(trial, oracle=_oracle(trial, fitted, examination.uncertainty, volts, seed))
 
@@ -366,7 +366,7 @@ def _line(seed: int, trial: Trial) -> str:
     return (
         f"seed {seed}{f' with {listed(beside)}' if beside else ''}: {trial.seconds:.0f} s, missed "
         f"{sorted(flown - found)}, false {sorted(found - flown)}, {len(inside)} of {len(errors)} "
-        f"intervals hold; {', '.join(off)}; said {sorted(_words(trial))}"
+        f"intervals hold; {', '.join(off)}; warnings {sorted(_warnings(trial))}"
     )
 
 

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.table import Bar, Section, figure
+from benchmarks.table import Bar, ResultSection, figure
 from benchmarks.timing import ROOT, environment
 
 FLIGHTS = (25, 50, 100, 200)
@@ -15,7 +15,7 @@ PICTURE = Path(__file__).with_name("large.png")
 GIB = 2.0**30
 
 
-def measure() -> Section:
+def measure() -> ResultSection:
     """Iterate on growing numbers of flights, each in a process of its own."""
     module = "benchmarks.contestants.large"
     found = {}
@@ -34,7 +34,7 @@ def measure() -> Section:
     return section(found)
 
 
-def section(found: Mapping[int, tuple[float, float]]) -> Section:
+def section(found: Mapping[int, tuple[float, float]]) -> ResultSection:
     """Return the table of flights -> processor seconds of an iteration, and bytes at most."""
     rows = [
         [str(flights), figure(seconds), figure(1e3 * seconds / flights), figure(memory / GIB)]
@@ -42,7 +42,7 @@ def section(found: Mapping[int, tuple[float, float]]) -> Section:
     ]
     fewest, most = min(found), max(found)
     growth = (found[most][0] / most) / (found[fewest][0] / fewest)
-    return Section(
+    return ResultSection(
         "Many flights",
         "An iteration of a search by 20 coefficients, two latencies among them, on simulated "
         "flights of 40 s at 400 Hz, all of them whole: loss, gradient, Hessian and step. Processor "

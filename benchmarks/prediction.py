@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.table import Section, figure
+from benchmarks.table import ResultSection, figure
 from benchmarks.timing import ROOT
 from tuner.config import InletName, JobFile, resolve_settings
 from tuner.core.errors import InputError
@@ -101,7 +101,7 @@ class Contest:
     remark: str = ""
 
 
-def measure() -> Section:
+def measure() -> ResultSection:
     """Fit and predict every set that is there."""
     head = [
         "set",
@@ -132,7 +132,7 @@ def measure() -> Section:
         "that the fit starts from; *observed* knows besides what turned the vehicle unseen in the "
         "last sample before. "
     )
-    return Section("Prediction of real flights", text + " ".join(notes), head, rows)
+    return ResultSection("Prediction of real flights", text + " ".join(notes), head, rows)
 
 
 def _rows(name: str, contest: Contest) -> Iterator[list[str]]:

@@ -17,7 +17,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from benchmarks.table import Section
+from benchmarks.table import ResultSection
 from tuner.recordings.formats import open_recording
 from tuner.recordings.sources import choose_map, locate
 from tuner.recordings.topics import shipped_maps
@@ -102,7 +102,7 @@ def best(work: Callable[[Path, Wanted], int], path: Path) -> tuple[float, int]:
     return min(times), count
 
 
-def measure(repeat: int = 8) -> Section:
+def measure(repeat: int = 8) -> ResultSection:
     """Read the lengthened circle in three formats."""
     rows = []
     with tempfile.TemporaryDirectory() as scratch:
@@ -128,7 +128,7 @@ def measure(repeat: int = 8) -> Section:
                     f"{slow / quick:.0f}",
                 ]
             )
-    return Section(
+    return ResultSection(
         "Reading",
         "The circle that ships with the project, repeated; processor seconds, the best of three, "
         "beside rosbags' own deserialisation of the same topics.",

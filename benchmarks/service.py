@@ -21,7 +21,7 @@ from rosbags.rosbag1 import Reader, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from benchmarks.reading import CIRCLE
-from benchmarks.table import Bar, Section
+from benchmarks.table import Bar, ResultSection
 from tuner.service import jobs
 from tuner.service.app import create_app
 from tuner.service.database import JobRow, RecordingRow, State
@@ -146,7 +146,7 @@ def upload(folder: Path) -> tuple[float, float, int]:
     return int(peak.split()[1]) / 1024, took, answer.status_code
 
 
-def measure() -> Section:
+def measure() -> ResultSection:
     """Return the tables of this part."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -171,4 +171,4 @@ def measure() -> Section:
         ),
         Bar("memory of an upload of 2 GiB, MiB", memory, 300.0, "at most"),
     ]
-    return Section("The tuning service", "One server, SQLite.", ["", "measured"], rows, bars)
+    return ResultSection("The tuning service", "One server, SQLite.", ["", "measured"], rows, bars)

@@ -9,7 +9,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from benchmarks.table import Bar, Section, figure, millions, seconds
+from benchmarks.table import Bar, ResultSection, figure, millions, seconds
 from benchmarks.timing import ROOT, Contestant, Spread, compete, environment
 from tuner.core import runtime
 
@@ -65,7 +65,7 @@ def contestants(vehicles: int, yardstick: Path | None) -> list[Contestant]:
     return all_contestants
 
 
-def throughput() -> Section:
+def throughput() -> ResultSection:
     """Measure vehicle-steps a second against the size of a batch, beside peers and a yardstick."""
     with tempfile.TemporaryDirectory() as folder:
         yardstick = _yardstick(Path(folder))
@@ -102,7 +102,7 @@ def throughput() -> Section:
             ("4096 vehicles, of MuJoCo C", 4096, single, "MuJoCo C", 60, " ×"),
         )
     ]
-    return Section(
+    return ResultSection(
         "Throughput against the size of a batch",
         "Millions of vehicle-steps a second, median and quartiles of "
         f"{ROUNDS} runs in turn. For tune and the yardstick a step is one of 1 kHz physics with "
@@ -115,7 +115,7 @@ def throughput() -> Section:
     )
 
 
-def derivatives() -> Section:
+def derivatives() -> ResultSection:
     """Measure Jacobian and gradient of 64 flights in units of one forward run of them."""
     measured = {
         contestant.name: contestant
@@ -141,7 +141,7 @@ def derivatives() -> Section:
         ["reference flights: loss", seconds(loss), "1"],
         ["reference flights: jacobian", seconds(jacobian), figure(jacobian.median / loss.median)],
     ]
-    return Section(
+    return ResultSection(
         "Derivatives of 64 flights",
         f"{FLIGHTS} flights of {SAMPLES / 100:g} s at 1 kHz, 13 states logged at 100 Hz, float64, "
         "a thread a core, the log on the host. The Jacobian is by 12 coefficients that all flights "
@@ -182,12 +182,12 @@ def _time(rate: Spread | None) -> Spread:
     return Spread(1 / rate.median, 1 / rate.high, 1 / rate.low)
 
 
-def one_vehicle() -> Section:
+def one_vehicle() -> ResultSection:
     """Measure one vehicle against real time."""
     (measured,) = compete([Contestant("one vehicle", (*OURS, "single"), {})], ROUNDS_OF_ONE)
     assert measured.rate is not None, measured.remark
     rate = measured.rate
-    return Section(
+    return ResultSection(
         "One vehicle against real time",
         f"A lemniscate of 40 s with all filters, logged at 100 Hz; {measured.remark}.",
         ["", "times real time"],
@@ -196,7 +196,7 @@ def one_vehicle() -> Section:
     )
 
 
-def compilation() -> Section:
+def compilation() -> ResultSection:
     """Measure the seconds to build programs in fresh processes, nothing kept from earlier."""
     rows, compiled = [], {}
     for what in (FORWARD, JACOBIAN, GRADIENT):
@@ -213,7 +213,7 @@ def compilation() -> Section:
             pairs.append([float(word) for word in done.stdout.split()])
         traced, compiled[what] = (Spread.of([pair[i] for pair in pairs]) for i in (0, 1))
         rows.append([what, seconds(traced), seconds(compiled[what])])
-    return Section(
+    return ResultSection(
         "Building programs",
         "Seconds in a fresh process with nothing kept: what jax traces in Python, then what is "
         "written as LLVM IR and compiled. The gradient, in reverse mode, is compiled by XLA. The "

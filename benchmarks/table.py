@@ -34,7 +34,7 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Section:
+class ResultSection:
     """One benchmark's part of the page."""
 
     title: str
@@ -58,7 +58,7 @@ def sections_of(page: str) -> dict[str, str]:
     return {part.partition("\n")[0]: f"## {part.strip()}\n" for part in parts}
 
 
-def update_section(page: str, section: Section) -> str:
+def update_section(page: str, section: ResultSection) -> str:
     """Return a page with a section in the place of the one of its title, or at its end."""
     before, heading, rest = page.partition(f"## {section.title}\n")
     _, following, after = rest.partition("\n## ") if heading else ("", "", "")
@@ -120,7 +120,7 @@ def lines_of(page: str) -> list[Line]:
 
 def updated_history(
     page: str, bars: Sequence[Bar], *, when: datetime, version: str, whole: bool
-) -> Section:
+) -> ResultSection:
     """Return a page's history with what was measured now.
 
     Parameters
@@ -140,7 +140,7 @@ def updated_history(
             now[bar.what] = figure(bar.measured) + (MARK if _is_worse(bar, lines) else "")
     lines.append(now)
     head = list(dict.fromkeys(name for line in lines for name in line))
-    return Section(
+    return ResultSection(
         TITLE,
         "A line a measure, the newest last; times in UTC. Figures are those of the bars, in their "
         "units; one that is worse than the best above it by more than a factor "

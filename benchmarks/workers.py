@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import work
-from benchmarks.table import Bar, Section, figure
+from benchmarks.table import Bar, ResultSection, figure
 from benchmarks.timing import ROOT
 from tuner.config import resolve_settings
 from tuner.core import runtime
@@ -23,7 +23,7 @@ JOBS, JOB = 400, 0.3
 REPEATS = 3
 
 
-def measure() -> Section:
+def measure() -> ResultSection:
     """Cross-validate, simulate a night, and count what the scheduler does in a second."""
     runtime.configure()
     folds, tables = _cross_validation()
@@ -43,7 +43,7 @@ def measure() -> Section:
         ),
     ]
     gain = folds["one worker"].seconds / folds["two workers"].seconds
-    return Section(
+    return ResultSection(
         "Workers",
         "Cross-validation of the four fitted reference flights, warm, the least of "
         f"{REPEATS}: in this process on all its devices, and in workers of a core each. A night's "

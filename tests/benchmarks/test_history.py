@@ -10,7 +10,7 @@ from benchmarks import reading, simulator
 from benchmarks.table import (
     TITLE,
     Bar,
-    Section,
+    ResultSection,
     lines_of,
     sections_of,
     update_bars,
@@ -89,14 +89,16 @@ def test_bars_of_a_part_take_their_rows_in_the_first_table_and_new_ones_follow()
 
 def test_the_command_writes_lines_and_keeps_what_it_does_not_measure(tmp_path, monkeypatch):
     results = tmp_path / "RESULTS.md"
-    kept = Section("Calibration", "Of another day.", ["a"], [["1"]])
+    kept = ResultSection("Calibration", "Of another day.", ["a"], [["1"]])
     results.write_text(update_section(with_line("# Page\n", [rate(2.0)]), kept), encoding="utf-8")
     monkeypatch.setattr(command, "RESULTS", results)
     parts = {name: command.PARTS[name] for name in ("derivatives", "reading")}
     monkeypatch.setattr(command, "PARTS", parts)
-    speed = Section("Derivatives", "Now.", ["a"], [["2"]], [rate(1.0)])
+    speed = ResultSection("Derivatives", "Now.", ["a"], [["2"]], [rate(1.0)])
     monkeypatch.setattr(simulator, "derivatives", lambda: speed)
-    monkeypatch.setattr(reading, "measure", lambda: Section("Reading", "Now.", ["a"], [["3"]]))
+    monkeypatch.setattr(
+        reading, "measure", lambda: ResultSection("Reading", "Now.", ["a"], [["3"]])
+    )
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["benchmarks", *words])
@@ -106,7 +108,7 @@ def test_the_command_writes_lines_and_keeps_what_it_does_not_measure(tmp_path, m
     whole = run()
     assert list(sections_of(whole)) == [TITLE, "Derivatives", "Reading", "Calibration"]
     assert [line["rate"] for line in lines_of(whole)] == ["2", "1 ↓"]
-    speed = Section("Derivatives", "Later.", ["a"], [["2"]], [rate(3.0)])
+    speed = ResultSection("Derivatives", "Later.", ["a"], [["2"]], [rate(3.0)])
     part = run("derivatives", "--update")
     assert [line["rate"] for line in lines_of(part)] == ["2", "3"]
     assert "| rate | 3 M | at least 1 M | met |" in part.partition("\n## ")[0]

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import lab as laboratory
 from benchmarks import lab_flights
-from benchmarks.lab import Kept, Trial, _rows, _voltages, keep, kept, section
+from benchmarks.lab import Trial, TrialRecord, _rows, _voltages, append_trial, read_trials, section
 from benchmarks.lab_flights import (
     CURRENT,
     KNOWN,
@@ -169,13 +169,13 @@ def test_a_run_goes_on_from_the_laboratories_that_a_file_keeps(tmp_path, monkeyp
     parts = ErrorParts(noise=1.0, residuals=2.0, lack=math.inf)
     reason = Reason(code=ReasonCode.INTERVAL)
     known = Estimate(1.0, 0.1, (0.8, 1.2), Verdict.WELL_KNOWN, reason, parts)
-    said = (Finding(Code.LAW_LACKING, "warning", "model", {"share": 0.1}, ("force_z",)),)
+    findings = (Finding(Code.LAW_LACKING, "warning", "model", {"share": 0.1}, ("force_z",)),)
     oracle = {"motor_constant": math.inf}
-    trial = Trial(drawn(0), ("battery",), {"motor_constant": known}, oracle, 1.0, 16.0, said)
+    trial = Trial(drawn(0), ("battery",), {"motor_constant": known}, oracle, 1.0, 16.0, findings)
     file = tmp_path / "kept"
-    assert kept(file, "drawn") == {}
-    keep(file, Kept(seed=0, effect="drawn", trial=trial))
-    keep(file, Kept(seed=1, effect="none", trial=trial))
+    assert read_trials(file, "drawn") == {}
+    append_trial(file, TrialRecord(seed=0, effect="drawn", trial=trial))
+    append_trial(file, TrialRecord(seed=1, effect="none", trial=trial))
     fitted = []
 
     def fit(seed, _):
@@ -187,7 +187,7 @@ def test_a_run_goes_on_from_the_laboratories_that_a_file_keeps(tmp_path, monkeyp
     monkeypatch.setattr(laboratory, "KEPT", str(file))
     laboratory.measure()
     assert fitted == [1]
-    read = kept(file, "drawn")
+    read = read_trials(file, "drawn")
     assert list(read) == [0, 1]
     assert all(replace(one, estimates={}) == replace(trial, estimates={}) for one in read.values())
     (estimate,) = read[1].estimates.values()

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from benchmarks.__main__ import page
-from benchmarks.table import Bar, Section, figure, millions, update_section
+from benchmarks.table import Bar, ResultSection, figure, millions, update_section
 from benchmarks.timing import Contestant, Spread, compete
 
 ANSWERS = """
@@ -47,7 +47,9 @@ def test_a_bar_is_met_or_missed(measured, sense, verdict):
 
 def test_the_page_begins_with_the_bars_and_holds_every_table():
     bar = Bar("twice as fast", 1.9, 2.0, "at least", " ×")
-    section = Section("Speed", "How.", ["", "rate"], [["ours", millions(Spread.of([2e6]))]], [bar])
+    section = ResultSection(
+        "Speed", "How.", ["", "rate"], [["ours", millions(Spread.of([2e6]))]], [bar]
+    )
     text = page([section], "here", 1.0)
     assert "| twice as fast | 1.9 × | at least 2 × | missed |" in text
     assert text.index("twice as fast") < text.index("## Speed") < text.index("| ours | 2 (2–2) |")
@@ -55,10 +57,10 @@ def test_the_page_begins_with_the_bars_and_holds_every_table():
 
 
 def test_a_part_takes_the_place_that_it_had_on_the_page():
-    one, two, three = (Section(t, "Old.", ["a"], [["1"]]) for t in ("One", "Two", "Three"))
+    one, two, three = (ResultSection(t, "Old.", ["a"], [["1"]]) for t in ("One", "Two", "Three"))
     old = update_section(update_section("# Page\n", one), two)
     assert update_section(old, two) == old
-    new = update_section(old, Section("One", "New.", ["a"], [["2"]]))
+    new = update_section(old, ResultSection("One", "New.", ["a"], [["2"]]))
     assert new == old.replace("Old.", "New.", 1).replace("| 1 |", "| 2 |", 1)
     assert update_section(old, three).index("## Three") > old.index("## Two")
 

@@ -22,8 +22,8 @@ from tuner.core.phrases import as_sentence, listed
 from tuner.core.spans import (
     JAX_STAGES,
     Recorder,
-    Row,
     Span,
+    StageTime,
     beside_of,
     recording,
     stage_table,
@@ -218,7 +218,7 @@ _COLUMNS = ("seconds", "processor", *JAX_STAGES.values(), "rest")
 _HEADER = ("stage", *(f"{name} [s]" for name in _COLUMNS), "programs")
 
 
-def _seconds(row: Row) -> tuple[float, ...]:
+def _seconds(row: StageTime) -> tuple[float, ...]:
     return (row.seconds, row.processor, *row.jax.values(), row.rest)
 
 
@@ -248,7 +248,7 @@ def trace_of(spans: Sequence[Span]) -> dict[str, Any]:
     }
 
 
-def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
+def _print(rows: Sequence[StageTime], recorder: Recorder, folder: Path) -> None:
     from tuner.cli.results import console, rich_table
 
     screen = console()
@@ -262,7 +262,7 @@ def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
     screen.print(f"profile: {folder / TABLE_FILE}, {folder / TRACE_FILE}")
 
 
-def _table(rows: Sequence[Row]) -> Table:
+def _table(rows: Sequence[StageTime]) -> Table:
     columns = ("stage", *_COLUMNS, "programs")
     cells = [
         (

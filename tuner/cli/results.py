@@ -66,15 +66,23 @@ STYLE_OF_LOOK = {
     "not": "red",
     "worse": "red",
     "failure": "red",
+    "dim": "dim",
 }
 """Class of the page's style -> of the terminal's."""
 
 
 def rich_table(table: Table) -> DrawnTable:
     """Return a table as the terminal draws it: words on the left, numbers on the right."""
-    made = DrawnTable(box=None, title=table.fold or None, title_justify="left", pad_edge=False)
+    made = DrawnTable(
+        box=None,
+        title=table.fold or None,
+        title_justify="left",
+        title_style="bold",
+        pad_edge=False,
+    )
     for name in table.columns:
-        made.add_column(name.strip(), justify="left" if name in table.words else "right")
+        left = name in table.words
+        made.add_column(name.strip(), justify="left" if left else "right", no_wrap=name == "topic")
     for row in table.rows:
         made.add_row(*map(_cell, row))
     return made
@@ -372,8 +380,8 @@ def folds_table(folds: Sequence[Refit]) -> object:
     return rich_table(Table(columns, rows, words=("left out",), fold=title))
 
 
-INFORMED_STYLES = {"yes": "green", "weakly": "yellow", "no": "red"}
-"""Whether a recording shows a coefficient -> style of the terminal."""
+LOOK_OF_INFORMATION = {"yes": "well", "weakly": "weak", "no": "not"}
+"""Whether a recording shows a coefficient -> look of its cell."""
 
 
 def inspections_drawn(
@@ -407,14 +415,14 @@ def _drawn_inspection(inspection: Inspection, verdict: Sequence[str]) -> list[Re
     if inspection.problem and not verdict:
         parts.append(Text(inspection.problem, "red"))
     parts += [Text(f"warning: {damage_sentence(damage)}", "yellow") for damage in inspection.damage]
-    parts.append(_topics_drawn(inspection))
+    parts.append(rich_table(_topics(inspection)))
     if inspection.missions:
-        parts.append(_missions_drawn(inspection))
+        parts.append(rich_table(_missions(inspection)))
     if inspection.clock or inspection.battery:
         parts.append(_clock_and_battery(inspection))
-    parts.append(_inlets_drawn(inspection))
+    parts.append(rich_table(_inlets(inspection)))
     if inspection.coefficients:
-        parts.append(_informed_drawn(inspection))
+        parts.append(rich_table(_informed(inspection)))
     for note in inspection.notes:
         colour = "yellow" if note.kind == "warning" else "dim"
         topic = f"{note.topic}: " if note.topic else ""
@@ -426,65 +434,49 @@ def _number(value: float | None, form: str, scale: float = 1.0) -> str:
     return "" if value is None else format(value * scale, form)
 
 
-def _titled_table(
-    title: str,
-    columns: Sequence[str],
-    rows: Iterable[tuple[str, Sequence[str | Text]]],
-    left: Sequence[str],
-) -> DrawnTable:
-    """Return a table of rows (style, cells); columns not in `left` are right-aligned."""
-    table = DrawnTable(title=title, title_justify="left", title_style="bold", box=None)
-    for name in columns:
-        table.add_column(name, justify="left" if name in left else "right", no_wrap=name == "topic")
-    for style, cells in rows:
-        table.add_row(*cells, style=style)
-    return table
-
-
-def _topics_drawn(inspection: Inspection) -> DrawnTable:
-    names = ("topic", "type", "messages", "Hz", "gap s", "jitter ms", "delay ms", "used for")
-    rows = (
-        (
-            "" if topic.signals else "dim",
-            (
-                topic.name or "(table)",
-                topic.type,
-                str(topic.count),
-                _number(topic.rate, ".1f"),
-                _number(topic.longest_gap, ".3f"),
-                _number(topic.jitter, ".2f", 1e3),
-                _number(topic.delay, ".2f", 1e3) if topic.delay and abs(topic.delay) < 3600 else "",
-                ", ".join(topic.signals),
-            ),
+def _topics(inspection: Inspection) -> Table:
+    columns = ("topic", "type", "messages", "Hz", "gap s", "jitter ms", "delay ms", "used for")
+    rows = [
+        _dim_unless(
+            bool(topic.signals),
+            topic.name or "(table)",
+            topic.type,
+            str(topic.count),
+            _number(topic.rate, ".1f"),
+            _number(topic.longest_gap, ".3f"),
+            _number(topic.jitter, ".2f", 1e3),
+            _number(topic.delay, ".2f", 1e3) if topic.delay and abs(topic.delay) < 3600 else "",
+            ", ".join(topic.signals),
         )
         for topic in inspection.topics
-    )
-    return _titled_table("topics", names, rows, ("topic", "type", "used for"))
+    ]
+    return Table(columns, rows, words=("topic", "type", "used for"), fold="topics")
 
 
-def _missions_drawn(inspection: Inspection) -> DrawnTable:
+def _dim_unless(used: bool, *cells: str) -> list[Cell]:
+    return [Cell(text, look="" if used else "dim") for text in cells]
+
+
+def _missions(inspection: Inspection) -> Table:
     numbers = ("laps", "mean m/s", "top m/s", "tilt °", "turn rad/s", "height m", "pose known")
-    rows = (
+    rows = [
         (
-            "",
-            (
-                f"{mission.start:.2f}",
-                f"{mission.duration:.2f}",
-                mission.begins_with,
-                "" if mission.laps is None else str(mission.laps),
-                f"{mission.mean_speed:.2f}",
-                f"{mission.top_speed:.2f}",
-                f"{mission.largest_tilt:.1f}",
-                _number(mission.top_turn_rate, ".2f"),
-                f"{mission.height[0]:.2f}–{mission.height[1]:.2f}",
-                f"{100 * mission.known:.1f} %",
-                _remark(mission),
-            ),
+            f"{mission.start:.2f}",
+            f"{mission.duration:.2f}",
+            mission.begins_with,
+            "" if mission.laps is None else str(mission.laps),
+            f"{mission.mean_speed:.2f}",
+            f"{mission.top_speed:.2f}",
+            f"{mission.largest_tilt:.1f}",
+            _number(mission.top_turn_rate, ".2f"),
+            f"{mission.height[0]:.2f}–{mission.height[1]:.2f}",
+            f"{100 * mission.known:.1f} %",
+            _remark(mission),
         )
         for mission in inspection.missions
-    )
+    ]
     columns = ("start s", "s", "begins with", *numbers, "remark")
-    return _titled_table("missions", columns, rows, ("begins with", "remark"))
+    return Table(columns, rows, words=("begins with", "remark"), fold="missions")
 
 
 def _remark(mission: MissionReport) -> str:
@@ -512,20 +504,20 @@ def _clock_and_battery(inspection: Inspection) -> Text:
     return Text(text)
 
 
-def _inlets_drawn(inspection: Inspection) -> DrawnTable:
+def _inlets(inspection: Inspection) -> Table:
     rows = []
     for inlet in inspection.inlets:
         usable = not inlet.missing and inspection.problem is None
         lacks = f"lacks {', '.join(inlet.missing)}" if inlet.missing else "no mission"
-        rows.append(("" if usable else "dim", (inlet.name, "yes" if usable else lacks)))
+        rows.append(_dim_unless(usable, inlet.name, "yes" if usable else lacks))
     columns = ("inlet", "can be fed from this recording")
-    return _titled_table("inlets", columns, rows, columns)
+    return Table(columns, rows, words=columns, fold="inlets")
 
 
-def _informed_drawn(inspection: Inspection) -> DrawnTable:
-    rows = (
-        ("", (found.coefficient, Text(found.how, INFORMED_STYLES[found.how]), found.why))
+def _informed(inspection: Inspection) -> Table:
+    rows = [
+        (found.coefficient, Cell(found.how, look=LOOK_OF_INFORMATION[found.how]), found.why)
         for found in inspection.coefficients
-    )
+    ]
     columns = ("coefficient", "", "because")
-    return _titled_table("could inform", columns, rows, columns)
+    return Table(columns, rows, words=columns, fold="could inform")

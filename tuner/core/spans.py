@@ -147,7 +147,7 @@ def recording() -> Iterator[Recorder]:
 
 
 @dataclass
-class Row:
+class StageTime:
     """A stage's seconds, those of stages inside it left out.
 
     Attributes
@@ -174,15 +174,15 @@ class Row:
         return self.seconds - sum(self.jax.values())
 
 
-def stage_table(spans: Sequence[Span], seconds: float, processor: float) -> tuple[Row, ...]:
+def stage_table(spans: Sequence[Span], seconds: float, processor: float) -> tuple[StageTime, ...]:
     """Return a row for every stage in the order of their begins.
 
     Every instant counts for the innermost span that holds it, so that the rows' seconds, and
     processor seconds, sum up to those of the process, ``seconds`` and ``processor``.
     """
     whole = Span(OUTSIDE, 0.0, seconds, processor=processor)
-    rows = {OUTSIDE: Row(OUTSIDE)}
-    open_: list[tuple[Span, Row]] = []
+    rows = {OUTSIDE: StageTime(OUTSIDE)}
+    open_: list[tuple[Span, StageTime]] = []
     for each in [
         whole,
         *sorted((s for s in spans if not s.beside), key=lambda s: (s.begin, -s.end)),
@@ -190,7 +190,7 @@ def stage_table(spans: Sequence[Span], seconds: float, processor: float) -> tupl
         while len(open_) > 1 and open_[-1][0].end <= each.begin:
             open_.pop()
         outer = open_[-1:]
-        row = rows.setdefault(each.name, Row(each.name)) if each.is_stage else outer[0][1]
+        row = rows.setdefault(each.name, StageTime(each.name)) if each.is_stage else outer[0][1]
         row.programs += each.name == COMPILING
         spent = min(each.end, seconds) - each.begin
         for (one, stage), sign in ((each, row), 1.0), *((around, -1.0) for around in outer):

@@ -133,7 +133,7 @@ def _page(contents: Contents, sections: Sequence[PageSection]) -> str:
         next=next_step(run.result, found, contents.folder, contents.exports)
         if run and found
         else None,
-        said=_examination_sentences(contents),
+        sentences=_examination_sentences(contents),
         warnings=warnings_of(contents.about.findings),
         exports=contents.exports,
     )
@@ -160,7 +160,7 @@ def page_of(title: str, sections: Sequence[PageSection], **first_screen: Any) ->
         script=Markup(script),
         figures=Markup(_compressed(charts_json(charts))),
         library=Markup(compressed),
-        **{"outcome": None, "said": (), "warnings": (), **first_screen},
+        **{"outcome": None, "sentences": (), "warnings": (), **first_screen},
     )
 
 
@@ -186,8 +186,8 @@ def _library() -> tuple[str, str]:
 
 def _examination_sentences(contents: Contents) -> list[str]:
     """Return sentences on an examination without a fit."""
-    said = [] if contents.knowledge is None else [examination_in_words(contents.knowledge)]
-    return said + (proposals_in_words(contents.proposals)[:2] if contents.proposals else [])
+    first = [] if contents.knowledge is None else [examination_in_words(contents.knowledge)]
+    return first + (proposals_in_words(contents.proposals)[:2] if contents.proposals else [])
 
 
 def _policy(*scripts: str) -> str:

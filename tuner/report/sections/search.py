@@ -226,8 +226,8 @@ def provenance(contents: Contents) -> PageSection:
         Table(("",), [(json.dumps(value, indent=2),)], words=("",), fold=name)
         for name, value in settings.items()
     ]
-    said = (f"Command: {about.command}",) if about.command else ()
-    return PageSection("provenance", "Provenance", said, tables=tables, folded=True)
+    sentences = (f"Command: {about.command}",) if about.command else ()
+    return PageSection("provenance", "Provenance", sentences, tables=tables, folded=True)
 
 
 def _digest(value: object) -> str:
