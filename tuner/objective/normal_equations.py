@@ -620,28 +620,47 @@ def _evaluated(
 
 
 def sums_at(
-    objective: Objective, points: Point, criterion: Criterion, *, derivatives: bool = True
+    objective: Objective,
+    points: Point,
+    criterion: Criterion,
+    *,
+    derivatives: bool = True,
+    still: bool = False,
 ) -> SegmentSums:
     """Return every segment's contribution at S points; all leaves have S first.
 
-    The engine in force computes them, a task each; one alone stays here.
+    With ``still`` coefficients, derivatives by them are not computed, and zero. The engine in force
+    computes the points, a task each; one alone stays here.
     """
     alone = [
         Point(coefficients, offsets)
         for coefficients, offsets in zip(points.coefficients, points.offsets, strict=True)
     ]
     if len(alone) == 1:
-        parts = [objective.sums(alone[0], criterion, derivatives=derivatives)]
+        parts = [_sums_of((objective, criterion, derivatives, still), alone[0])]
     else:
         engine = current()
-        problem = engine.share((objective, criterion, derivatives))
+        problem = engine.share((objective, criterion, derivatives, still))
         parts = engine.map(_sums, [(problem, point) for point in alone])
     joined: SegmentSums = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
     return joined
 
 
-def _sums(
-    task: tuple[Callable[[], tuple[Objective, Criterion, bool]], Point], _report: Report
-) -> SegmentSums:
-    (objective, criterion, derivatives), point = task[0](), task[1]
-    return objective.sums(point, criterion, derivatives=derivatives)
+def _sums(task: tuple[Callable[[], _Asked], Point], _report: Report) -> SegmentSums:
+    return _sums_of(task[0](), task[1])
+
+
+_Asked = tuple[Objective, Criterion, bool, bool]
+"""Problem and criterion, whether derivatives are computed, and whether coefficients are still."""
+
+
+def _sums_of(asked: _Asked, point: Point) -> SegmentSums:
+    objective, criterion, derivatives, still = asked
+    if not (derivatives and still):
+        return objective.sums(point, criterion, derivatives=derivatives)
+    sums, more = objective.sums(point, criterion, still=True), (len(objective.space), 0)
+    return replace(
+        sums,
+        gradient=np.pad(sums.gradient, (more, (0, 0))),
+        hessian=np.pad(sums.hessian, (more, more, (0, 0))),
+    )

@@ -198,7 +198,8 @@ def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -
     )
     if not stage.drops_offsets or not problem.free.offsets[: len(CLOCKS)].any():
         return problem
-    sums = sums_at(problem.objective, points, problem.criterion)
+    still = not problem.free.coefficients.any()
+    sums = sums_at(problem.objective, points, problem.criterion, still=still)
     stay = _clocks_that_differ(problem, best, sums)
     free = Point(problem.free.coefficients, problem.free.offsets & stay)
     if not np.any(points.offsets[:, ~stay]):  # nothing moves: the points are flown already

@@ -153,6 +153,7 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
         (K + offsets·N,) one for free parameters, zero for others; changes only at `initial_step`.
     """
     moves = np.flatnonzero(free)
+    still = not np.any(moves < len(objective.space))
     each = [picked(before, start) for start in range(len(before.damping))]
 
     def quadratics(sums: SegmentSums) -> list[NormalEquations]:
@@ -171,7 +172,7 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
         if not any(_accepts(one, at.loss, moves)[0] for one, at in zip(each, tried, strict=True)):
             sums, here = plain, tried
     if sums is None:
-        sums = sums_at(objective, before.tried, criterion)
+        sums = sums_at(objective, before.tried, criterion, still=still)
     here = here or quadratics(sums)
     longest = DAMPING_FACTOR if objective.segments.windowed else DAMPING_FACTOR**3
     steps = [

@@ -106,11 +106,11 @@ def test_the_search_ends_within_a_tenth_of_a_standard_error_of_the_minimum(fit):
 def test_no_point_is_flown_twice_where_clocks_are_looked_at(fit, monkeypatch):
     flown, looked_at = [], []
 
-    def recorded(objective, points, criterion, *, derivatives=True):
+    def recorded(objective, points, criterion, *, derivatives=True, still=False):
         if derivatives:
             numbers = (points, criterion.scale, criterion.horizon, criterion.huber)
             flown.append(tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(numbers)))
-        return sums_at(objective, points, criterion, derivatives=derivatives)
+        return sums_at(objective, points, criterion, derivatives=derivatives, still=still)
 
     def judged(*given):
         looked_at.append(_clocks_that_differ(*given))
@@ -220,6 +220,38 @@ def test_least_squares_reports_its_damping():
     first, second, *_ = (iteration.damping for iteration in progress.iterations)
     assert first == 1.0
     assert second == pytest.approx(0.2)  # the model predicted well: five times longer a step
+
+
+def test_offsets_alone_are_fitted_without_derivatives_by_coefficients(fit, monkeypatch):
+    stages = horizon_stages(fit.samples, fit.schedule.log_rate, robust=True, steps=5)[-2:]
+    offsets = np.ones((len(OFFSETS), 2), bool)
+    asked, sums_of = set(), type(fit).sums
+
+    def spied(objective, *given, **how):
+        asked.add((how.get("still", False), how.get("derivatives", True)))
+        return sums_of(objective, *given, **how)
+
+    def polished():
+        start = initial_progress(fit, np.asarray(fit.space.initial)[None])
+        late = replace(start, points=Point(start.points.coefficients, start.points.offsets + 4.0))
+        free = Point(np.zeros(len(fit.space), bool), offsets)
+        said = {"free": free, "undecided": {}, "on_progress": lambda _: None}
+        return run_stages(fit, stages, late, **said)
+
+    monkeypatch.setattr(type(fit), "sums", spied)
+    alone = polished()
+    assert {how for how in asked if how[1]} == {(True, True)}
+
+    def with_columns(*given, **how):
+        return sums_at(*given, **{**how, "still": False})
+
+    for module in (optimisers, continuation):
+        monkeypatch.setattr(module, "sums_at", with_columns)
+    beside = polished()
+    assert (False, True) in asked
+    np.testing.assert_array_equal(alone.points.offsets, beside.points.offsets)
+    assert np.abs(alone.points.offsets).max() < 2.0  # they went half of the way at least
+    np.testing.assert_array_equal(alone.losses, beside.losses)
 
 
 # what is undecided of the loop is decided by the recordings

@@ -33,7 +33,7 @@ def advanced(monkeypatch):
     """Steps in the valley, of several starts; ``differentiated`` has the points that were."""
     differentiated = []
 
-    def flown(_, points, __, *, derivatives=True):
+    def flown(_, points, __, *, derivatives=True, **___):
         if derivatives:
             differentiated.append(points)
         return points
