@@ -127,7 +127,7 @@ def upload(folder: Path) -> tuple[float, float, int]:
     code = (
         "import sys\nfrom pathlib import Path\nfrom tuner.service.app import serve\n"
         "from tuner.service.settings import *\n"
-        "serve(ServiceSettings(Path(sys.argv[1]), limits=Limits(free_bytes=0)), "
+        "serve(ServiceSettings(Path(sys.argv[1]), limits=ServiceLimits(free_bytes=0)), "
         "host='127.0.0.1', port=0, say=lambda t: print(t, flush=True))"
     )
     command = [sys.executable, "-c", code, str(folder / "data")]
