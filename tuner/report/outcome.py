@@ -352,7 +352,7 @@ def _is_of_another_loop(result: RunResult) -> bool:
         if found.code is Code.CONTROLLER_ANSWERS
         and found.subject == CONTROLLER_FILE
         and any(
-            abs(math.log(found.numbers[axis])) > math.log(MAX_GAIN_RATIO)
+            not 1.0 / MAX_GAIN_RATIO <= found.numbers[axis] <= MAX_GAIN_RATIO
             for axis in found.names[1:]
             if found.names[0] != "late"
         )

@@ -140,6 +140,7 @@ def answering(part, roll, flight=CONTROLLER_FILE):
     [
         ((("P", 0.77), ("I", 0.74)), Usability.UNUSABLE),
         ((("P", 1.25), ("I", 1.3), ("late", 0.004)), Usability.UNUSABLE),
+        ((("P", 1.25), ("I", -0.1)), Usability.UNUSABLE),
         ((("P", 0.9), ("I", 0.74)), Usability.WITH_CARE),
         ((("I", 0.7), ("late", -0.004)), Usability.WITH_CARE),
         ((("P", 0.77, "circle"), ("I", 0.74, "circle")), Usability.WITH_CARE),
