@@ -68,6 +68,22 @@ def test_that_flights_are_simulated_is_said_where_the_job_file_says_so(result):
     assert " simulated flight" in said
 
 
+def test_what_goes_with_the_arms_is_said_to(result):
+    row = next(iter(result.coefficients.values())).model_copy(
+        update={"fitted": True, "identifiable": True, "verdict": Verdict.WELL_KNOWN}
+    )
+
+    def last_use(*names):
+        coefficients = dict.fromkeys(names, row)
+        return outcome(result.model_copy(update={"coefficients": coefficients})).uses[-1]
+
+    arms = "the vehicle file's arms, which no flight shows: measure them."
+    both = ("inertia_xx", "moment_constant", "motor_constant")
+    assert last_use(*both) == f"inertia_xx and moment_constant go with {arms}"
+    assert last_use("inertia_zz") == f"inertia_zz goes with {arms}"
+    assert "arms" not in last_use("motor_constant")
+
+
 @pytest.mark.parametrize(
     ("after", "word", "standing"),
     [
