@@ -19,7 +19,6 @@ rate and the inputs of the last samples; position and attitude follow by kinemat
 
 from __future__ import annotations
 
-import os
 import re
 import tempfile
 import time
@@ -31,7 +30,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.table import ResultSection, figure
-from benchmarks.timing import ROOT
+from benchmarks.timing import REAL_FLIGHTS, ROOT
 from tuner.config import InletName, JobFile, resolve_settings
 from tuner.core.errors import InputError
 from tuner.core.numerics import Array
@@ -70,7 +69,6 @@ INLET: InletName = "actuator"
 """Where each flight has its build, commands follow from commanded thrust and torque."""
 CLOCK_HZ = 100.0
 """The clock on which flights without a pose are compared."""
-FLIGHTS = Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights"))
 JOBS: Mapping[str, str] = {"nanobench": "crazyflie"}
 """Set -> shipped job file, where it holds no ``tune.yaml`` of its own."""
 HELD_OUT: Mapping[str, tuple[str, ...]] = {
@@ -111,7 +109,7 @@ def measure() -> ResultSection:
     ]
     rows: list[list[str]] = []
     notes = []
-    for folder in sorted(path for path in FLIGHTS.glob("*") if path.is_dir()):
+    for folder in sorted(path for path in REAL_FLIGHTS.glob("*") if path.is_dir()):
         try:
             contest = CONTESTS.get(folder.name, contest_of)(folder)
         except InputError as error:

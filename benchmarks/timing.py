@@ -14,6 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+REAL_FLIGHTS = Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights"))
+"""Folders of real recordings, none of which is stored here."""
+LAB_FLIGHTS = REAL_FLIGHTS.parent / "lab_flights"
+"""Folders of simulated recordings with gusts and terms, likewise."""
 
 
 @dataclass(frozen=True)
