@@ -177,7 +177,7 @@ def predictions_by_all(
         for flight, inlet, late in held_out
     ]
     signal = INLETS[held_out[0][1]].needs[0]
-    regression = Regression.of([flight for flight, *_ in known], signal)
+    regression = LinearRegression.of([flight for flight, *_ in known], signal)
     return {
         "hold": [hold_state(one.flight, one.begins, one.ahead) for one in predictors],
         "linear regression": [
@@ -393,7 +393,7 @@ CONTESTS: Mapping[str, Callable[[Path], Contest]] = {
 
 
 @dataclass(frozen=True)
-class Regression:
+class LinearRegression:
     """A linear model of the accelerations.
 
     Attributes
@@ -406,7 +406,7 @@ class Regression:
     weights: Array
 
     @staticmethod
-    def of(flights: Sequence[Flight], signal: str) -> Regression:
+    def of(flights: Sequence[Flight], signal: str) -> LinearRegression:
         """Fit it to some flights."""
         rows, targets = [], []
         for flight in flights:
@@ -421,7 +421,7 @@ class Regression:
             rows.append(row[known])
             targets.append(target[known])
         matrix, target = np.concatenate(rows), np.concatenate(targets)
-        return Regression(signal, np.linalg.lstsq(matrix, target, rcond=None)[0])
+        return LinearRegression(signal, np.linalg.lstsq(matrix, target, rcond=None)[0])
 
     def predict(self, flight: Flight, begins: Array, ahead: Array) -> Predictions:
         """Predict a flight from its recorded states at (n,) times, (S,) s ahead."""

@@ -59,7 +59,7 @@ class Contestant:
 
 
 @dataclass(frozen=True)
-class Measured:
+class Throughput:
     """A contestant's result: amount per second, or why it could not take part."""
 
     name: str
@@ -103,12 +103,12 @@ class Running:
         self.process.stdin.flush()
         self.times.append(float(self.process.stdout.readline()))
 
-    def measured(self) -> Measured:
+    def measured(self) -> Throughput:
         rate = Spread.of(self.times).per(self.amount) if self.times else None
-        return Measured(self.name, rate, self.remark)
+        return Throughput(self.name, rate, self.remark)
 
 
-def compete(contestants: Sequence[Contestant], rounds: int) -> list[Measured]:
+def compete(contestants: Sequence[Contestant], rounds: int) -> list[Throughput]:
     """Let each run once in every round, so that what else the machine does meets all alike."""
     started: list[Running] = []
     ready: list[Running] = []

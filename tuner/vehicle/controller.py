@@ -113,7 +113,7 @@ class RateControl(Section):
     rate: Rate = 400.0
 
 
-class Filters(Section):
+class FiltersSection(Section):
     """Low-pass filters of the gyro, Hz; None is no filter.
 
     Attributes
@@ -183,7 +183,7 @@ class ControllerFile(Section):
     attitude: AttitudeControl = AttitudeControl()
     thrust: ThrustMap = ThrustMap()
     rate: RateControl = RateControl()
-    filters: Filters = Filters()
+    filters: FiltersSection = FiltersSection()
     mixer: Mixer = Mixer()
     physics: Physics = Physics()
     sensing: Sensing = Sensing()

@@ -79,7 +79,7 @@ _OTHER_UNITS = {
 }
 
 
-class Inertia(Section):
+class InertiaSection(Section):
     """Principal moments of inertia about the centre of mass, kg m², body axes forward-left-up."""
 
     xx: Positive
@@ -98,7 +98,7 @@ class Inertia(Section):
         return self
 
 
-class Rotor(Section):
+class RotorEntry(Section):
     """Where a rotor sits (body frame forward-left-up, m, from the centre of mass) and how it turns.
 
     The spin is seen from above.
@@ -108,7 +108,7 @@ class Rotor(Section):
     spin: Literal["ccw", "cw"]
 
 
-class Motor(Section):
+class MotorSection(Section):
     """From command to rotor speed.
 
     With ``v = u + input_offset``, the speed that a command u in 0..1 asks for is
@@ -140,7 +140,7 @@ class Motor(Section):
     quadratic: Number = 0.0
 
 
-class Aerodynamics(Section):
+class AerodynamicsSection(Section):
     """From rotor speed and air velocity to force and moment.
 
     Attributes
@@ -179,7 +179,7 @@ def max_latency(latency: str) -> float:
     return bounds[1]
 
 
-class Setup(Section):
+class SetupSection(Section):
     """What the set-up adds to the vehicle.
 
     Attributes
@@ -197,15 +197,15 @@ class Setup(Section):
     gyro_cutoff: Positive | None = None
 
 
-class Battery(Section):
+class BatterySection(Section):
     """What the motors are fed by.
 
     Attributes
     ----------
     reference_voltage
-        V at which a command asks for the speed of `Motor`; with ``battery_exponent``, it asks for
-        less as the recorded voltage falls below. None takes that of the fullest battery without
-        load.
+        V at which a command asks for the speed of the motor section; with ``battery_exponent``, it
+        asks for less as the recorded voltage falls below. None takes that of the fullest battery
+        without load.
     """
 
     reference_voltage: Positive | None = None
@@ -247,13 +247,13 @@ class VehicleFile(Section):
 
     name: str
     mass: Positive
-    inertia: Inertia
-    rotors: tuple[Rotor, ...]
+    inertia: InertiaSection
+    rotors: tuple[RotorEntry, ...]
     motor_order: MotorOrder | None = None
-    motor: Motor
-    aerodynamics: Aerodynamics
-    setup: Setup = Setup()
-    battery: Battery = Battery()
+    motor: MotorSection
+    aerodynamics: AerodynamicsSection
+    setup: SetupSection = SetupSection()
+    battery: BatterySection = BatterySection()
     effects: Annotated[dict[str, Number], AfterValidator(_known_effects)] = Field(
         default_factory=dict
     )

@@ -12,7 +12,7 @@ from tuner.vehicle import (
     with_values,
     write_vehicle,
 )
-from tuner.vehicle.vehicle import Aerodynamics, Inertia, Motor, Setup
+from tuner.vehicle.vehicle import AerodynamicsSection, InertiaSection, MotorSection, SetupSection
 
 SHIPPED = sorted((configs_folder() / "vehicles").glob("*.yaml"))
 ORIGINAL = configs_folder() / "vehicles" / "hovergames.yaml"
@@ -180,7 +180,12 @@ def test_every_coefficient_has_a_place_of_its_own():
 
 
 def test_every_number_of_a_vehicle_file_is_a_coefficient_or_known_not_to_be():
-    sections = {"inertia": Inertia, "motor": Motor, "aerodynamics": Aerodynamics, "setup": Setup}
+    sections = {
+        "inertia": InertiaSection,
+        "motor": MotorSection,
+        "aerodynamics": AerodynamicsSection,
+        "setup": SetupSection,
+    }
     places = {(name, key) for name, model in sections.items() for key in model.model_fields}
     places |= {("", "mass")}
     registered = {row.place for row in COEFFICIENTS.values() if not row.is_effect}

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks import fast_flights
 from benchmarks.prediction import (
     HELD_OUT,
-    Regression,
+    LinearRegression,
     cut,
     options_for_set,
     weighed_mass,
@@ -329,7 +329,7 @@ def test_a_flight_that_no_recorded_rotor_turns_tells_nothing(full_flight, update
 
 def test_linear_regression_predicts_better_than_one_that_holds(full_flight):
     begins, ahead = np.arange(0.2, 5.0, 0.1), np.arange(1, 51) * 0.01
-    regression = Regression.of([full_flight], "rotor_speed")
+    regression = LinearRegression.of([full_flight], "rotor_speed")
     predicted = regression.predict(full_flight, begins, ahead)
     naive = hold_state(full_flight, begins, ahead)
     for name in ("position", "velocity", "attitude"):

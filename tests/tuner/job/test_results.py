@@ -14,12 +14,12 @@ from tuner.search.problem import Job
 from tuner.search.progress import best_values
 from tuner.uncertainty.verdict import ReasonCode, Verdict
 from tuner.vehicle import ControllerFile
-from tuner.vehicle.controller import Filters
+from tuner.vehicle.controller import FiltersSection
 
 
 @pytest.mark.parametrize(("name", "initial"), [("gyro_cutoff", 30.0), ("fuselage_drag", 0.0)])
 def test_what_the_vehicle_file_leaves_open_is_held_at_the_value_that_flies(name, initial, updated):
-    controller = ControllerFile(filters=Filters(gyro_cutoff=30.0))
+    controller = ControllerFile(filters=FiltersSection(gyro_cutoff=30.0))
     space = space_of(updated, controller, JobFile(free=(name, "motor_constant")))
     settings = SimpleNamespace(vehicle=updated, controller=controller)
     point = SimpleNamespace(coefficients=jnp.asarray(space.initial + 0.5))

@@ -19,7 +19,7 @@ from tuner.vehicle import (
     read_vehicle,
     with_values,
 )
-from tuner.vehicle.controller import Filters
+from tuner.vehicle.controller import FiltersSection
 from tuner.vehicle.model import coefficients_in, model_of, with_coefficients
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "coefficients.md"
@@ -125,7 +125,7 @@ def test_every_coefficient_has_a_place_in_the_model(vehicle):
 
 
 def test_the_search_for_the_gyro_cutoff_starts_at_the_one_that_flies(vehicle):
-    slower = ControllerFile(filters=Filters(gyro_cutoff=30.0))
+    slower = ControllerFile(filters=FiltersSection(gyro_cutoff=30.0))
     job = JobFile(free=("gyro_cutoff",))
     (parameter,) = space_of(vehicle, slower, job).parameters
     assert parameter.initial == 30.0
@@ -137,7 +137,7 @@ def test_the_search_for_the_gyro_cutoff_starts_at_the_one_that_flies(vehicle):
 
 
 def test_a_filter_that_is_left_out_cannot_be_fitted(vehicle):
-    none = ControllerFile(filters=Filters(gyro_cutoff=None))
+    none = ControllerFile(filters=FiltersSection(gyro_cutoff=None))
     with pytest.raises(ConfigError, match=r"setup\.gyro_cutoff"):
         space_of(vehicle, none, JobFile(free=("gyro_cutoff",)))
     assert "gyro_cutoff" not in space_of(vehicle, none, JobFile()).fixed
