@@ -36,11 +36,13 @@ CHECKPOINTS = "checkpoint*.npz"
 OF_A_RUN = (
     BEST_FIT_FILE, EFFECTIVE_FILE, "controller.yaml", "report.html", "traces.npz",
     *(f"{name}.json" for name in ("about", "bench", "exports", "laps", "result", "search")),
-    *(f"{name}.csv" for name in ("bootstrap", "cross_validation", "metrics")),
+    *(f"{name}.csv" for name in ("bootstrap", "cross_validation", "information_shares", "metrics")),
     *(f"{name}.csv" for name in ("correlation", "covariance", "information")),
-    *(f"{name}.{suffix}" for name in ("next_flight", "profile", "sensitivity")
-      for suffix in ("csv", "json")),
-    "global_sensitivity.json", "profiles.json",
+    *(
+        f"{name}.{suffix}"
+        for name in ("global_sensitivity", "next_flight", "profile", "profiles", "sensitivity")
+        for suffix in ("csv", "json")
+    ),
 )  # fmt: skip
 """Files of a result folder beside checkpoints: those that one run or another writes there."""
 IN_FOLDER = (*OF_A_RUN, EXPORTS, EFFECTIVE, PLOTS)

@@ -121,6 +121,12 @@ def std_errors_of(information: Array) -> Array:
     return np.asarray(np.sqrt(np.diag(scaled_inverse(information))))
 
 
+def log_determinant(matrix: Array) -> float:
+    """Return the logarithm of a positive semidefinite matrix's determinant; see `scaled_root`."""
+    factor, unit = scaled_root(matrix)
+    return float(np.linalg.slogdet(factor @ factor.T)[1] - 2.0 * np.log(unit).sum())
+
+
 @dataclass(frozen=True)
 class Inverse:
     """The inverse of information that flights and a prior make up.

@@ -64,11 +64,15 @@ class Proposal(Part):
         The options of ``tune simulate`` for it.
     shrinks
         Coefficient -> width of its interval after the flight over that before.
+    volume
+        Factor on the geometric mean of the half axes of the fitted coefficients' confidence
+        ellipsoid.
     """
 
     name: Annotated[str, Len(1)]
     trajectory: dict[str, JsonValue]
     shrinks: dict[str, Share]
+    volume: Share
 
     @property
     def mean(self) -> float:
@@ -114,9 +118,9 @@ class Proposals(ResultFile):
     def write(self, folder: Path) -> None:
         """Write ``next_flight.json`` and, for other programs, ``next_flight.csv``."""
         super().write(folder)
-        header = ("flight", "mean_shrink", *self.targets)
+        header = ("flight", "mean_shrink", "volume_shrink", *self.targets)
         rows = [
-            [flight.name, flight.mean, *map(flight.shrinks.get, self.targets)]
+            [flight.name, flight.mean, flight.volume, *map(flight.shrinks.get, self.targets)]
             for flight in self.flights
         ]
         write_text(folder / NEXT_FLIGHT_TABLE, csv_text(header, rows))

@@ -2,10 +2,10 @@
 
 Every candidate inside an arena is simulated with the fitted coefficients and differentiated by
 them, with the noise of the recorded flights in each channel; its information is added to theirs.
-The A-optimal flight shrinks the sum of squared relative errors most (Goodwin and Payne, "Dynamic
-System Identification: Experiment Design and Data Analysis", 1977). A signal is simulated along the
-recorded flights, and added likewise; its residuals are assumed to exceed noise as much as those of
-recorded signals.
+The D-optimal flight shrinks the volume of the confidence ellipsoid most, the A-optimal one the sum
+of squared relative errors (Goodwin and Payne, "Dynamic System Identification: Experiment Design and
+Data Analysis", 1977). A signal is simulated along the recorded flights, and added likewise; its
+residuals are assumed to exceed noise as much as those of recorded signals.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sim_jax.state import hover, hover_speed
 from sim_jax.trajectory import Shape, shapes
 from tuner.config import InletName, TrajectorySettings
 from tuner.core.errors import InputError
-from tuner.core.numerics import Array, scaled_inverse, std_errors_of
+from tuner.core.numerics import Array, log_determinant, scaled_inverse, std_errors_of
 from tuner.design.proposals import MAX_WORTHWHILE_SHARE, LogProposal, Proposal, Proposals
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_at
@@ -286,6 +286,7 @@ def rank_next_flights(
             name=flight,
             trajectory=trajectory.model_dump(mode="json"),
             shrinks={name: _ratio(now, gain, names.index(name), count) for name in targets},
+            volume=_volume(now, gain, count),
         )
         for (flight, trajectory), gain, flies in zip(found.items(), gains, flown, strict=True)
         if flies
@@ -318,6 +319,12 @@ def _ratio(now: Array, gain: Array, place: int, count: int) -> float:
     row = places.index(place)
     before, after = (scaled_inverse(matrix[square])[row, row] for matrix in (now, now + gain))
     return float(np.sqrt(after / before))
+
+
+def _volume(now: Array, gain: Array, count: int) -> float:
+    """Return the factor on the geometric mean of the half axes of the fitted ones' ellipsoid."""
+    before, after = (log_determinant(matrix[:count, :count]) for matrix in (now, now + gain))
+    return float(np.exp(-0.5 * (after - before) / count))
 
 
 def _stays_inside(

@@ -86,6 +86,7 @@ class Residual(Part):
     white: bool
 
 
+PROFILES_TABLE = "profiles.csv"
 CHI_SQUARE_95 = 3.841459
 """Rise of χ² (one degree of freedom) at the true value that 95 % of experiments stay below."""
 
@@ -123,8 +124,20 @@ class Profiles(ResultFile):
 
     profiles: list[Profile]
 
+    def write(self, folder: Path) -> None:
+        """Write ``profiles.json`` and, for other programs, ``profiles.csv``."""
+        super().write(folder)
+        rows = [
+            [profile.name, *row]
+            for profile in self.profiles
+            for row in zip(profile.values, profile.rise, profile.quadratic, strict=True)
+        ]
+        header = ("coefficient", "value", "chi_square_rise", "quadratic")
+        write_text(folder / PROFILES_TABLE, csv_text(header, rows))
+
 
 Method = Literal["morris", "sobol"]
+GLOBAL_TABLE = "global_sensitivity.csv"
 
 #: Method -> what the attributes `main`, `total` and `spread` of a `SensitivityIndex` are.
 INDEX_MEANINGS = {
@@ -169,6 +182,16 @@ class GlobalSensitivity(ResultFile):
     simulations: int
     crashed: int
     indices: list[SensitivityIndex]
+
+    def write(self, folder: Path) -> None:
+        """Write ``global_sensitivity.json`` and, for other programs, ``.csv``."""
+        super().write(folder)
+        header = ("coefficient", "flight", "channel", *INDEX_MEANINGS[self.method])
+        rows = [
+            [i.coefficient, i.flight or "all", i.channel or "all", i.main, i.total, i.spread]
+            for i in self.indices
+        ]
+        write_text(folder / GLOBAL_TABLE, csv_text(header, rows))
 
 
 class CoefficientKnowledge(Part):
@@ -250,15 +273,20 @@ class EffectOverTime(Part):
         s, middles of equal stretches.
     change
         Coefficient -> RMS change of all channels for +1 % in each stretch, in standard deviations.
+    span
+        Coefficient -> s from and to which half of its squared effect falls; the shortest such
+        stretch.
     """
 
     flight: str
     windowed: bool = False
     time: list[float]
     change: dict[str, list[float]]
+    span: dict[str, tuple[float, float]]
 
 
 SENSITIVITY_FILE = "sensitivity.csv"
+SHARES_FILE = "information_shares.csv"
 MATRICES = ("correlation", "covariance", "information")
 
 COLUMNS = (
@@ -272,6 +300,8 @@ COLUMNS = (
     "rmse",
     "rmse_plus_10pct",
     "rmse_minus_10pct",
+    "half_effect_from",
+    "half_effect_to",
     "information_share",
 )
 
@@ -318,11 +348,17 @@ class Knowledge(ResultFile):
         """Write ``sensitivity.json`` and, for other programs, tables.
 
         ``sensitivity.csv`` has one row for each coefficient and axis of a channel of a flight;
-        ``information_share`` is the whole channel's on that flight. The matrices are square, their
-        first column and first row the names; covariance and information in the coefficients' units.
+        ``information_share`` is the whole channel's on that flight; half of the coefficient's
+        squared effect on the flight falls between ``half_effect_from`` and ``half_effect_to``, in
+        s. The matrices are square, their first column and first row the names; covariance and
+        information in the coefficients' units.
         """
         super().write(folder)
-        texts = {SENSITIVITY_FILE: csv_text(COLUMNS, _sensitivity(self))}
+        share = ("coefficient", "flight", "channel", "share")
+        texts = {
+            SENSITIVITY_FILE: csv_text(COLUMNS, _sensitivity(self)),
+            SHARES_FILE: csv_text(share, _shares(self)),
+        }
         for name in MATRICES:
             rows = zip(self.names, getattr(self, name), strict=True)
             header = ("coefficient", *self.names)
@@ -350,6 +386,7 @@ class Knowledge(ResultFile):
 
 
 def _sensitivity(knowledge: Knowledge) -> Iterable[Sequence[object]]:
+    spans = {flight.flight: flight.span for flight in knowledge.effects_over_time}
     for name, record in knowledge.coefficients.items():
         for output in knowledge.outputs:
             if name not in output.change:
@@ -365,8 +402,17 @@ def _sensitivity(knowledge: Knowledge) -> Iterable[Sequence[object]]:
                 output.rmse,
                 output.rmse_up[name],
                 output.rmse_down[name],
+                *spans[output.flight][name],
                 record.shares[output.channel][output.flight],
             ]
+
+
+def _shares(knowledge: Knowledge) -> Iterable[Sequence[object]]:
+    for name, record in knowledge.coefficients.items():
+        for channel, flights in record.shares.items():
+            for flight, share in flights.items():
+                yield [name, flight, channel, share]
+        yield [name, "", "prior", record.prior_share]
 
 
 CALIBRATION = Path(__file__).with_name("calibration.json")

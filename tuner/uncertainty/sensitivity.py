@@ -106,6 +106,9 @@ def local_sensitivity(
                 windowed=objective.segments.count > len(flights),
                 time=time.round(3).tolist(),
                 change={n: row.tolist() for n, row in zip(space.names, effect, strict=True)},
+                span={
+                    n: shortest_half(time, row) for n, row in zip(space.names, effect, strict=True)
+                },
             )
             for flight, (time, effect) in zip(flights, effects, strict=True)
         ],
@@ -190,6 +193,18 @@ def _over_time(
             counts += np.bincount(stretch, seen, minlength=TIME_BINS)
     middles = (np.arange(TIME_BINS) + 0.5) * end / TIME_BINS
     return middles, np.sqrt(squares / np.maximum(counts, 1.0)) * moved[:, None]
+
+
+def shortest_half(time: Array, effect: Array) -> tuple[float, float]:
+    """Return the shortest stretch, from and to in s, with half of the squared effect."""
+    width = float(time[1] - time[0])
+    cumulative = np.concatenate([[0.0], np.cumsum(np.square(effect))])
+    if cumulative[-1] <= 0.0:
+        return 0.0, float(time[-1] + width / 2)
+    ends = np.searchsorted(cumulative, cumulative[:-1] + cumulative[-1] / 2)
+    lengths = np.where(ends < len(cumulative), ends - np.arange(len(effect)), len(cumulative))
+    first = int(np.argmin(lengths))
+    return round(first * width, 3), round(int(ends[first]) * width, 3)
 
 
 GRID_LEVELS = 4

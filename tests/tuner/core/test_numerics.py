@@ -13,6 +13,7 @@ from tuner.core.numerics import (
     Inverse,
     finite_rows,
     huber_weights,
+    log_determinant,
     robust_sd,
     scaled_inverse,
     scaled_solve,
@@ -72,6 +73,7 @@ def test_what_nothing_is_known_of_has_a_large_error_and_the_rest_its_own(
     assert std_errors_of(matrix)[known] == pytest.approx(alone, rel=1e-3)
     inverse = Inverse.of(matrix, np.zeros_like(matrix))
     assert np.isfinite(inverse.matrix).all()
+    assert np.isfinite(log_determinant(matrix))
     assert inverse.known[known].all()
     if noise <= 0.0:
         assert not inverse.known[lost].any()

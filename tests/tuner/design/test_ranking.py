@@ -89,6 +89,7 @@ def test_what_the_swing_does_not_identify_a_yaw_spin_does(proposals: Proposals) 
 
 def test_no_flight_widens_an_interval(proposals: Proposals) -> None:
     for flight in proposals.flights:
+        assert flight.volume < 1.0
         assert all(0.0 < share <= 1.0 + 1e-9 for share in flight.shrinks.values())
     means = [flight.mean for flight in proposals.flights]
     assert means == sorted(means)
@@ -139,7 +140,7 @@ def test_proposals_can_be_read_back(proposals: Proposals, tmp_path: Path) -> Non
     assert Proposals.read(tmp_path) == proposals
     lines = (tmp_path / "next_flight.csv").read_text().splitlines()
     assert len(lines) == 1 + len(proposals.flights)
-    assert lines[0].startswith("flight,mean_shrink,")
+    assert lines[0].startswith("flight,mean_shrink,volume_shrink,")
 
 
 def in_a_hall(*flights: Proposal) -> Proposals:
@@ -154,7 +155,7 @@ def in_a_hall(*flights: Proposal) -> Proposals:
 
 
 def flight(name: str, **shrinks: float) -> Proposal:
-    return Proposal(name=name, trajectory={}, shrinks=shrinks)
+    return Proposal(name=name, trajectory={}, shrinks=shrinks, volume=0.9)
 
 
 def test_sentences_name_each_flight_and_what_it_would_narrow() -> None:

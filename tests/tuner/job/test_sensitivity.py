@@ -38,6 +38,7 @@ def test_the_folder_holds_tables_matrices_and_the_report(examined):
         {
             "sensitivity.csv",
             "sensitivity.json",
+            "information_shares.csv",
             "correlation.csv",
             "covariance.csv",
             "information.csv",

@@ -142,6 +142,7 @@ def _knowledge(vehicle: VehicleFile, free: Sequence[str], undetermined: Directio
                 flight=flight,
                 time=time.tolist(),
                 change=dict.fromkeys(names, rising),
+                span=dict.fromkeys(names, (4.0, 6.0)),
             )
             for flight in FLIGHTS
         ],

@@ -175,7 +175,7 @@ def test_an_effect_over_time_that_is_no_number_or_lacks_is_named(tmp_path: Path,
 
 def test_a_proposal_that_lacks_a_target_is_named(tmp_path: Path) -> None:
     making.write_run(tmp_path, FREE, ROLLING)
-    flight = {"name": "circle", "trajectory": {}, "shrinks": {}}
+    flight = {"name": "circle", "trajectory": {}, "shrinks": {}, "volume": 1.0}
     proposals = {"schema_version": 2, "arena": [8, 6, 3], "seconds": 20, "flights": [flight]}
     proposals |= {"targets": ["inertia_zz"], "fixed_targets": [], "all_known": False}
     (tmp_path / "next_flight.json").write_text(json.dumps(proposals))

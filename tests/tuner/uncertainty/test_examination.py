@@ -17,6 +17,7 @@ from tuner.uncertainty.estimates import flights_refute
 from tuner.uncertainty.examination import Examination, examine, knowledge_of
 from tuner.uncertainty.identifiability import stand_ins_of
 from tuner.uncertainty.records import Knowledge
+from tuner.uncertainty.sensitivity import shortest_half
 from tuner.uncertainty.verdict import ReasonCode, Verdict
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant", "estimate_latency")
@@ -198,6 +199,13 @@ def test_residuals_of_a_wrong_model_are_not_white(objective: Objective) -> None:
     assert not any(residual.white for residual in coloured if residual.channel == "position")
 
 
+def test_half_of_an_effect_is_where_it_is() -> None:
+    effect = np.zeros(40)
+    effect[20:24] = 1.0
+    assert shortest_half(np.arange(40) + 0.5, effect) == (20.0, 22.0)
+    assert shortest_half(np.arange(40) + 0.5, np.zeros(40)) == (0.0, 40.0)
+
+
 def test_files_hold_the_knowledge(knowledge: Knowledge, tmp_path: Path) -> None:
     knowledge.write(tmp_path)
     assert Knowledge.read(tmp_path) == knowledge
@@ -210,7 +218,7 @@ def test_files_hold_the_knowledge(knowledge: Knowledge, tmp_path: Path) -> None:
     matrix = np.array([[float(v) for v in line.split(",")[1:]] for line in lines[1:]])
     errors = [knowledge.coefficients[name].std_error for name in FREE]
     assert np.sqrt(np.diag(matrix)) == pytest.approx(errors)
-    for name, known in knowledge.coefficients.items():
-        of_name = [row for row in rows if row["coefficient"] == name]
-        shares = {(r["flight"], r["channel"]): float(r["information_share"]) for r in of_name}
-        assert sum(shares.values()) + known.prior_share == pytest.approx(1.0)
+    shares = list(csv.DictReader(io.StringIO((tmp_path / "information_shares.csv").read_text())))
+    for name in knowledge.coefficients:
+        total_share = sum(float(row["share"]) for row in shares if row["coefficient"] == name)
+        assert total_share == pytest.approx(1.0)

@@ -98,10 +98,12 @@ def _over_time(knowledge: Knowledge, names: Sequence[str]) -> list[Chart]:
         for name in names:
             change = np.array(over_time.change[name])
             largest = max(float(change.max()), 1e-300)
+            start, end = over_time.span[name]
             rows.append((change / largest).round(3).tolist())
             texts.append(
                 [
-                    f"{name}: {c:.3g} σ at {t:.1f} s"
+                    f"{name}: {c:.3g} σ at {t:.1f} s<br>half of its effect from {start:.1f} "
+                    f"to {end:.1f} s"
                     for t, c in zip(over_time.time, change, strict=True)
                 ]
             )
