@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import wraps
 from pathlib import Path
-from types import NoneType, SimpleNamespace, UnionType
+from types import SimpleNamespace
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -18,10 +18,7 @@ from typing import (
     Literal,
     Self,
     TypeVar,
-    Union,
     cast,
-    get_args,
-    get_origin,
     get_type_hints,
 )
 
@@ -265,13 +262,14 @@ def taking(options: type | None = None) -> Callable[[F], F]:
         def checked(*given: Any, **named: Any) -> Any:
             import numpy as np  # noqa: PLC0415 (what asks for help alone does not need it)
 
+            from tuner.core.yaml_section import check_types  # noqa: PLC0415 (pydantic)
+
             known = signature.bind(*given, **named).arguments
             # without that of the result, whose import takes its time
             types = {p.name: p.annotation for p in own if p.annotation is not p.empty}
             hinted = SimpleNamespace(__annotations__=types)
-            for name, hint in get_type_hints(hinted, inspect.unwrap(function).__globals__).items():
-                if name in known:
-                    check_type(name, plain(known[name]), hint)
+            hints = get_type_hints(hinted, inspect.unwrap(function).__globals__)
+            check_types({n: plain(known[n]) for n in hints if n in known}, hints, "options")
             usual: dict[str, Any] = dict.fromkeys(("divide", "over", "invalid"), "warn")
             with np.errstate(under="ignore", **usual):  # whatever its caller has set
                 return function(*given, **named)
@@ -290,41 +288,6 @@ def taking(options: type | None = None) -> Callable[[F], F]:
         return cast(F, checked)
 
     return shown
-
-
-_TYPES = {str: "text", Path: "a path", float: "a number", int: "a whole number",
-          bool: "True or False", Sequence: "a list", Mapping: "a mapping"}  # fmt: skip
-"""Type of a parameter -> its name in sentences."""
-
-
-def check_type(name: str, value: object, hint: Any) -> None:
-    """Refuse a value that is of no type of a hint, or a list with such an entry.
-
-    Parameters
-    ----------
-    value
-        As `plain` returns it.
-
-    Raises
-    ------
-    ConfigError
-        It is of another type.
-    """
-    kinds = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
-    known = {get_origin(kind) or kind: get_args(kind) for kind in kinds}
-    if isinstance(value, list) and Sequence in known:
-        for number, entry in enumerate(value):
-            check_type(f"{name}[{number}]", entry, known[Sequence][0])
-    elif not any(_is_of(value, kind) for kind in known):
-        words = [_TYPES.get(kind) or kind.__name__ for kind in known if kind is not NoneType]
-        raise ConfigError(name, f"is of type {type(value).__name__}", f"give {' or '.join(words)}")
-
-
-def _is_of(value: object, kind: Any) -> bool:
-    if isinstance(value, bool) or kind in (bool, Sequence):
-        return kind is bool and isinstance(value, bool)
-    wider = {float: int | float, Path: str, Literal: object}.get(kind, kind)
-    return isinstance(value, wider)
 
 
 def plain(value: Any) -> Any:

@@ -26,6 +26,7 @@ from pydantic import (
     AllowInfNan,
     BaseModel,
     ConfigDict,
+    InstanceOf,
     Strict,
     ValidationError,
     create_model,
@@ -230,7 +231,9 @@ def config_error(
     while place and place not in lines:
         place = place[:-1]
     line = f"line {lines[place]}: " if place in lines else ""
-    more = f" ({len(details) - 1} more after this)" if len(details) > 1 else ""
+    first = _keys(details[0]["loc"])
+    others = sum(_keys(detail["loc"])[: len(first)] != first for detail in details)
+    more = f" ({others} more after this)" if others else ""
     return ConfigError(path, line + what, remedy + more)
 
 
@@ -242,7 +245,7 @@ _EXPECTATIONS: Mapping[str, str] = {
     "greater_than": "it should be more than {gt}",
     "greater_than_equal": "it should be at least {ge}",
     "int_type": "it should be a whole number",
-    "is_instance_of": "it should be a mapping of keys to values",
+    "is_instance_of": "it should be a {class}",
     "json_type": "it should be what JSON can hold",
     "less_than": "it should be less than {lt}",
     "less_than_equal": "it should be at most {le}",
@@ -342,7 +345,9 @@ _KIND = re.compile(
 
 
 def _keys(place: Place) -> Place:
-    return tuple(part for part in place if isinstance(part, int) or not _KIND.fullmatch(part))
+    """Return the keys in a location, whose first part is always one."""
+    inner = (part for part in place[1:] if isinstance(part, int) or not _KIND.fullmatch(part))
+    return (*place[:1], *inner)
 
 
 def dotted(place: Place) -> str:
@@ -446,10 +451,26 @@ def section_of(options: type, *, leaving: Collection[str] = (), text: Any = str)
     return create_model(options.__name__, __base__=Section, **chosen)  # type: ignore[call-overload, no-any-return]
 
 
+def check_types(values: Mapping[str, object], hints: Mapping[str, Any], where: str) -> None:
+    """Refuse a value that is of no type of its hint.
+
+    Raises
+    ------
+    ConfigError
+        In one line: where, the value's name, the value, what it should be.
+    """
+    own: dict[str, Any] = {name: (_checked(hints[name], str), ...) for name in values}
+    build(create_model("values", __base__=Section, **own), values, where)
+
+
 def _checked(hint: Any, text: Any) -> Any:
     """Return a type of which no value of another type is made."""
-    if hint is str:
-        return text
+    plain, kind = {str: text, Mapping: dict[Any, Any]}, get_origin(hint) or hint
+    if kind in plain:
+        return plain[kind]
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        instance: Any = InstanceOf  # an alias to mypy, which takes no type that is computed
+        return instance[kind]
     if hint in (bool, int, float):
         return Annotated[hint, Strict()]
     inner = [_checked(part, text) for part in get_args(hint)]
