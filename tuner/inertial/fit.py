@@ -44,7 +44,7 @@ OUTPUTS = ("roll", "pitch", "yaw", "thrust")
 STEADY = ("steady_roll", "steady_pitch", "steady_yaw")
 """The constants of the first three, in rad/s²."""
 NUMBER_NAMES = ("up", "down", "late", *OUTPUTS, *STEADY)
-"""The numbers of a `Response`: coordinates of the lags, gains, constants."""
+"""The numbers of a `Response`: the lags' coordinates (`MotorLags`), gains, and constants."""
 CONSTANT_COLUMN, RATE_COLUMN, DRAG_COLUMN = 0, 1, 3
 """The columns of a constant, of the rate, and about x and y of the drag, among those that no lag
 moves."""
@@ -91,15 +91,11 @@ class Response:
 
     Attributes
     ----------
-    lags
-        Of the motors.
-    gains
-        Output -> the response: mass over inertia in 1/m², of torque's lever in m, or of thrust to
-        squared rotor speed.
-    steady
-        Of `STEADY` -> rad/s².
+    values
+        Of `NUMBER_NAMES`, in their order. An output's gain is mass over inertia in 1/m², of
+        torque's lever in m, or of thrust to squared rotor speed; constants are in rad/s².
     covariance
-        (10, 10) of `NUMBER_NAMES`: lags' coordinates, gains and constants.
+        (10, 10) of them.
     explained
         Output -> explained share of its variance, in the band of `low_pass`.
     curves
@@ -108,13 +104,16 @@ class Response:
         (n,) s of those.
     """
 
-    lags: MotorLags
-    gains: Mapping[str, float]
-    steady: Mapping[str, float]
+    values: Mapping[str, float]
     covariance: Array
     explained: Mapping[str, float]
     curves: Mapping[str, tuple[Array, Array]]
     time: Array
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """The numbers' standard errors."""
+        return dict(zip(self.values, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
 TINY = 1e-30
@@ -225,14 +224,8 @@ def fit_response(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Respon
     """
     found = _fit_once(stretches, vehicle)
     other = _fit_once(tuple(stretch.at_half_rate for stretch in stretches), vehicle)
-    apart = _as_vector(found) - _as_vector(other)
+    apart = np.subtract([*found.values.values()], [*other.values.values()])
     return replace(found, covariance=found.covariance + np.diag(apart**2))
-
-
-def _as_vector(response: Response) -> Array:
-    return np.array(
-        [*response.lags.coordinates, *response.gains.values(), *response.steady.values()]
-    )
 
 
 def _fit_once(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Response:
@@ -414,13 +407,11 @@ def _response(problem: _Problem, place: Array, weighings: Mapping[str, _Whitenin
         curves[name] = seen, made
     covariance = _covariance(problem, weighings, tables, errors)
     covariance += _air_covariance(problem, moving, found)
+    of_outputs = [solution[0] for solution in found.values()]
+    constants = [found[n][moving[n][0].shape[1] + CONSTANT_COLUMN] for n in OUTPUTS[: len(STEADY)]]
+    numbers = map(float, (*place, *of_outputs, *constants))
     return Response(
-        lags=MotorLags.at(place),
-        gains={name: float(solution[0]) for name, solution in found.items()},
-        steady={
-            name: float(found[output][moving[output][0].shape[1] + CONSTANT_COLUMN])
-            for name, output in zip(STEADY, OUTPUTS, strict=False)
-        },
+        values=dict(zip(NUMBER_NAMES, numbers, strict=True)),
         covariance=covariance,
         explained={
             name: float((np.var(seen) - np.var(seen - made)) / (np.var(seen) + BIAS_SD**2))

@@ -69,7 +69,9 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
         raise RecordingError(flight.path, clause(sentence(finding)), clause(remedy(finding)))
     response = fit_response(stretches, vehicle)
     wrong = [
-        name for name in _outputs_within(response, MAX_CERTAIN_ERROR) if response.gains[name] <= 0.0
+        name
+        for name in _outputs_within(response, MAX_CERTAIN_ERROR)
+        if response.values[name] <= 0.0
     ]
     if wrong:
         raise RecordingError(
@@ -89,22 +91,20 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
 
 def _outputs_within(response: Response, dim: float) -> list[str]:
     """Return the outputs whose gains have relative standard errors below a limit."""
-    error = dict(zip(NUMBER_NAMES, np.sqrt(np.diag(response.covariance)), strict=True))
+    gains, errors, explained = response.values, response.errors, response.explained
     return [
         name
         for name in OUTPUTS
-        if response.explained[name] > MIN_EXPLAINED
-        and error[name] < dim * abs(response.gains[name])
+        if explained[name] > MIN_EXPLAINED and errors[name] < dim * abs(gains[name])
     ]
 
 
 def _used_numbers(response: Response) -> tuple[str, ...]:
     """Return the names of the numbers that are used."""
-    error = dict(zip(NUMBER_NAMES, np.sqrt(np.diag(response.covariance)), strict=True))
-    shown = {
-        name for name in _outputs_within(response, MAX_RELATIVE_ERROR) if response.gains[name] > 0.0
-    }
-    lags = {name for name in ("up", "down") if error[name] < 2.0 * MAX_RELATIVE_ERROR} | {"late"}
+    well = _outputs_within(response, MAX_RELATIVE_ERROR)
+    shown = {name for name in well if response.values[name] > 0.0}
+    errors = response.errors
+    lags = {name for name in ("up", "down") if errors[name] < 2.0 * MAX_RELATIVE_ERROR} | {"late"}
     steady = {name for name, output in OUTPUT_OF.items() if output in shown}
     return tuple(name for name in NUMBER_NAMES if name in shown | lags | steady)
 
@@ -112,12 +112,10 @@ def _used_numbers(response: Response) -> tuple[str, ...]:
 def _measurement(
     name: str, response: Response, used: Sequence[str], vehicle: VehicleFile
 ) -> Measurement:
-    lags, gains = response.lags, response.gains
+    gains = response.values
     curve = 2.0 * COEFFICIENTS["input_scaling"].scaled(vehicle.motor.input_scaling)
     values = {
-        "up": math.log(lags.up),
-        "down": math.log(lags.down),
-        "late": lags.delay,
+        **response.values,
         "roll": math.log(max(gains["roll"] / vehicle.mass, 1e-300)),
         "pitch": math.log(max(gains["pitch"] / vehicle.mass, 1e-300)),
         "yaw": curve + math.log(max(gains["yaw"] * vehicle.aerodynamics.moment_constant, 1e-300)),
@@ -129,7 +127,7 @@ def _measurement(
     inertia = {
         name: over[output] / gains[output] for name, output in OUTPUT_OF.items() if name in used
     }
-    values |= {name: response.steady[name] * moment for name, moment in inertia.items()}
+    values |= {name: response.values[name] * moment for name, moment in inertia.items()}
     places = [NUMBER_NAMES.index(number) for number in used]
     # gains enter by their logarithms, constants as moments
     slope = np.array(
