@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,6 +55,11 @@ class Change(NamedTuple):
     def gradient(self) -> Array:
         """Change of the slope of the loss (K,)."""
         return np.asarray(self.across.sum(axis=(0, 1, 2)))
+
+
+_SQUARES = ("nuisance_prior", "prior", "ground", "lost")
+_ROWS = ("selection_shifts", "pull", "nuisance_pull")
+"""Fields of `FisherInformation` of (K, K) and of (K,)."""
 
 
 @dataclass(frozen=True)
@@ -141,37 +146,25 @@ class FisherInformation:
     def joined(parts: Sequence[FisherInformation]) -> FisherInformation:
         """Return the information of all flights from that of consecutive groups of them."""
         first = parts[0]
-        first_flight = np.cumsum([0, *(int(part.flight.max()) + 1 for part in parts)])
-        return FisherInformation(
-            channels=first.channels,
-            flight=np.concatenate(
-                [part.flight + number for part, number in zip(parts, first_flight, strict=False)]
-            ),
-            blocks=np.concatenate([part.blocks for part in parts], axis=1),
-            score=np.concatenate([part.score for part in parts], axis=1),
-            spread=np.concatenate([part.spread for part in parts], axis=1),
-            nuisance_prior=np.sum([part.nuisance_prior for part in parts], axis=0),
-            prior=first.prior,
-            crashed=np.concatenate([part.crashed for part in parts]),
-            begins=np.concatenate([part.begins for part in parts]),
-            scale=np.concatenate([part.scale for part in parts], axis=1),
-            ground=first.ground,
-            changes={
-                name: Change(
-                    *(
-                        np.concatenate(same, axis=1)
-                        for same in zip(*(part.changes[name] for part in parts), strict=True)
-                    )
-                )
-                for name in first.changes
-            },
-            diverged=None
-            if first.diverged is None
-            else np.concatenate([part.diverged for part in parts if part.diverged is not None]),
-            pull=first.pull,
-            nuisance_pull=None
-            if first.nuisance_pull is None
-            else np.sum([p.nuisance_pull for p in parts if p.nuisance_pull is not None], axis=0),
+        begins = np.cumsum([0, *(int(part.flight.max()) + 1 for part in parts)])
+        flights = [part.flight + number for part, number in zip(parts, begins, strict=False)]
+
+        def of_all(*names: str, by: Callable[..., Any]) -> dict[str, Any]:
+            known = [name for name in names if getattr(first, name) is not None]
+            return {name: by([getattr(part, name) for part in parts]) for name in known}
+
+        along_segments = partial(np.concatenate, axis=1)
+        changes = {
+            name: Change(*map(along_segments, zip(*(p.changes[name] for p in parts), strict=True)))
+            for name in first.changes
+        }
+        return replace(
+            first,
+            flight=np.concatenate(flights),
+            changes=changes,
+            **of_all("blocks", "score", "spread", "scale", by=along_segments),
+            **of_all("crashed", "begins", "diverged", by=np.concatenate),
+            **of_all("nuisance_prior", "nuisance_pull", by=partial(np.sum, axis=0)),
         )
 
     def with_resting(self, where: NDArray[np.bool_]) -> FisherInformation:
@@ -189,25 +182,15 @@ class FisherInformation:
     def about(self, indices: NDArray[np.intp]) -> FisherInformation:
         """Return the information about some coefficients while the others are fixed."""
         square = np.ix_(indices, indices)
-
-        def some(values: Array | None) -> Array | None:
-            return None if values is None else values[indices]
-
-        return replace(
-            self,
+        return self._with_each(
+            lambda matrix: matrix[square],
+            lambda row: row[indices],
             blocks=self.blocks[..., indices, :][..., indices],
             score=self.score[..., indices],
-            nuisance_prior=self.nuisance_prior[square],
-            prior=self.prior[square],
-            ground=None if self.ground is None else self.ground[square],
-            lost=None if self.lost is None else self.lost[square],
             changes={
                 name: change._replace(across=change.across[..., indices])
                 for name, change in self.changes.items()
             },
-            selection_shifts=some(self.selection_shifts),
-            pull=some(self.pull),
-            nuisance_pull=some(self.nuisance_pull),
         )
 
     def with_change(self, change: Change) -> FisherInformation:
@@ -217,22 +200,23 @@ class FisherInformation:
         """
         beside = np.append(change.across, change.own[..., None], axis=-1)
         blocks = np.concatenate([self.blocks, change.across[..., None, :]], axis=-2)
-        edge = ((0, 1), (0, 1))
-        return replace(
-            self,
+        return replace(self, selection_shifts=None)._with_each(
+            lambda matrix: np.pad(matrix, (0, 1)),
+            lambda row: np.append(row, 0.0),
             blocks=np.append(blocks, beside[..., None], axis=-1),
             score=np.append(self.score, change.score[..., None], axis=-1),
-            nuisance_prior=np.pad(self.nuisance_prior, edge),
-            prior=np.pad(self.prior, edge),
-            ground=None if self.ground is None else np.pad(self.ground, edge),
-            lost=None if self.lost is None else np.pad(self.lost, edge),
             changes={},
-            selection_shifts=None,
-            pull=None if self.pull is None else np.append(self.pull, 0.0),
-            nuisance_pull=None
-            if self.nuisance_pull is None
-            else np.append(self.nuisance_pull, 0.0),
         )
+
+    def _with_each(
+        self, square: Callable[[Array], Array], row: Callable[[Array], Array], **more: Any
+    ) -> FisherInformation:
+        """Return the same with each (K, K) and each (K,) that is there changed."""
+        for names, change in ((_SQUARES, square), (_ROWS, row)):
+            for name in names:
+                value = getattr(self, name)
+                more[name] = None if value is None else change(value)
+        return replace(self, **more)
 
     @property
     def refuted(self) -> bool:
