@@ -98,7 +98,7 @@ class ModelAccelerations:
     def _slopes(self, point: Array) -> dict[str, Array]:
         """Return coefficient -> derivatives (K,) of its value by a point's coordinates (K,)."""
         return {
-            name: ratio * (np.exp(x) if parameter.scale == "log" else 1.0) * unit
+            name: ratio * parameter.error_at(x, 1.0) * unit
             for parameter, x, unit in zip(self.parameters, point, np.eye(len(point)), strict=True)
             for name, ratio in parameter.ratios.items()
         }
@@ -129,7 +129,7 @@ def moves_rotors(name: str) -> bool:
 def values_at(parameters: Sequence[Parameter], point: Array) -> dict[str, float]:
     """Return coefficient -> value of scaled coordinates (K,), tied ones too."""
     return {
-        name: float(np.exp(x) if parameter.scale == "log" else x) * ratio
+        name: parameter.value_at(x) * ratio
         for parameter, x in zip(parameters, point, strict=True)
         for name, ratio in parameter.ratios.items()
     }

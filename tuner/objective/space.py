@@ -123,10 +123,6 @@ class Space:
         inside = np.clip(share, 1e-6, 1 - 1e-6)
         return np.asarray(np.log(inside / (1 - inside)) * self.stretch)
 
-    def from_scaled(self, index: int, scaled: float) -> float:
-        """Return a parameter's value from its scaled coordinate."""
-        return float(np.exp(scaled)) if self.is_log[index] else float(scaled)
-
     def slope(self, vector: Array) -> Array:
         """Return dx/dz, the scaled coordinate's change with the search vector, shape (K,).
 

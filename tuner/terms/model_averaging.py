@@ -140,7 +140,9 @@ def substitutes_of(
             probability = float(expit((before - loss(there)) / excess))
             scaled = linear.scaled + there
             values = {  # conditions of flights are columns beyond the space's
-                linear.names[i]: space.from_scaled(i, scaled[i]) for i in columns if i < len(space)
+                linear.names[i]: space.parameters[i].value_at(scaled[i])
+                for i in columns
+                if i < len(space)
             }
             found.append(Substitute(group, values, change, probability))
     return found

@@ -19,7 +19,6 @@ from tuner.core.numerics import Array, scaled_inverse, unit_diagonal
 from tuner.disturbances.predictor import hidden_by_setpoints
 from tuner.findings.findings import Code, Finding
 from tuner.objective.information import Change, FisherInformation
-from tuner.objective.space import Space
 from tuner.search.progress import Fitted
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.estimates import READINGS, STUDENT_FACTOR, Uncertainty
@@ -168,15 +167,16 @@ def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[s
         if name not in space.names:
             continue
         index = space.names.index(name)
+        parameter = space.parameters[index]
         estimate = uncertainty.estimates[name]
         ground = float(prior.mean[place])
         identified = bool(moves[index])
         spread = float(np.hypot(alone_error[index], ground_error[place]))
         sources[name] = Sources(
-            ground=space.from_scaled(index, ground),
-            ground_error=_error(space, index, ground, ground_error[place]),
-            flights=space.from_scaled(index, alone[index]) if identified else None,
-            flights_error=_error(space, index, alone[index], alone_error[index])
+            ground=parameter.value_at(ground),
+            ground_error=parameter.error_at(ground, ground_error[place]),
+            flights=parameter.value_at(alone[index]) if identified else None,
+            flights_error=parameter.error_at(alone[index], alone_error[index])
             if identified
             else None,
             both=estimate.value,
@@ -184,11 +184,6 @@ def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[s
             deviation=float(alone[index] - ground) / spread if identified else None,
         )
     return sources
-
-
-def _error(space: Space, index: int, scaled: float, error: float) -> float:
-    value = space.from_scaled(index, float(scaled))
-    return float(error * value) if space.is_log[index] else float(error)
 
 
 def ground_conflicts(sources: Mapping[str, Sources], mass: float | None) -> Iterator[Finding]:

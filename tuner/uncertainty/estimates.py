@@ -198,11 +198,9 @@ def _estimates(
     parameter, (verdict, reason), (scaled, error) = space.parameters[index], judgement, at
     limits = parameter.scaled(parameter.lower), parameter.scaled(parameter.upper)
     low, high = (
-        space.from_scaled(index, float(np.clip(scaled + side * error, *limits)))
-        for side in (-Z95, Z95)
+        parameter.value_at(float(np.clip(scaled + side * error, *limits))) for side in (-Z95, Z95)
     )
-    value = space.from_scaled(index, scaled)
-    slope = value if parameter.scale == "log" else 1.0
+    value, slope = parameter.value_at(scaled), parameter.error_at(scaled, 1.0)
     tied = reason.model_copy(update={"tied_to": parameter.name})
     return {
         name: Estimate(

@@ -282,7 +282,7 @@ def profile_likelihood(
     scaled[:, index] = grid
     starts = space.vector_at(scaled)
     chi = _refitted(objective, full_problem.point, criterion, starts, index)
-    values = np.array([space.from_scaled(index, float(x)) for x in grid])
+    values = np.array([space.parameters[index].value_at(x) for x in grid])
     # as the standard errors do, the likelihood allows for residuals that are not white noise
     rise = (chi - chi.min()) / uncertainty.covariance.beyond_noise[index] ** 2
     lowest = int(np.argmin(chi))

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+
 Scope = Literal["vehicle", "setup", "flight", "window"]
 Scale = Literal["log", "linear"]
 Place = tuple[str, str]
@@ -63,11 +65,11 @@ class Scaled:
 
     def value_at(self, scaled: float) -> float:
         """Return the value at a scaled coordinate."""
-        return math.exp(scaled) if self.scale == "log" else scaled
+        return float(np.exp(scaled) if self.scale == "log" else scaled)
 
     def error_at(self, scaled: float, deviation: float) -> float:
         """Return the standard error of a value from that of its scaled coordinate."""
-        return deviation * math.exp(scaled) if self.scale == "log" else deviation
+        return float(deviation * (self.value_at(scaled) if self.scale == "log" else 1.0))
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ def side_by_side(flights_mean, flights_information):
     total = flights_information + PRIOR.information
     pull = flights_information @ flights_mean + PRIOR.information @ MEAN
     end = np.linalg.solve(total, pull)
-    values = {name: fit.from_scaled(i, end[i]) for i, name in enumerate(FREE)}
+    values = {name: fit.parameters[i].value_at(end[i]) for i, name in enumerate(FREE)}
     vector = fit.vector_of(values)
     error = np.sqrt(np.diag(np.linalg.inv(total)))
     uncertainty = SimpleNamespace(
