@@ -21,7 +21,7 @@ from tuner.evaluate.prediction import (
 )
 from tuner.evaluate.records import PredictedErrors
 from tuner.findings.findings import Code, Finding
-from tuner.objective.inlets import INLETS
+from tuner.objective.inlets import INLETS, linear_interpolation
 from tuner.recordings.flight import Flight
 from tuner.search.job_flights import with_known
 from tuner.search.problem import Job
@@ -212,8 +212,7 @@ def _beyond_limit(flight: Flight, control: PositionControl, time: Array, positio
         series = flight.series.get(f"reference_{kind}")
         if series is None:
             return 0.0
-        wanted = [np.interp(time, series.time, column) for column in series.values.T]
-        feedback += np.array(gains) * (np.column_stack(wanted) - there)
+        feedback += np.array(gains) * (linear_interpolation(series, time) - there)
     limit = control.max_feedback_acceleration
     return float(np.mean(np.linalg.norm(feedback, axis=1) > limit))
 

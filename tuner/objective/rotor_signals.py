@@ -382,9 +382,7 @@ def with_commands(flight: Flight, vehicle: VehicleFile) -> Flight:
     if flight.has("command") or not has_wrench or len(vehicle.rotors) != 4:
         return flight
     thrust, torque = (flight.series[name] for name in WRENCH)
-    moments = np.column_stack(
-        [np.interp(thrust.time, torque.time, column) for column in torque.values.T]
-    )
+    moments = linear_interpolation(torque, thrust.time)
     command = commands_of(np.column_stack([thrust.values, moments]), vehicle)
     series = Series(thrust.time, command)
     on_clock = resample("command", series, flight.time)

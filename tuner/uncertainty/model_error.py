@@ -199,8 +199,7 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
         acting[:, :3] = Rotation.from_quat(
             np.asarray(one.motion.attitude.stacked()).T, scalar_first=True
         ).apply(acting[:, :3])
-        for axis, column in enumerate(acting.T):
-            pushes[axis, :, number] = np.interp(ticks, one.time, column)
+        pushes[..., number] = linear_interpolation(Series(one.time, acting), ticks).T
     force, moment = (Vec3(*map(jnp.asarray, rows)) for rows in (pushes[:3], pushes[3:]))
     pushed = Disturbance(force=force, moment=moment, rate=rate)
     return ModelErrors(found.laws, pushed, differing, found.speed_lag, gain_shifts)
@@ -447,7 +446,7 @@ def _controller_estimates(
             stamps = stamps[(stamps >= 0.0) & (stamps <= clock[-1])]
             there = Series(clock, flown.channels[channel][number])
             # outputs of a loop hold until it runs again; a body rate is continuous
-            read = _interpolated if name == "body_rate" else zero_order_hold
+            read = linear_interpolation if name == "body_rate" else zero_order_hold
             made.append(Series(stamps, read(there, stamps)))
         simulated.append(_signals(made, mixer, even))
     if not recorded:
@@ -470,7 +469,7 @@ def _controller_estimates(
 
 def _signals(parts: Sequence[Series], mixer: MixerSettings, time: Array) -> Signals:
     """Return a rate controller's inputs and outputs from set-points, gyro and commands."""
-    wanted, rate, commands = (_interpolated(part, time) for part in parts)
+    wanted, rate, commands = (linear_interpolation(part, time) for part in parts)
     torque = torque_of(mixer, tuple(commands.T))
     turned = np.array([1.0, -1.0, -1.0])  # FRD
     return Signals(
@@ -508,18 +507,14 @@ def _of_centre_of_mass(series: Mapping[str, Series], model: Model) -> dict[str, 
         arm = Series(attitude.time, turned.apply(offset))
         moved["position"] = _difference(position, arm)
         if "velocity" in series and float(model.controller.sees_markers) > 0.5:
-            rates = _interpolated(series["body_rate"], attitude.time)
+            rates = linear_interpolation(series["body_rate"], attitude.time)
             swing = Series(attitude.time, turned.apply(np.cross(rates, offset)))
             moved["velocity"] = _difference(series["velocity"], swing)
     return moved
 
 
-def _interpolated(series: Series, times: Array) -> Array:
-    return np.column_stack([np.interp(times, series.time, column) for column in series.values.T])
-
-
 def _difference(series: Series, other: Series) -> Series:
-    return Series(series.time, series.values - _interpolated(other, series.time))
+    return Series(series.time, series.values - linear_interpolation(other, series.time))
 
 
 def _commanded_speeds(
@@ -580,7 +575,7 @@ def _simulated(
     clock = np.arange(channels[MOTION].shape[1]) / rate
 
     def at(name: str) -> Array:
-        return _interpolated(Series(clock, channels[name][number]), part.time)
+        return linear_interpolation(Series(clock, channels[name][number]), part.time)
 
     rows, attitude, speeds = at(MOTION), at(BODY_ATTITUDE), at(TRUE_ROTOR_SPEED)
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
