@@ -1073,7 +1073,7 @@ def dtype_of(var: Any) -> Any:
 
 
 def _is_unsigned(var: Any) -> bool:
-    return str(getattr(var.aval, "dtype", "")).startswith("uint")
+    return getattr(getattr(var.aval, "dtype", None), "kind", "") == "u"
 
 
 def _type_in(elements: Elements) -> ir.Type:

@@ -68,9 +68,10 @@ def is_bool(value: ir.Value) -> bool:
 
 def constant(kind: ir.Type, number: float | int | bool) -> ir.Constant:
     """Return a number as a constant of a scalar or vector type."""
-    real = isinstance(base(kind), ir.FloatType | ir.DoubleType)
-    plain = float(number) if real else int(number)
-    return _constant(kind, plain, repr(plain))
+    if isinstance(base(kind), ir.IntType):
+        return _constant(kind, int(number), "")
+    plain = float(number)
+    return _constant(kind, plain, "" if plain else repr(plain))
 
 
 @cache
