@@ -19,7 +19,7 @@ import uvicorn
 
 from tests.tuner.service import serving
 from tests.tuner.service.serving import FAKE_WORKER
-from tuner.service import dispatcher, recordings
+from tuner.service import dispatcher, http, recordings
 from tuner.service.app import HttpConnection, create_app
 from tuner.service.service import Service
 from tuner.service.settings import ServiceLimits, ServiceSettings
@@ -32,6 +32,13 @@ LIMITS = ServiceLimits(free_bytes=0)
 def _quick_worker(monkeypatch, request):
     if "real_worker" not in request.fixturenames:
         monkeypatch.setattr(dispatcher, "WORKER", FAKE_WORKER)
+
+
+@pytest.fixture(autouse=True)
+def _quick_looks(monkeypatch):
+    """Have the table of jobs looked at more often than a person would notice."""
+    for module in (dispatcher, http):
+        monkeypatch.setattr(module, "POLL_INTERVAL_S", 0.05)
 
 
 @pytest.fixture(autouse=True)
