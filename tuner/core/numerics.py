@@ -41,6 +41,13 @@ def robust_sd(values: ArrayLike) -> Array:
     return np.asarray(MAD_TO_SD * np.median(np.abs(values)))
 
 
+def student_factor(freedom: int) -> float:
+    """Return the factor by which few degrees of freedom widen a 95 % interval (Student's t)."""
+    from scipy.special import stdtrit  # noqa: PLC0415 (scipy.stats takes a second to import)
+
+    return float(stdtrit(max(freedom, 1), 0.975) / Z95)
+
+
 def huber_weights(error: Array, limit: float) -> Array:
     """Return Huber's weights: 1 up to a limit of the scaled error, then falling as its inverse."""
     return np.asarray(1.0 / np.maximum(1.0, np.abs(error) / limit))

@@ -28,9 +28,9 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import huber, stdtrit  # scipy.stats takes a quarter of a second to import
+from scipy.special import huber  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import Z95, Array, huber_weights, robust_sd
+from tuner.core.numerics import Array, huber_weights, robust_sd, student_factor
 from tuner.equation_error.model_accelerations import LinearisedAccelerations, ModelAccelerations
 from tuner.equation_error.recorded_accelerations import Mask
 
@@ -378,8 +378,9 @@ def _covariance(sums: UnitEquations, free: Mask) -> Array:
     scaled = information[inside] * np.outer(unit, unit)
     covariance[inside] = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) * np.outer(unit, unit)
     pulls = [sums.change_by(slope, free) for slope in sums.slope]
-    student = stdtrit(count - 1, 0.975) / Z95
-    scatter = student**2 * count / (count - 1) * np.sum(np.square(pulls), axis=0)
+    scatter = (
+        student_factor(count - 1) ** 2 * count / (count - 1) * np.sum(np.square(pulls), axis=0)
+    )
     least = np.maximum(np.diag(covariance), 0.0)
     wider = np.sqrt(np.maximum(scatter, least) / np.maximum(least, 1e-300))
     wider[~free] = 1.0

@@ -13,13 +13,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from sim_jax.constants import RAD_S_PER_RPM
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import Z95, Array, robust_sd
+from tuner.core.numerics import Array, robust_sd, student_factor
 from tuner.ground.measurement import Curve
 from tuner.recordings.content import Content, ReadOptions, read_content
 from tuner.recordings.recording import TABLE_TOPIC, Clock, TabularRecording
@@ -158,11 +157,6 @@ def widen(covariance: Array, chi_square: float, freedom: int) -> Array:
     ratio = chi_square / max(freedom, 1)
     ratio = max(ratio, 1.0) if freedom < MIN_TRUSTED_FREEDOM else ratio
     return np.asarray(covariance * ratio * student_factor(freedom) ** 2)
-
-
-def student_factor(freedom: int) -> float:
-    """Return the factor by which few degrees of freedom widen an interval (Student's t)."""
-    return float(stats.t.ppf(0.975, max(freedom, 1))) / Z95
 
 
 MAX_BYTES = 200_000_000

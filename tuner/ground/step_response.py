@@ -12,9 +12,9 @@ from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import Array, robust_sd, scaled_solve
+from tuner.core.numerics import Array, robust_sd, scaled_solve, student_factor
 from tuner.ground.measurement import Curve, Measurement, Remark
-from tuner.ground.rig_data import OUTLIER_SIGMAS, student_factor
+from tuner.ground.rig_data import OUTLIER_SIGMAS
 from tuner.vehicle.vehicle import max_latency
 
 LAG_RANGE_S = (0.001, 1.0)

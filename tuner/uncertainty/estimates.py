@@ -9,9 +9,15 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import Z95, Array, Inverse, scaled_inverse, symmetric_eigen
+from tuner.core.numerics import (
+    Z95,
+    Array,
+    Inverse,
+    scaled_inverse,
+    student_factor,
+    symmetric_eigen,
+)
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.information import Change, FisherInformation, information_at
@@ -368,7 +374,7 @@ SIMULATOR_STEP_S = 1.0 / 4000.0
 """A simulator's finest usual step. A lag integrated by Euler's rule, as most do, is half a step
 shorter than its time constant: ln(1 - h/τ) = -h/(τ - h/2) to second order. The standard error of a
 value between two limits is their half-width over √3."""
-STUDENT_FACTOR = float(stdtrit(VOLTMETER_DRAWS, 0.975) / Z95)
+STUDENT_FACTOR = student_factor(VOLTMETER_DRAWS)
 """Factor on the root mean square of the draws: Student's t over the normal quantile, at 95 %."""
 RESIDUAL_PARTS = ("noise", "residuals", "left_out")
 """Parts that are three estimates of the same error."""
