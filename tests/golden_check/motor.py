@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from sim_jax.environment import Air
-from sim_jax.geometry import Vec3
+from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.terms import total_wrench
-from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
+from sim_jax.vehicle import Aerodynamics, Body, Motor, PerRotor, Rotor, Setup, Vehicle
 from tests.golden_check.table import Deviation, Table, deviation, merged
 
 EXACT = 1e-12
 SINGLE = 1e-6
+COLUMNS = (
+    "omega_signed",
+    "reversible",
+    "motor_constant",
+    "moment_constant",
+    "rotor_drag",
+    "rolling_moment",
+)
 BODY = Body(1.0, 1.0, 1.0, 1.0)
 """Any: what acts on it does not depend on its mass."""
 
@@ -28,7 +39,7 @@ def command_map(table: Table) -> list[Deviation]:
         max_rotor_velocity=table.column("max_rot_vel"),
         input_offset=table.column("offset"),
     )
-    got = tuple(reference_speed(motor, command) for command in table.four("ctl"))
+    got = _reference_speeds(motor, table.four("ctl"))
     limited = [
         jnp.minimum(table.column(f"ref{rotor}"), table.column("max_rot_vel")) for rotor in range(4)
     ]
@@ -37,6 +48,11 @@ def command_map(table: Table) -> list[Deviation]:
         deviation("reference speed", got, limited, SINGLE),
         deviation("reference speed, single precision", got, single, SINGLE),
     ]
+
+
+@jax.jit
+def _reference_speeds(motor: Motor, commands: PerRotor) -> PerRotor:
+    return tuple(reference_speed(motor, command) for command in commands)
 
 
 def rotor_filter(table: Table) -> list[Deviation]:
@@ -48,14 +64,20 @@ def _filter_sequence(table: Table) -> list[Deviation]:
         time_constant_up=jnp.asarray(table.only("tau_up")),
         time_constant_down=jnp.asarray(table.only("tau_down")),
     )
-    lag = Lag.over(motor, table.only("dt"))
+    speeds = _followed(motor, jnp.asarray(table.only("dt")), table.column("cmd"))
+    return [deviation("rotor speed", speeds, table.column("state"), EXACT)]
+
+
+@jax.jit
+def _followed(motor: Motor, dt: Array, commands: Array) -> Array:
+    """Return the rotor speed after each command."""
+    lag = Lag.over(motor, dt)
 
     def step(speed: Array, command: Array) -> tuple[Array, Array]:
         speed, _ = lag.advance(speed, command)
         return speed, speed
 
-    _, speeds = jax.lax.scan(step, jnp.zeros(()), table.column("cmd"))
-    return [deviation("rotor speed", speeds, table.column("state"), EXACT)]
+    return jax.lax.scan(step, jnp.zeros(()), commands)[1]
 
 
 def motor_model(table: Table) -> list[Deviation]:
@@ -64,12 +86,52 @@ def motor_model(table: Table) -> list[Deviation]:
 
 def _motor_model(table: Table) -> list[Deviation]:
     spin = int(table.only("dir"))
-    attitude = table.quaternion("rotor_q")
-    through_air = table.vector("v") - table.vector("wind_")
-    speed = table.column("omega_signed")
+    axis = "world" if table.frame["variant"].iloc[0] == "hg" else "body"
+    pushed, thrust, drag, rolling, moments = _acting(
+        spin,
+        axis,
+        table.quaternion("rotor_q"),
+        table.vector("v") - table.vector("wind_"),
+        {name: table.column(name) for name in COLUMNS},
+    )
+    after = _after_a_step(
+        _motor(
+            time_constant_up=table.column("tau_up"), time_constant_down=table.column("tau_down")
+        ),
+        table.column("dt"),
+        table.column("filter_prev"),
+        table.column("cmd_f32_clamped"),
+    )
+    return [
+        deviation("thrust, rotor axes", pushed, table.vector("rel_force_"), EXACT),
+        deviation("thrust", thrust, table.vector("thrust_world_"), EXACT),
+        deviation("rotor drag", drag, table.vector("drag_world_"), EXACT),
+        deviation("rolling moment", rolling, table.vector("rolling_world_"), EXACT),
+        deviation("all moments", moments, table.vector("torque_world_total_"), EXACT),
+        deviation("rotor speed after the step", after, table.column("filter_new"), EXACT),
+        deviation(
+            "joint speed",
+            spin * after / table.column("slowdown"),
+            table.column("joint_vel_new"),
+            EXACT,
+        ),
+    ]
+
+
+@eqx.filter_jit
+def _acting(
+    spin: int,
+    axis: Literal["world", "body"],
+    attitude: Quaternion,
+    through_air: Vec3,
+    known: dict[str, Array],
+) -> tuple[Vec3, Vec3, Vec3, Vec3, Vec3]:
+    """Return thrust in rotor and in world axes, and there drag, rolling moment and all moments."""
+    speed = known["omega_signed"]
     # A reversible rotor pushes the other way when it turns backwards; all else is the same.
-    backwards = table.flag("reversible") & (speed < 0)
-    thrust = jnp.where(backwards, -1.0, 1.0) * table.column("motor_constant")
+    constant = (
+        jnp.where((known["reversible"] > 0) & (speed < 0), -1.0, 1.0) * known["motor_constant"]
+    )
     zero = jnp.zeros_like(speed)
 
     def wrench(**coefficients: Array) -> Wrench:
@@ -79,7 +141,6 @@ def _motor_model(table: Table) -> list[Deviation]:
             "rotor_drag_coefficient",
             "rolling_moment_coefficient",
         )
-        axis = "world" if table.frame["variant"].iloc[0] == "hg" else "body"
         aerodynamics = Aerodynamics(
             *(coefficients.get(name, zero) for name in names), reaction_torque=axis
         )
@@ -88,45 +149,22 @@ def _motor_model(table: Table) -> list[Deviation]:
         motion = Motion(centre, through_air, attitude, centre)
         return total_wrench(vehicle, motion, (jnp.abs(speed),), Air.around(vehicle, motion))
 
-    drag = {"rotor_drag_coefficient": table.column("rotor_drag")}
-    rolling = {"rolling_moment_coefficient": table.column("rolling_moment")}
-    push = {"motor_constant": thrust, "moment_constant": table.column("moment_constant")}
-    pushed, dragged = wrench(**push), wrench(**drag)
-    rolled, everything = wrench(**rolling), wrench(**push, **drag, **rolling)
-    lag = Lag.over(
-        _motor(
-            time_constant_up=table.column("tau_up"), time_constant_down=table.column("tau_down")
-        ),
-        table.column("dt"),
+    drag = {"rotor_drag_coefficient": known["rotor_drag"]}
+    rolling = {"rolling_moment_coefficient": known["rolling_moment"]}
+    push = {"motor_constant": constant, "moment_constant": known["moment_constant"]}
+    thrust = wrench(**push).force
+    return (
+        thrust,
+        attitude.to_world(thrust),
+        attitude.to_world(wrench(**drag).force),
+        attitude.to_world(wrench(**rolling).moment),
+        attitude.to_world(wrench(**push, **drag, **rolling).moment),
     )
-    after, _ = lag.advance(table.column("filter_prev"), table.column("cmd_f32_clamped"))
 
-    return [
-        deviation("thrust, rotor axes", pushed.force, table.vector("rel_force_"), EXACT),
-        deviation("thrust", attitude.to_world(pushed.force), table.vector("thrust_world_"), EXACT),
-        deviation(
-            "rotor drag", attitude.to_world(dragged.force), table.vector("drag_world_"), EXACT
-        ),
-        deviation(
-            "rolling moment",
-            attitude.to_world(rolled.moment),
-            table.vector("rolling_world_"),
-            EXACT,
-        ),
-        deviation(
-            "all moments",
-            attitude.to_world(everything.moment),
-            table.vector("torque_world_total_"),
-            EXACT,
-        ),
-        deviation("rotor speed after the step", after, table.column("filter_new"), EXACT),
-        deviation(
-            "joint speed",
-            spin * after / table.column("slowdown"),
-            table.column("joint_vel_new"),
-            EXACT,
-        ),
-    ]
+
+@jax.jit
+def _after_a_step(motor: Motor, dt: Array, speed: Array, command: Array) -> Array:
+    return Lag.over(motor, dt).advance(speed, command)[0]
 
 
 def _motor(**known: Array) -> Motor:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from sim_jax.control import mixer, rate
 from sim_jax.control.gains import Filters, MixerSettings, RateGains
@@ -35,6 +40,26 @@ def _rate_sequence(table: Table) -> list[Deviation]:
             for sign in ("pos", "neg")
         )
     )
+    torque, integral = _controlled(
+        (
+            gains,
+            table.vector("rate_"),
+            table.vector("sp_"),
+            table.vector("angacc_"),
+            saturation,
+            table.flag("landed"),
+            table.column("dt"),
+        )
+    )
+    return [
+        deviation("torque", torque, table.vector("torque_"), LOOP),
+        deviation("integrator", integral, table.vector("integ_"), LOOP),
+    ]
+
+
+@jax.jit
+def _controlled(rows: tuple[object, ...]) -> tuple[Vec3, Vec3]:
+    """Return torque and integral after each row."""
 
     def step(integral: Vec3, row: tuple[object, ...]) -> tuple[Vec3, tuple[Vec3, Vec3]]:
         gains, measured, setpoint, acceleration, saturated, landed, dt = row
@@ -53,20 +78,7 @@ def _rate_sequence(table: Table) -> list[Deviation]:
         integral = jax.tree.map(lambda old, new: jnp.where(landed, old, new), integral, moved)
         return integral, (torque, integral)
 
-    rows = (
-        gains,
-        table.vector("rate_"),
-        table.vector("sp_"),
-        table.vector("angacc_"),
-        saturation,
-        table.flag("landed"),
-        table.column("dt"),
-    )
-    _, (torque, integral) = jax.lax.scan(step, Vec3.zeros(jnp.zeros(())), rows)
-    return [
-        deviation("torque", torque, table.vector("torque_"), LOOP),
-        deviation("integrator", integral, table.vector("integ_"), LOOP),
-    ]
+    return jax.lax.scan(step, Vec3.zeros(jnp.zeros(())), rows)[1]  # type: ignore[no-any-return]
 
 
 def gyro_filter(table: Table) -> list[Deviation]:
@@ -74,23 +86,26 @@ def gyro_filter(table: Table) -> list[Deviation]:
 
 
 def _gyro_sequence(table: Table) -> list[Deviation]:
-    sample_rate = table.only("sample_rate")
-    gyro = GyroFilter.at(
-        Filters(jnp.asarray(table.only("gyro_cutoff")), jnp.asarray(table.only("dgyro_cutoff"))),
-        sample_rate,
-    )
+    cutoffs = Filters(*(jnp.asarray(table.only(f"{name}_cutoff")) for name in ("gyro", "dgyro")))
+    smooth, derivative = _filtered(cutoffs, table.only("sample_rate"), table.column("raw"))
+    return [
+        deviation("rate", smooth, table.column("filtered_rate"), LOOP),
+        # a difference of single-precision rates, divided by a short time
+        deviation("derivative", derivative, table.column("filtered_accel"), LOOP, of_largest=True),
+    ]
+
+
+@eqx.filter_jit
+def _filtered(cutoffs: Filters, sample_rate: float, measured: Array) -> tuple[Array, Array]:
+    """Return filtered rate and derivative after each measured one."""
+    gyro = GyroFilter.at(cutoffs, sample_rate)
 
     def step(memory: GyroMemory, raw: Array) -> tuple[GyroMemory, tuple[Array, Array]]:
         memory = filter_gyro(gyro, memory, Vec3(raw, raw, raw), sample_rate)
         return memory, (memory.rate.x, memory.acceleration.x)
 
     rest = GyroMemory.settled(gyro, Vec3.zeros(jnp.zeros(())))
-    _, (smooth, derivative) = jax.lax.scan(step, rest, table.column("raw"))
-    return [
-        deviation("rate", smooth, table.column("filtered_rate"), LOOP),
-        # a difference of single-precision rates, divided by a short time
-        deviation("derivative", derivative, table.column("filtered_accel"), LOOP, of_largest=True),
-    ]
+    return jax.lax.scan(step, rest, measured)[1]  # type: ignore[no-any-return]
 
 
 def mixer_quad_x(table: Table) -> list[Deviation]:
@@ -103,30 +118,44 @@ def _mixer_part(table: Table) -> list[Deviation]:
         thrust_factor=table.only("thrust_factor"),
     )
     torque, thrust = _torque(table), table.column("thrust")
-    commands = stepwise_mixer.mix(mixer.as_float32, settings, torque, thrust)
-    pulses = tuple(mixer.quantise(command) for command in commands)
-    saturation = mixer.saturation(settings, commands)
+    commands = stepwise_mixer.mix(
+        stepwise_mixer.single, settings, np.stack(jax.tree.leaves(torque)), np.asarray(thrust)
+    )
+    saturation, pulses = _saturation_and_pulses(
+        settings, tuple(jnp.asarray(command, float) for command in commands)
+    )
     wanted = [
         [table.column(f"{axis}_{sign}") for axis in ("roll", "pitch", "yaw")]
         for sign in ("pos", "neg")
     ]
-    closed = mixer.mix(settings, torque, thrust)
+    closed = []
+    # The root in the thrust curve magnifies the rounding of an output near zero.
+    if settings.thrust_factor == 0:
+        mixed = _closed_form(settings, torque, thrust)
+        closed = [deviation("outputs, closed form", _outputs(mixed), table.four("out"), MIXER)]
     return [
         deviation("outputs", _outputs(commands), table.four("out"), MIXER),
-        # The root in the thrust curve magnifies the rounding of an output near zero.
-        *(
-            [deviation("outputs, closed form", _outputs(closed), table.four("out"), MIXER)]
-            if table.only("thrust_factor") == 0
-            else []
-        ),
+        *closed,
         deviation("saturation flags", [saturation.positive, saturation.negative], wanted, 0.0),
         deviation("commands in PWM steps", pulses, table.four("ctl"), MIXER),
-        deviation("PWM, µs", tuple(1000.0 + 1000.0 * u for u in pulses), table.four("pwm"), MIXER),
+        deviation(
+            "PWM, µs", [1000.0 + 1000.0 * np.asarray(u) for u in pulses], table.four("pwm"), MIXER
+        ),
     ]
 
 
-def _outputs(commands: PerRotor) -> tuple[Array, ...]:
-    return tuple(2.0 * command - 1.0 for command in commands)
+_closed_form = eqx.filter_jit(mixer.mix)
+
+
+@eqx.filter_jit
+def _saturation_and_pulses(
+    settings: MixerSettings, commands: PerRotor
+) -> tuple[rate.Saturation, PerRotor]:
+    return mixer.saturation(settings, commands), tuple(map(mixer.quantise, commands))
+
+
+def _outputs(commands: Sequence[ArrayLike]) -> tuple[np.ndarray, ...]:
+    return tuple(2.0 * np.asarray(command) - 1.0 for command in commands)
 
 
 def _torque(table: Table) -> Vec3:
@@ -140,7 +169,25 @@ def rate_and_mixer(table: Table) -> list[Deviation]:
 def _rate_and_mixer(table: Table) -> list[Deviation]:
     """The sequences are numbered by the airmode; the gains are the airframe's."""
     settings = MixerSettings(airmode=int(table.only("seq")))  # type: ignore[arg-type]
-    gains = hovergames_rates()
+    rows = (
+        table.vector("rate_"),
+        table.vector("sp_"),
+        table.vector("angacc_"),
+        table.column("thrust"),
+    )
+    torque, integral, commands = _looped(settings, hovergames_rates(), rows)
+    return [
+        deviation("torque", torque, table.vector("torque_"), LOOP),
+        deviation("integrator", integral, table.vector("integ_"), LOOP),
+        deviation("outputs", _outputs(commands), table.four("out"), LOOP),
+    ]
+
+
+@eqx.filter_jit
+def _looped(
+    settings: MixerSettings, gains: RateGains, rows: tuple[Vec3, Vec3, Vec3, Array]
+) -> tuple[Vec3, Vec3, PerRotor]:
+    """Return torque, integral and commands after each row."""
 
     def step(
         carry: tuple[Vec3, PerRotor], row: tuple[Vec3, Vec3, Vec3, Array]
@@ -163,15 +210,5 @@ def _rate_and_mixer(table: Table) -> list[Deviation]:
 
     half = jnp.asarray(0.5)
     first = (Vec3.zeros(half), (half, half, half, half))
-    rows = (
-        table.vector("rate_"),
-        table.vector("sp_"),
-        table.vector("angacc_"),
-        table.column("thrust"),
-    )
     _, (torque, integral, commands) = jax.lax.scan(step, first, rows)
-    return [
-        deviation("torque", torque, table.vector("torque_"), LOOP),
-        deviation("integrator", integral, table.vector("integ_"), LOOP),
-        deviation("outputs", _outputs(commands), table.four("out"), LOOP),
-    ]
+    return torque, integral, commands

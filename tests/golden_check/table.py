@@ -37,10 +37,10 @@ class Table:
         return len(self.frame)
 
     def column(self, name: str) -> Array:
-        return jnp.asarray(self.frame[name].to_numpy(dtype=float))
+        return jnp.asarray(self.frame[name].to_numpy(), float)
 
     def flag(self, name: str) -> Array:
-        return self.column(name) > 0
+        return jnp.asarray(self.frame[name].to_numpy() > 0, bool)
 
     def vector(self, prefix: str) -> Vec3:
         return Vec3(*(self.column(prefix + axis) for axis in "xyz"))
@@ -116,11 +116,11 @@ def merged(parts: list[list[Deviation]]) -> list[Deviation]:
     return list(together.values())
 
 
-def _leaves(tree: object) -> list[Array]:
+def _leaves(tree: object) -> list[np.ndarray]:
     if isinstance(tree, Vec3):
         return [tree.x, tree.y, tree.z]
     if isinstance(tree, Quaternion):
         return [tree.w, tree.x, tree.y, tree.z]
     if isinstance(tree, tuple | list):
         return [leaf for branch in tree for leaf in _leaves(branch)]
-    return [jnp.asarray(tree)]
+    return [np.asarray(tree)]
