@@ -29,11 +29,11 @@ CRAZYFLIE = ("B2_circle_fast_rep1", "B2_circle_slow_rep1", "B3_figure8_medium_re
 
 
 def write_lab(folder: Path) -> None:
-    """Write six seconds of each of `FLIGHTS`, with the battery's voltage, into a folder."""
+    """Write 4.5 seconds of each of `FLIGHTS`, with the battery's voltage, into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     vehicle = with_values(read_vehicle(configs_folder() / "vehicles/hovergames_updated.yaml"), LATE)
     for name, (shape, how) in FLIGHTS.items():
-        (flown,) = tuner.simulate(shape, vehicle=vehicle, duration=6.0, **how)
+        (flown,) = tuner.simulate(shape, vehicle=vehicle, duration=4.5, **how)
         signals = {
             **flown.signals,
             "battery_voltage": np.full((flown.time.size, 1), 16.0),
@@ -67,12 +67,12 @@ def write_logs(folder: Path) -> None:
 
 
 def write_nanobench(folder: Path) -> None:
-    """Write flights of a Crazyflie as cflib logs them beside motion capture, eight seconds each."""
+    """Write flights of a Crazyflie as cflib logs them beside motion capture, six seconds each."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in CRAZYFLIE:
         shape = "circle" if "circle" in name else "lemniscate"
         speed = 0.5 if "slow" in name else 1.0
-        (flown,) = tuner.simulate(shape, vehicle="crazyflie", radius=0.5, speed=speed, duration=8.0)
+        (flown,) = tuner.simulate(shape, vehicle="crazyflie", radius=0.5, speed=speed, duration=6.0)
         s = flown.signals
         command = 65535.0 * s["command"][:, [0, 3, 1, 2]]  # as its motors are numbered
         table = {
