@@ -17,7 +17,7 @@ from tuner.ground.plan import (
     StepResponse,
     ThrustStand,
     TorqueStand,
-    YawSpin,
+    YawSpins,
 )
 from tuner.ground.rig_data import read_columns, read_swing, recording_path
 from tuner.ground.rigs import measure_bifilar, measure_rpm_curve, measure_stand
@@ -56,7 +56,7 @@ def measure(  # noqa: PLR0911 (one return a kind)
     match experiment:
         case HoverWeights():
             return measure_hover_weights(name, experiment, vehicle, folder)
-        case YawSpin():
+        case YawSpins():
             return measure_yaw_spin(name, experiment, vehicle, folder)
         case Propeller():
             return measure_propeller(name, experiment, folder)

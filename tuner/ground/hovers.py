@@ -17,7 +17,7 @@ from tuner.core.disk import read_bytes
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.numerics import Array
 from tuner.ground.measurement import Curve, Measurement, Remark, rotor_radius
-from tuner.ground.plan import MAX_SPIN_RATE, MIN_SPIN_RATE, HoverWeights, Propeller, YawSpin
+from tuner.ground.plan import MAX_SPIN_RATE, MIN_SPIN_RATE, HoverWeights, Propeller, YawSpins
 from tuner.ground.rig_data import recording_path, steady_flight
 from tuner.vehicle import VehicleFile
 
@@ -110,7 +110,7 @@ def measure_hover_weights(
     )  # fmt: skip
 
 
-def measure_yaw_spin(name: str, given: YawSpin, vehicle: VehicleFile, folder: Path) -> Measurement:
+def measure_yaw_spin(name: str, given: YawSpins, vehicle: VehicleFile, folder: Path) -> Measurement:
     """Return the relation of rotor drag to torque from spins: yaw rate, slow pair, fast pair.
 
     rotor_drag_coefficient / (moment_constant · motor_constant) = (Ω_fast - Ω_slow)/(ω r²)

@@ -149,7 +149,7 @@ class SpinPoint(Section):
         return self
 
 
-class YawSpin(Section):
+class YawSpins(Section):
     """Steady yaw spins; ``rotor_speed_error`` is the standard error of each speed, rad/s."""
 
     kind: Literal["yaw_spin"]
@@ -187,7 +187,7 @@ Experiment = Annotated[
     | RpmCurve
     | StepResponse
     | HoverWeights
-    | YawSpin
+    | YawSpins
     | Propeller,
     Field(discriminator="kind"),
 ]

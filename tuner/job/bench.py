@@ -24,7 +24,7 @@ from tuner.ground.measurement import (
     bench_record,
     combine,
 )
-from tuner.ground.plan import BenchFile, YawSpin, read_bench
+from tuner.ground.plan import BenchFile, YawSpins, read_bench
 from tuner.report import render
 from tuner.result import (
     BEST_FIT_FILE,
@@ -172,7 +172,7 @@ def _measure_all(
 ) -> tuple[tuple[Measurement, ...], Combination, VehicleFile]:
     """Return each measurement, their combination, and the measured vehicle."""
     experiments = dict(zip(experiment_names(plan.experiments), plan.experiments, strict=True))
-    spins = {name: spin for name, spin in experiments.items() if isinstance(spin, YawSpin)}
+    spins = {name: spin for name, spin in experiments.items() if isinstance(spin, YawSpins)}
     nominal, base, vehicle = known_of(start), path.parent, start
     measured = {
         name: measure(name, experiment, start, base)
