@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import numpy as np
@@ -28,12 +29,14 @@ def nothing(motion: Motion) -> Wrench:
     return Wrench(zero, zero)
 
 
-def fly(advance: Step, count: int, duration: float = 1.0, wrench: Callable = nothing) -> Motion:
-    def step(motion: Motion, _: None) -> tuple[Motion, None]:
-        return advance(BODY, motion, wrench, duration / count), None
+@partial(jax.jit, static_argnames=("advance", "count", "wrench"))
+def fly(advance: Step, count: int, start: Motion = TUMBLING, wrench: Callable = nothing) -> Motion:
+    """Return the motion after a second of so many steps."""
 
-    motion: Motion = jax.lax.scan(step, TUMBLING, length=count)[0]
-    return motion
+    def step(_: int, motion: Motion) -> Motion:
+        return advance(BODY, motion, wrench, 1.0 / count)
+
+    return jax.lax.fori_loop(0, count, step, start)
 
 
 def angular_momentum(motion: Motion) -> Vec3:
@@ -87,13 +90,14 @@ def test_attitude_follows_a_constant_rate() -> None:
     """Spin about a principal axis: an exact answer."""
     spinning = Motion(vec(0, 0, 0), vec(0, 0, 0), quaternion(1, 0, 0, 0), vec(0.0, 0.0, 3.0))
 
-    def step(motion: Motion, _: None) -> tuple[Motion, None]:
-        return step_midpoint(BODY, motion, nothing, 1e-3), None
-
-    after: Motion = jax.lax.scan(step, spinning, length=1000)[0]
+    after = fly(step_midpoint, 1000, spinning)
     ahead = after.attitude.heading()
     assert float(np.arctan2(ahead.y, ahead.x)) == pytest.approx(3.0, abs=3e-6)
     assert float(after.body_rate.z) == 3.0
+
+
+def push(_: Motion) -> Wrench:
+    return Wrench(vec(0.0, 0.0, 20.0), vec(0.0, 0.06, 0.0))
 
 
 @pytest.mark.parametrize(
@@ -103,16 +107,8 @@ def test_order_of_each_step_under_a_moment(advance: Step, order: int) -> None:
     """A moment about a principal axis and thrust: what the midpoint step is made for."""
     still = Motion(vec(0, 0, 0), vec(1, 0, 0), quaternion(1, 0, 0, 0), vec(0.0, 0.5, 0.0))
 
-    def push(_: Motion) -> Wrench:
-        return Wrench(vec(0.0, 0.0, 20.0), vec(0.0, 0.06, 0.0))
-
-    def at(step: Step, count: int) -> Motion:
-        def advanced(motion: Motion, _: None) -> tuple[Motion, None]:
-            return step(BODY, motion, push, 1.0 / count), None
-
-        motion: Motion = jax.lax.scan(advanced, still, length=count)[0]
-        return motion
-
-    exact = at(step_rk4, 2000)
-    errors = [apart(at(advance, count).position, exact.position) for count in (25, 50)]
+    exact = fly(step_rk4, 2000, still, push)
+    errors = [
+        apart(fly(advance, count, still, push).position, exact.position) for count in (25, 50)
+    ]
     assert errors[0] / errors[1] == pytest.approx(2**order, rel=0.15)

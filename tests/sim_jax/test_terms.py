@@ -209,9 +209,10 @@ ON_ITS_WAY = (jnp.asarray(610.0), jnp.asarray(620.0), jnp.asarray(590.0), jnp.as
 """Speed, reference before and after a command arrives, reference as lagged, rad/s."""
 
 
-def after_two_lags(second, *, craft=CRAFT, share=0.4):
+@jax.jit
+def after_two_lags(second, motor=CRAFT.motor, share=0.4):
     """Return the rotor speed after a step of 2.5 ms, its mean, and the lagged reference."""
-    lag = SwitchedLag.over(craft.motor, 0.0025, jnp.asarray(share), None, jnp.asarray(second))
+    lag = SwitchedLag.over(motor, 0.0025, jnp.asarray(share), None, jnp.asarray(second))
     speed, before, after, lagged = ON_ITS_WAY
     return jnp.stack(
         [*lag.advance(speed, before, after, lagged), lag.lag_reference(lagged, before, after)]
@@ -221,7 +222,7 @@ def after_two_lags(second, *, craft=CRAFT, share=0.4):
 @pytest.mark.parametrize("second", [1e-4, SECOND, float(CRAFT.motor.time_constant_down), 0.05])
 def test_two_lags_in_series_are_those_of_the_differential_equations(second):
     constant, (speed, before, after, lagged) = float(CRAFT.motor.time_constant_down), ON_ITS_WAY
-    alike = replace(CRAFT, motor=replace(CRAFT.motor, time_constant_up=jnp.asarray(constant)))
+    alike = replace(CRAFT.motor, time_constant_up=jnp.asarray(constant))
 
     def slopes(_, state, reference):
         turning, behind, _ = state
@@ -233,7 +234,7 @@ def test_two_lags_in_series_are_those_of_the_differential_equations(second):
             slopes, (0.0, length), state, args=(reference,), rtol=1e-10, atol=1e-10, method="LSODA"
         ).y[:, -1]
     expected = [state[0], state[2] / 0.0025, state[1]]
-    np.testing.assert_allclose(after_two_lags(second, craft=alike), expected, rtol=1e-8)
+    np.testing.assert_allclose(after_two_lags(second, alike), expected, rtol=1e-8)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4])
@@ -259,6 +260,7 @@ def test_a_second_lag_of_nothing_changes_no_bit_of_a_flight_and_another_delays_i
     assert np.abs(flown(time_constant_second=SECOND) - base).max() > 1.0
 
 
+@jax.jit
 def read_by(lag, memory=1.0):
     """Return what tachometers with a lag read after a step of 2.5 ms, rad/s."""
     return Tachometer.over(lag, 0.0025, memory).reading(*map(jnp.asarray, (590.0, 600.0, 620.0)))
@@ -295,11 +297,16 @@ def test_a_longer_memory_reads_as_a_filter_that_is_computed_sample_by_sample():
     true = 620.0 + 60.0 * np.sin(8.0 * np.arange(600) / 400.0) ** 3
     sampled = lfilter([1.0 - kept], [1.0, -kept], true[::4], zi=true[:1] * kept)[0]
 
+    @jax.jit
+    def read_along(memory):
+        def reading(last, ends):
+            read = Tachometer.over(lag, 1.0 / 400.0, memory).reading(last, *ends)
+            return read, read
+
+        return jax.lax.scan(reading, true[0], (true[:-1], true[1:]))[1]
+
     def off(memory):
-        sensor, read = Tachometer.over(lag, 1.0 / 400.0, memory), [jnp.asarray(true[0])]
-        for before, after in zip(*map(jnp.asarray, (true[:-1], true[1:])), strict=True):
-            read.append(sensor.reading(read[-1], before, after))
-        return np.std(np.array(read)[::4][20:] - sampled[20:])
+        return np.std(np.array(read_along(memory))[3::4][19:] - sampled[20:])
 
     assert off(constant / float(lag)) < 0.25 * off(1.0)
 
@@ -326,23 +333,29 @@ def test_derivatives_of_the_drag_of_a_fuselage_are_finite_at_rest():
     def of(drag, velocity):
         return wrench(with_effects(fuselage_drag=drag), replace(MOVING, velocity=velocity))
 
-    at_rest = jax.jacfwd(of, argnums=(0, 1))(jnp.asarray(0.02), vec(0, 0, 0))
+    at_rest = jax.jit(jax.jacfwd(of, argnums=(0, 1)))(jnp.asarray(0.02), vec(0, 0, 0))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(at_rest))
+
+
+@jax.jit
+def climbing(climbs, around):
+    motion = Motion(vec(0, 0, 1), vec(0, 0, climbs), quaternion(1, 0, 0, 0), vec(0.3, -0.2, 0.0))
+    return wrench(CRAFT, motion, (jnp.asarray(600.0),) * 4, around)
+
+
+@jax.jit
+def climbing_in(climbs, gusts):
+    return jax.vmap(lambda w: climbing(climbs, Environment(wind=vec(0, 0, w))))(gusts)
 
 
 @pytest.mark.parametrize("climbs", [0.0, 0.03, -0.08, 1.0])
 def test_a_draught_leaves_of_thrust_and_damping_what_gusts_leave_in_the_mean(climbs):
     sd, gusts = 0.05, 0.05 * np.random.default_rng(0).standard_normal(200_000)
-    motion = Motion(vec(0, 0, 1), vec(0, 0, climbs), quaternion(1, 0, 0, 0), vec(0.3, -0.2, 0.0))
-
-    def acting(around):
-        return wrench(CRAFT, motion, (jnp.asarray(600.0),) * 4, around)
-
-    blown = jax.vmap(lambda w: acting(Environment(wind=vec(0, 0, w))))(jnp.asarray(gusts))
-    scatter = np.asarray(blown).std(axis=0) / np.sqrt(len(gusts))
-    found = np.asarray(acting(Environment(draught=jnp.asarray(sd))))
-    assert (np.abs(found - np.asarray(blown).mean(axis=0)) < 4.0 * scatter + 1e-9).all()
-    still = np.asarray(acting(STILL_AIR))
+    blown = np.asarray(climbing_in(climbs, gusts))
+    scatter = blown.std(axis=0) / np.sqrt(len(gusts))
+    found = np.asarray(climbing(climbs, Environment(draught=jnp.asarray(sd))))
+    assert (np.abs(found - blown.mean(axis=0)) < 4.0 * scatter + 1e-9).all()
+    still = np.asarray(climbing(climbs, STILL_AIR))
     if 0.0 < climbs < sd:
         assert (np.abs(found - still)[2:5] > 10.0 * scatter[2:5]).all()
     if climbs > 10.0 * sd:
