@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from lanes import Argument, Program, Run
+from lanes import Argument, Program, ProgramResults
 from sim_jax.control.gains import (
     AttitudeGains,
     Controller,
@@ -173,7 +173,7 @@ class Kernel:
             moves,
         )
 
-    def __call__(self, factor: Any, *, samples: int) -> Run:
+    def __call__(self, factor: Any, *, samples: int) -> ProgramResults:
         """Fly factors (12, B); the log's leaves are (B, samples), on the host."""
         return self.program(
             _Given(factor, np.ones(COEFFICIENTS), _points(samples)),

@@ -13,6 +13,14 @@ through `jax.vmap` and XLA instead. Nothing here knows of multirotors.
 from lanes.dependence import dependent
 from lanes.layout import Argument
 from lanes.machine import keep_code_in
-from lanes.program import Program, Run, joined, program_of
+from lanes.program import Program, ProgramResults, joined, program_of
 
-__all__ = ["Argument", "Program", "Run", "dependent", "joined", "keep_code_in", "program_of"]
+__all__ = [
+    "Argument",
+    "Program",
+    "ProgramResults",
+    "dependent",
+    "joined",
+    "keep_code_in",
+    "program_of",
+]

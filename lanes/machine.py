@@ -235,7 +235,7 @@ def _linker() -> Any:
     return llvm.create_lljit_compiler(_target_machine(_level()))
 
 
-class Code:
+class LoadedFunction:
     """A function in memory, there as long as this is."""
 
     def __init__(self, code: bytes, function: str) -> None:

@@ -30,7 +30,7 @@ from lanes.dependence import dependent
 from lanes.layout import Argument, Lengths, is_laid_by_loop, module_text
 from lanes.lowering import LINE_BYTES, MAX_COLUMNS
 from lanes.machine import (
-    Code,
+    LoadedFunction,
     UnknownError,
     digest_of,
     is_kept,
@@ -42,7 +42,7 @@ from lanes.machine import (
 )
 from lanes.values import UnsupportedError
 
-__all__ = ["Argument", "Program", "Run", "joined", "keep_code_in", "program_of"]
+__all__ = ["Argument", "Program", "ProgramResults", "joined", "keep_code_in", "program_of"]
 
 logger = logging.getLogger(__name__)
 
@@ -77,7 +77,7 @@ MAX_BLOCKS_ON_ONE_THREAD = 512
 
 
 @dataclass(frozen=True)
-class Run:
+class ProgramResults:
     """Results of a program.
 
     Attributes
@@ -290,7 +290,7 @@ class Program:
         lanes: int,
         turns: int = 0,
         wanted: Any = None,
-    ) -> Run:
+    ) -> ProgramResults:
         """Run.
 
         Parameters
@@ -333,7 +333,7 @@ class Program:
                         raise ValueError(f"{length} is {given} and {own}")
         return lengths
 
-    def by_xla(self, values: Any, tangents: Any = None, *, turns: int = 0) -> Run:
+    def by_xla(self, values: Any, tangents: Any = None, *, turns: int = 0) -> ProgramResults:
         """Compute the same through `jax.vmap` and XLA; tests compare kernels with it."""
         leaves = [jnp.asarray(leaf) for leaf in self.structure.flatten_up_to(values)]
         lengths = self._lengths([np.asarray(leaf) for leaf in leaves], turns)
@@ -341,18 +341,18 @@ class Program:
             tangents = None
         run = self._xla(tuple(sorted(lengths.items())))
         if not self.moving:
-            return Run(jax.tree.map(np.asarray, run(leaves, [])), None)
+            return ProgramResults(jax.tree.map(np.asarray, run(leaves, [])), None)
         shape = {number: self.arguments[number].shape for number in self.moving}
         moved = tangents or [np.zeros((1, *shape[number])) for number in self.moving]
         found, columns = run(leaves, [jnp.asarray(t) for t in moved])
         if not tangents:
-            return Run(jax.tree.map(np.asarray, found), None)
+            return ProgramResults(jax.tree.map(np.asarray, found), None)
         _, (shapes, _), stand_ins = self._traced
 
         def laid(leaf: Any, shape: Any) -> NDArray[Any]:
             return np.moveaxis(np.asarray(leaf), 0, 1 if is_laid_by_loop(shape, stand_ins) else -1)
 
-        return Run(jax.tree.map(np.asarray, found), jax.tree.map(laid, columns, shapes))
+        return ProgramResults(jax.tree.map(np.asarray, found), jax.tree.map(laid, columns, shapes))
 
     def _xla(self, lengths: tuple[tuple[str, int], ...]) -> Callable[..., Any]:
         known: dict[Any, Callable[..., Any]] = self.__dict__.setdefault("_programs", {})
@@ -403,7 +403,7 @@ class _Compiled:
             self.moved = known["moved"]
         #: of the values alone
         self._values = self.structure.children()[0] if program.moving else self.structure
-        self.code = Code(code, "run")
+        self.code = LoadedFunction(code, "run")
         void, whole = ctypes.c_void_p, ctypes.c_int64
         self.function = ctypes.CFUNCTYPE(None, *[void] * 5, *[whole] * 6)(self.code.address)
 
@@ -451,7 +451,7 @@ class _Compiled:
         lengths: Mapping[str, int],
         lanes: int,
         wanted: Any = None,
-    ) -> Run:
+    ) -> ProgramResults:
         """Compute all lanes and columns."""
         program, width = self.program, self.width
         count = len(tangents[0]) if tangents else 0
@@ -533,7 +533,7 @@ class _Compiled:
         half = self._values.num_leaves
         results = jax.tree.unflatten(self._values, found[:half])
         if not tangents:
-            return Run(results, None)
+            return ProgramResults(results, None)
         by_column = [
             None
             if not moved or array is None
@@ -544,7 +544,7 @@ class _Compiled:
                 found[half:], self.moved[half:], self.outputs[half:], strict=True
             )
         ]
-        return Run(results, jax.tree.unflatten(self._values, by_column))
+        return ProgramResults(results, jax.tree.unflatten(self._values, by_column))
 
 
 def _on_whole_lines(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:

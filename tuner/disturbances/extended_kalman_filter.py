@@ -24,7 +24,7 @@ from jax import Array, lax
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from lanes import Argument, Run, program_of
+from lanes import Argument, ProgramResults, program_of
 from sim_jax import terms
 from sim_jax.numeric import row_of
 from sim_jax.schedule import Schedule
@@ -195,7 +195,7 @@ def innovations(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
     """Return whitened innovations (T, m, F) with given gains, and derivatives; None for none.
 
-    The derivatives keep the kernel's layout (F, Q, T, m): see `lanes.Run`.
+    The derivatives keep the kernel's layout (F, Q, T, m): see `lanes.ProgramResults`.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ def _run(
     tangents: list[NDArray[np.float64]] | None = None,
     *,
     few: bool,
-) -> Run:
+) -> ProgramResults:
     """Simulate all segments with given gains; without any, filter them."""
 
     def table(leaf: Any) -> Argument:

@@ -74,7 +74,7 @@ class Flown(NamedTuple):
     channels
         Channel -> (F, samples, c).
     columns
-        Channel -> (F, Q, samples, c) derivatives, as of a `lanes.Run`; None
+        Channel -> (F, Q, samples, c) derivatives, as of a `lanes.ProgramResults`; None
         where nothing moves.
     crash_time
         (F,) s, infinite for a segment that flew.

@@ -59,7 +59,7 @@ Spectrum = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
-class Lag:
+class InputLag:
     """A lag and its standard deviation, in s."""
 
     seconds: float
@@ -102,7 +102,7 @@ def with_input_lags(recordings: Sequence[JobFlight], vehicle: VehicleFile) -> tu
     )
 
 
-def _is_late(flight: Flight, vehicle: VehicleFile, lag: Lag) -> bool:
+def _is_late(flight: Flight, vehicle: VehicleFile, lag: InputLag) -> bool:
     """Return whether a lag of rotor speeds is significant, and confirmed by innovations.
 
     Rotors respond within a step, too: a lag is not confirmed where none or half of it is as likely.
@@ -151,7 +151,7 @@ def _innovation_variance(answer: Array, columns: Array, complete: Mask, order: i
     return left / len(filtered)
 
 
-def input_lag(flight: Flight, signal: Source, vehicle: VehicleFile) -> Lag | None:
+def input_lag(flight: Flight, signal: Source, vehicle: VehicleFile) -> InputLag | None:
     """Return the lag of a flight's rotor speeds or commands behind its state.
 
     Parameters
@@ -165,7 +165,7 @@ def input_lag(flight: Flight, signal: Source, vehicle: VehicleFile) -> Lag | Non
 
     Returns
     -------
-    Lag or None
+    InputLag or None
         None where it cannot be estimated.
     """
     clock = flight.time[TRIMMED_SAMPLES:-TRIMMED_SAMPLES]
@@ -237,7 +237,7 @@ def _real(columns: Spectrum) -> Array:
     return np.concatenate([columns.real, columns.imag])
 
 
-def _likeliest_lag(of_axes: Array) -> Lag | None:
+def _likeliest_lag(of_axes: Array) -> InputLag | None:
     """Return the likeliest lag of all axes, by the parabola through the peak of their sum.
 
     None for no sharp peak. Where the axes contradict each other by more than chance, the standard
@@ -255,7 +255,7 @@ def _likeliest_lag(of_axes: Array) -> Lag | None:
     birge = np.sqrt(max(fallen / (len(of_axes) - 1), 1.0))
     sd = birge * step / np.sqrt(-bend)
     place = float(LAGS_S[at] + 0.5 * (before - after) / bend * step)
-    return Lag(place, float(sd)) if sd < MAX_LAG_SD_S else None
+    return InputLag(place, float(sd)) if sd < MAX_LAG_SD_S else None
 
 
 WINDOW_S = 0.25

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lanes import Run, joined
+from lanes import ProgramResults, joined
 from lanes.machine import digest_of
 from lanes.program import _program_of
 from sim_jax import terms
@@ -133,7 +133,7 @@ def test_channels_in_another_order_are_no_other_program(monkeypatch, tangents):
 
     def program(_, arguments, *static, **options):
         asked.append((jax.tree.flatten(arguments), static, options))
-        return lambda *_, **__: Run(({name: name for name in static[-1]}, None), None)
+        return lambda *_, **__: ProgramResults(({name: name for name in static[-1]}, None), None)
 
     monkeypatch.setattr(simulation, "program_of", program)
     for names in (("position", "attitude"), ("attitude", "position")):

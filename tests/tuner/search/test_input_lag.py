@@ -17,7 +17,7 @@ from tuner.options import Options
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
 from tuner.search.job_flights import JobFlight, read_recordings
-from tuner.search.recorded_rotors import Lag, _is_late, input_lag, with_input_lags
+from tuner.search.recorded_rotors import InputLag, _is_late, input_lag, with_input_lags
 
 RATE = 500.0
 
@@ -84,8 +84,8 @@ def test_lateness_is_found_to_a_fraction_of_a_sample(broadband, updated, seconds
 
 def test_a_lateness_that_may_be_chance_is_not_believed(broadband, updated):
     flight = late_by(broadband, 0.01)
-    assert _is_late(flight, updated, Lag(0.01, 0.001))
-    assert not _is_late(flight, updated, Lag(0.01, 0.005))
+    assert _is_late(flight, updated, InputLag(0.01, 0.001))
+    assert not _is_late(flight, updated, InputLag(0.01, 0.005))
 
 
 def test_noise_alone_shows_no_lag(broadband, updated):
