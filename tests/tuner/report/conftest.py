@@ -30,4 +30,4 @@ ROLLING = Direction(
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
     making.write_run(folder, FREE, ROLLING)
-    return render(folder, plots=True)
+    return render(folder)

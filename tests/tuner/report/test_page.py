@@ -86,14 +86,23 @@ def test_what_a_user_typed_stays_text(report: Path) -> None:
     assert making.COMMAND not in report.read_text()
 
 
-def test_the_main_figures_are_written_for_papers(report: Path) -> None:
-    names = {path.name for path in (report.parent / "plots").iterdir()}
-    assert {"swing_position.svg", "correlation.svg", "sensitivity.svg", "waterfall.svg"} <= names
-    assert b"inertia_xx" in (report.parent / "plots" / "correlation.svg").read_bytes()
+@pytest.fixture(scope="module")
+def figures(report: Path) -> list[Path]:
+    """Return the files of the page's figures, drawn into its folder."""
+    render(report.parent, plots=True)
+    return sorted((report.parent / "plots").iterdir())
 
 
-def test_the_same_folder_renders_the_same_page_and_figures(report: Path) -> None:
-    files = [report, *sorted((report.parent / "plots").iterdir())]
+def test_the_main_figures_are_written_for_papers(figures: list[Path]) -> None:
+    drawn = {path.name: path.read_bytes() for path in figures}
+    assert {"swing_position.svg", "correlation.svg", "sensitivity.svg", "waterfall.svg"} <= {*drawn}
+    assert b"inertia_xx" in drawn["correlation.svg"]
+
+
+def test_the_same_folder_renders_the_same_page_and_figures(
+    report: Path, figures: list[Path]
+) -> None:
+    files = [report, *figures]
     before = [file.read_bytes() for file in files]
     render(report.parent, plots=True)
     assert [file.read_bytes() for file in files] == before
