@@ -37,21 +37,25 @@ MAX_STEPS = 16
 """Default largest number of steps."""
 DAMPING_LEVELS = (0.0, 0.1, 1.0, 10.0, 100.0)
 """Shares of the Hessian's diagonal added to it until a step lowers the loss (Levenberg)."""
-MAX_STRENGTH_STEP = float(np.log(4.0))
-"""Largest step of a strength's logarithm: beyond it the likelihood is not quadratic."""
+MAX_STRENGTH_RATIO = 4.0
+"""Largest ratio of a strength to that of the step before: further on the likelihood is another."""
+LEAST_CHANGE = 0.5 * (MAX_STRENGTH_RATIO**-2 - 1.0)
+"""That ratio downwards, as half the relative change of a variance."""
+IS_AMPLITUDE = ~np.isin(STRENGTHS, ["gust_lasts", "turbulence_lasts"])
+"""Whether a strength is a standard deviation, not a time."""
 MAX_CLOCK_SHIFT = 0.25
 """Share of a tick by which a clock moves before samples are assigned to ticks again: until then the
 line through their old two ticks is extrapolated."""
 MIN_STEP_GAIN = 0.1
 """Least predicted gain of a step, in the log-likelihood."""
-MIN_SHIFT = 0.25
-"""Standard errors of a coefficient or clock that a step must move one by to be damped and tried
-again: what smaller ones gain is of strengths too small to be seen."""
-NEAR_GAIN, FINAL_GAIN = 1.0, 0.3
-"""Predicted gains below which a step is taken untested, and below which it is the last."""
-FINAL_SHIFT = 0.1
-"""Shift below which a step is the last; one below `MIN_SHIFT` is, too, where it gained less than
-`NEAR_GAIN`. Strengths near zero gain a little in each step."""
+NEAR_GAIN, FINAL_GAIN = 4.0, 0.3
+"""Predicted gains below which a step is taken untested, and below which it is the last. Strengths
+are of the first part of each flight: where they are likeliest, chance alone makes whole flights
+less likely by half their number."""
+FINAL_SHIFT = 0.25
+"""Standard errors of a coefficient or clock: a step near the estimate that moves none by more is
+the last. The next would move it by an eighth of that. One that gains less than `FINAL_GAIN`, too,
+is not taken."""
 
 
 def maximise_likelihood(
@@ -77,24 +81,21 @@ def maximise_likelihood(
     objective, point, criterion = problem
     criterion = unscaled(criterion)
     point = Point(point.coefficients, predictor.inputs.offsets)
-    laid, rate, gain = point.offsets, float(objective.schedule.log_rate), np.inf
+    laid, rate = point.offsets, float(objective.schedule.log_rate)
     predictor = predictor.at(objective, point)
     for _ in range(steps):
         equations = _equations(predictor, objective, point, criterion, free)
         change = equations.step(objective.space, point)
         if change is None:
             break
+        gain, shift = equations.gain(change), equations.shift(change)
+        if gain < FINAL_GAIN and shift < FINAL_SHIFT:
+            break
         predictor = predictor.without_gains  # memory holds those of one point
-        gain, before = equations.gain(change), gain
-        loss = _loss(predictor, objective, point, criterion)
         lower = _descent(equations, predictor, objective, point, criterion, near=gain < NEAR_GAIN)
         if lower is None:
             return predictor.at(objective, point), point
-        if gain < FINAL_GAIN or 0.5 * before < gain < NEAR_GAIN:  # they shrink no more
-            return lower
-        shift = equations.shift(change)
-        gained = loss - _loss(lower[0], objective, lower[1], criterion)
-        if shift < (MIN_SHIFT if gained < NEAR_GAIN else FINAL_SHIFT):
+        if gain < FINAL_GAIN or (gain < NEAR_GAIN and shift < FINAL_SHIFT):
             return lower
         predictor, point = lower
         del lower
@@ -126,7 +127,7 @@ class _Equations(NamedTuple):
 
     def gain(self, change: Array) -> float:
         """Return the predicted reduction of the loss by a step."""
-        return -0.5 * float(self.gradient @ change)
+        return -float((self.gradient + 0.5 * self.hessian @ change) @ change)
 
     def shift(self, change: Array) -> float:
         """Return the largest step of a parameter that is no strength, in standard errors."""
@@ -139,19 +140,24 @@ class _Equations(NamedTuple):
     def step(self, space: Space, point: Point, damping: float = 0.0) -> Array | None:
         """Return the damped Gauss-Newton step; parameters that would leave their bounds stay.
 
+        Strengths move as variances, see `_strengths_step`: one that would fall below none falls as
+        far as it may, and others move as that asks of them.
         None where its gain is too small, or not a number as the filter has lost a flight.
         """
-        free = self.free.copy()
+        free, change = self.free.copy(), np.zeros(len(self.gradient))
         hessian = self.hessian + damping * np.diag(np.diag(self.hessian))
+        amplitudes = len(change) - len(STRENGTHS) + np.flatnonzero(IS_AMPLITUDE)
         while True:
             moves = np.flatnonzero(free)
-            change = np.zeros(len(self.gradient))
-            change[moves] = -scaled_solve(hessian[np.ix_(moves, moves)], self.gradient[moves])
+            left = self.gradient + hessian @ np.where(free, 0.0, change)
+            change[moves] = -scaled_solve(hessian[np.ix_(moves, moves)], left[moves])
             share = _share_after(space, point, change)
             leaves = np.flatnonzero(free[: len(space)] & ((share <= 0.0) | (share >= 1.0)))
-            if not len(leaves):
+            vanish = amplitudes[free[amplitudes] & (change[amplitudes] < LEAST_CHANGE)]
+            if not len(leaves) and not len(vanish):
                 return change if self.gain(change) >= MIN_STEP_GAIN else None
-            free[leaves] = False
+            free[leaves], change[leaves] = False, 0.0
+            free[vanish], change[vanish] = False, LEAST_CHANGE
 
 
 def _equations(
@@ -193,10 +199,7 @@ def _equations(
     of_flights = np.moveaxis(across[count:] @ owner, -1, 1).reshape(kinds * flights, -1)
     across = np.concatenate([across[:count].sum(axis=-1), of_flights])
     bend = information + 1e-9 * np.eye(len(slope))
-    strengths = predictor.strengths
-    held = (strengths <= MIN_STRENGTHS) & (slope > 0.0) | (strengths >= MAX_STRENGTHS) & (
-        slope < 0.0
-    )
+    held = _held(predictor.strengths, slope, information)
     return _Equations(
         np.concatenate([own, slope]),
         np.block([[among, across], [across.T, bend]]),
@@ -223,15 +226,37 @@ def _descent(
         change = equations.step(space, point, damping)
         if change is None:
             return None
-        by_strengths = np.clip(change[-len(strengths) :], -MAX_STRENGTH_STEP, MAX_STRENGTH_STEP)
+        by_strengths = _strengths_step(change[-len(strengths) :])
         to = _moved(space, point, change[: -len(strengths)])
         tried = replace(predictor, strengths=clipped(strengths + by_strengths)).at(objective, to)
         if _loss(tried, objective, to, criterion) < here or (near and not tried.is_lost):
             return tried, to
         del tried  # its gains are large
-        if equations.shift(change) < MIN_SHIFT:
-            break
     return None
+
+
+def _strengths_step(change: Array) -> Array:
+    """Return the step (8,) of the strengths' logarithms for a change that their slopes ask for.
+
+    That is of variances: the innovations' covariance is linear in them, and scoring for one that
+    stands alone ends in one step (Harvey 1989, 4.3.3).
+    """
+    step = change.copy()
+    step[IS_AMPLITUDE] = 0.5 * np.log(1.0 + 2.0 * change[IS_AMPLITUDE])
+    return np.clip(step, -np.log(MAX_STRENGTH_RATIO), np.log(MAX_STRENGTH_RATIO))
+
+
+def _held(strengths: Array, slope: Array, information: Array) -> Mask:
+    """Return which strengths (8,) stay: those at a bound that their slopes point beyond.
+
+    And those near none. The logarithm of a strength that tends to zero has no curvature, so that a
+    round-off would choose its step. It stays where it is known to no better than a factor of e and
+    where without it recordings would be no likelier by `MIN_STEP_GAIN`, as long as they would be
+    likelier with less of it.
+    """
+    none = IS_AMPLITUDE & (np.diag(information) < 1.0) & (0.5 * slope < MIN_STEP_GAIN)
+    lower = (slope > 0.0) & (none | (strengths <= MIN_STRENGTHS))
+    return np.asarray(lower | (slope < 0.0) & (strengths >= MAX_STRENGTHS))
 
 
 def _share_after(space: Space, point: Point, change: Array) -> Array:

@@ -32,6 +32,10 @@ from tuner.vehicle.model import Model, with_coefficients
 CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
 """Channels of samples, in order: jax sorts the keys of a dictionary."""
 
+SPEED_SHORT = 1e-9
+"""Share by which rotors begin slower than they were seen: those in trim turn as fast as they are
+asked to, and round-off would choose which of their time constants the covariance begins with."""
+
 
 class FilterInput(eqx.Module):
     """Segments and samples of a filter, F segments along the last axis.
@@ -116,6 +120,8 @@ class Observer(eqx.Module):
             environment=environment,
             limits=AIRBORNE,  # a height that no sample corrects drifts, and ends no flight
         )
+        slower = tuple(speed * (1.0 - SPEED_SHORT) for speed in state.rotor_speed)
+        state = replaced(state, rotor_speed=slower)
         rate = float(schedule.log_rate)
         processes = processes_of(model.vehicle, assumed.strengths, rate)
         late = inputs.offsets[: len(OFFSETS)] * OFFSET_UNIT

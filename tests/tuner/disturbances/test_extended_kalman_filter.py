@@ -116,6 +116,19 @@ def test_commands_that_once_took_longer_change_nothing() -> None:
     np.testing.assert_allclose(long.loss, short.loss, rtol=1e-9)
 
 
+def test_a_likelihood_of_flights_that_begin_in_trim_does_not_hang_on_round_off() -> None:
+    """A rotor that turns as asked speeds up, or slows down with another time constant."""
+    schedule, inputs, expected = hovering()
+    asked, up = (expected.coefficients[n] for n in ("input_scaling", "time_constant_up"))
+    values = {"time_constant_down": 3.0 * up, "actuator_latency": 2.5 * schedule.step}
+    losses = []
+    for turn in (1.0 - 1e-12, 1.0, 1.0 + 1e-12):
+        values["input_scaling"] = turn * asked
+        beside = replace(expected, coefficients={**expected.coefficients, **values})
+        losses.append(ekf.filtered(schedule, inputs, beside).loss)
+    np.testing.assert_allclose(losses, np.broadcast_to(losses[1], np.shape(losses)), atol=1e-8)
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("folder", "optimised")
 def test_innovations_are_those_of_a_filter_in_matrices() -> None:

@@ -8,8 +8,19 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
-from tuner.disturbances.disturbances import INITIAL_STRENGTHS, STRENGTHS
-from tuner.disturbances.maximum_likelihood import _Equations
+from tuner.disturbances.disturbances import (
+    INITIAL_STRENGTHS,
+    MAX_STRENGTHS,
+    MIN_STRENGTHS,
+    STRENGTHS,
+)
+from tuner.disturbances.maximum_likelihood import (
+    LEAST_CHANGE,
+    MAX_STRENGTH_RATIO,
+    _Equations,
+    _held,
+    _strengths_step,
+)
 from tuner.disturbances.observer import FilterInput
 from tuner.disturbances.predictor import Predictor
 
@@ -33,6 +44,46 @@ def test_a_step_is_as_long_as_its_largest_move_but_of_strengths_in_standard_erro
     assert equations.shift(moves) == 0.0
     moves[:2] = 0.5, -0.1
     assert equations.shift(moves) == pytest.approx(0.5 * 2.0 * 0.8)
+
+
+def test_a_strength_falls_to_none_at_most_and_others_move_as_that_asks() -> None:
+    fit = problem(("inertia_xx", "motor_constant"))
+    point = fit.start(fit.space.initial)
+    count = point.coefficients.size + point.offsets.size + len(STRENGTHS)
+    hessian, gradient = np.diag(np.full(count, 4.0)), np.zeros(count)
+    lift, lasts = (count - len(STRENGTHS) + STRENGTHS.index(n) for n in ("lift", "gust_lasts"))
+    gradient[[lift, lasts]] = 8.0, 1.0
+    hessian[lift, lasts] = hessian[lasts, lift] = 1.0
+    equations = _Equations(gradient, hessian, np.ones(count, bool))
+    step = equations.step(fit.space, point)
+    moved = np.flatnonzero(step)
+    assert moved.tolist() == [lift, lasts]
+    assert step[lift] == LEAST_CHANGE
+    assert step[lasts] == pytest.approx(-(1.0 + LEAST_CHANGE) / 4.0)  # not by -2 of the other
+    along = _strengths_step(step[-len(STRENGTHS) :])
+    assert along[STRENGTHS.index("lift")] == pytest.approx(-np.log(MAX_STRENGTH_RATIO))
+    assert along[STRENGTHS.index("gust_lasts")] == step[lasts]
+    loss = [equations.gradient @ s + 0.5 * s @ hessian @ s for s in (step, 0.0 * step)]
+    assert equations.gain(step) == pytest.approx(loss[1] - loss[0])
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.8, 3.0])
+def test_a_variance_that_stands_alone_is_found_in_one_step(ratio: float) -> None:
+    """Half the log-variance has slope n (1 - ratio²) and information 2 n, for n samples."""
+    change = np.full(len(STRENGTHS), -(1.0 - ratio**2) / 2.0)
+    found = _strengths_step(change)[STRENGTHS.index("wind")]
+    assert found == pytest.approx(np.log(ratio))
+
+
+def test_a_strength_near_none_stays_until_its_slope_points_up() -> None:
+    inside, flat = 0.5 * (MIN_STRENGTHS + MAX_STRENGTHS), 0.5 * np.eye(len(STRENGTHS))
+    times = np.array(["lasts" in name for name in STRENGTHS])
+    np.testing.assert_array_equal(_held(inside, np.full(8, 0.19), flat), ~times)
+    for slope, information in ((-0.01, flat), (0.21, flat), (0.19, 4.0 * flat)):
+        assert not _held(inside, np.full(8, slope), information).any()
+    for bound, outside in ((MIN_STRENGTHS, 1.0), (MAX_STRENGTHS, -1.0)):
+        assert _held(bound, np.full(8, outside), flat).all()
+        assert not _held(bound, np.full(8, -outside), flat).any()
 
 
 def test_a_filter_flies_on_the_voltage_that_another_problem_reads():

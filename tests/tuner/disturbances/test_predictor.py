@@ -287,6 +287,7 @@ def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitt
 def test_a_larger_inertia_and_a_stronger_turbulence_are_alike_in_sizes(fitted) -> None:
     """Sizes show accelerations: smaller ones of a larger inertia, larger of stronger turbulence."""
     problem, predictor, point = fitted
+    predictor = replace(predictor, strengths=STRENGTHS).at(problem, point)
     sizes = predictor.slopes(problem, point).sizes
     coupling = predictor.coupling(problem, point, sizes)
     own = np.sqrt(np.sum(sizes**2, axis=(1, 2, 3)))
