@@ -30,7 +30,7 @@ def test_samples_tell_and_time_spreads_what_products_of_matrices_say() -> None:
     transition[-3:] = np.diag(np.append(np.zeros(SIZE - 3), retention))[-3:]
     derivatives = rng.standard_normal((WIDE, SHOWN)) * (rng.random((WIDE, SHOWN)) < 0.4)
     derivatives[:, 0] = 1.0
-    columns = [jnp.asarray(row)[jnp.flatnonzero(row)] for row in derivatives]
+    columns = [jnp.asarray(row[np.flatnonzero(row)], float) for row in derivatives]
 
     def push(change: list) -> list:
         """Return each row's sum of the numbers that it depends on."""
