@@ -266,6 +266,24 @@ def is_refuted(objective: Objective, point: Point, criterion: Criterion) -> bool
     return FisherInformation.joined(parts).refuted
 
 
+def leaves_flights(objective: Objective, point: Point, criterion: Criterion) -> bool:
+    """Return whether a fit crashes, or most simulated flights are far from the recorded ones.
+
+    Unlike `is_refuted`, derivatives may grow along flights that it meets: a model that lacks terms
+    may make up for them at the edge of stability, where no term could be tried otherwise.
+    """
+    crashed, diverged = list[np.bool_](), list[np.bool_]()
+    for _, (part, at, weights) in flight_batches(objective, point, criterion):
+        jacobian = part.jacobian(at, weights)
+        crashes = np.isfinite(np.asarray(jacobian.crash_time))
+        of_flights = _diverged(part, jacobian, crashes)
+        if of_flights is None:
+            return False
+        crashed.extend(crashes)
+        diverged.extend(of_flights)
+    return bool(np.any(crashed) or np.mean(diverged) > 0.5)
+
+
 def with_start_values(space: Space, vector: ArrayLike, names: Collection[str]) -> Array:
     """Return a search vector with new coefficients at their start values.
 

@@ -12,7 +12,7 @@ them, sections of the same flight can; a held-out flight keeps its own, as it ke
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,8 +23,8 @@ from tuner.core.phrases import listed
 from tuner.core.spans import span
 from tuner.findings.findings import Finding
 from tuner.objective.battery import require_voltage
-from tuner.objective.criterion import Point, units_of
-from tuner.objective.information import is_refuted, with_start_values
+from tuner.objective.criterion import Criterion, Point, units_of
+from tuner.objective.information import is_refuted, leaves_flights, with_start_values
 from tuner.objective.initial_conditions import is_at_rest
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal_equations import Objective, with_conditions
@@ -486,14 +486,14 @@ def search_with_terms(
             )
         if fitted.polished:
             reporter.listener.on_estimates(point_estimates(job, fitted))
-        if _is_refuted(fitted):
+        if _is_refuted(fitted, leaves_flights):
             return Selected(job, fitted, refuted=True)
         if not fitted.polished:
             for finding in gains_far_off(fitted, job.fitted):
                 reporter.listener.on_doubt(finding)
         with span("selection of terms"):
             selected = with_terms_selected(job, fitted, reporter)
-        return replace(selected, refuted=_is_refuted(selected.fitted))
+        return replace(selected, refuted=_is_refuted(selected.fitted, is_refuted))
 
     selected = searched(resume=resume, provisional=bool(candidates_of(job)))
     if selected.fitted.polished:
@@ -501,10 +501,10 @@ def search_with_terms(
     return searched(resume=True, provisional=False)
 
 
-def _is_refuted(fitted: Fitted) -> bool:
+def _is_refuted(fitted: Fitted, by: Callable[[Objective, Point, Criterion], bool]) -> bool:
     if fitted.residuals_at_noise_level:
         return False
-    return is_refuted(fitted.objective, fitted.point, fitted.criterion)
+    return by(fitted.objective, fitted.point, fitted.criterion)
 
 
 def with_terms_selected(job: Job, fitted: Fitted, reporter: Reporter) -> Selected:

@@ -10,6 +10,7 @@ from typing import Any, cast
 import pytest
 
 from tests.tuner.terms.making import unfitted_with
+from tuner.objective import residuals
 from tuner.search.listener import Reporter
 from tuner.search.progress import COLOURED_RATIO, Fitted
 from tuner.terms import refit_with_disturbances, selection
@@ -63,6 +64,13 @@ def test_neither_terms_nor_disturbances_explain_a_vehicle_that_falls(thrust, fli
     assert found.refuted is not flies
     assert tried == (["terms"] if flies else [])
     assert followed(found, monkeypatch) is flies
+
+
+def test_derivatives_that_grow_along_flights_that_are_met_refute_at_the_end_alone(monkeypatch):
+    monkeypatch.setattr(residuals, "MAX_DERIVATIVE", 1e-9)
+    found, tried = ended_with(1.0, monkeypatch)
+    assert tried == ["terms"]
+    assert found.refuted
 
 
 @pytest.mark.parametrize(("others", "follows"), [(1.0, False), (2.0 * COLOURED_RATIO, True)])
