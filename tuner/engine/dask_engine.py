@@ -12,7 +12,6 @@ import logging
 import os
 import pickle
 import signal
-import sys
 import threading
 import uuid
 from collections.abc import Callable, Collection, Iterator
@@ -42,7 +41,7 @@ from distributed.security import Security
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import cache_folder
 from tuner.core.errors import EngineError, InputError
-from tuner.core.runtime import configure, extra, set_environment
+from tuner.core.runtime import configure, extra
 from tuner.engine.engine import (
     DASK,
     HERE,
@@ -62,7 +61,7 @@ class Stopped(Exception):  # noqa: N818 (no error: it was asked for)
 
 @dataclass(frozen=True)
 class SetUp(WorkerPlugin):  # type: ignore[misc]
-    """What a worker does before its first task, and before it imports jax; a plugin of Dask's.
+    """What a worker does before its first task; a plugin of Dask's.
 
     Attributes
     ----------
@@ -87,7 +86,7 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
             os.environ["CUDA_VISIBLE_DEVICES"] = str(int(worker.name) % self.gpus)
             os.environ["JAX_PLATFORMS"] = ""  # what there is: who started it has the processor's
             os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # others share it
-        set_environment()
+        configure()
 
 
 def pin(cores: Collection[int]) -> None:
@@ -105,8 +104,7 @@ def run_task(content: bytes, identity: str, topic: str) -> Any:
     Parameters
     ----------
     content
-        Function and argument, pickled, the argument by itself: it is read once jax is set up, where
-        the function's module imports it. Who starts a process for a job needs no jax.
+        Function and argument, pickled.
 
     Raises
     ------
@@ -117,10 +115,7 @@ def run_task(content: bytes, identity: str, topic: str) -> Any:
     """
     worker, stop = get_worker(), Event(stop_name(identity))
     try:
-        function, argument = pickle.loads(content)
-        if "jax" in sys.modules:
-            _configure_once()
-        task = pickle.loads(argument)
+        function, task = pickle.loads(content)
     except (ImportError, AttributeError) as error:
         raise EngineError(
             "workers",
@@ -139,11 +134,6 @@ def run_task(content: bytes, identity: str, topic: str) -> Any:
 
     with using(HERE), _logging_to(log):
         return function(task, report)
-
-
-@lru_cache(maxsize=1)
-def _configure_once() -> None:
-    configure()
 
 
 def stop_name(identity: str) -> str:
@@ -216,7 +206,7 @@ class OnDask(Engine):
         outcome: Future[R] = Future()
         with self._translated():
             # bytes, lest the scheduler, which looks at arguments, import and hold all of it
-            content = cloudpickle.dumps((function, cloudpickle.dumps(task)))
+            content = cloudpickle.dumps((function, task))
             inner = self._client.submit(run_task, content, identity, self._topic, pure=False)
 
         async def follow() -> None:

@@ -2,7 +2,6 @@
 
 import logging
 import os
-import sys
 import time
 from pathlib import Path
 
@@ -18,7 +17,6 @@ def about_the_process(_, report):
     del report
     return {
         "pid": os.getpid(),
-        "jax": "jax" in sys.modules,
         "cores": [
             sorted(os.sched_getaffinity(int(thread.name)))
             for thread in Path("/proc/self/task").iterdir()

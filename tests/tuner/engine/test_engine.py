@@ -4,9 +4,8 @@ import time
 
 import pytest
 
-from tests.tuner.engine import jax_tasks, tasks
+from tests.tuner.engine import tasks
 from tuner.core.errors import EngineError, InputError, RecordingError
-from tuner.core.runtime import kernel_folder
 from tuner.engine import HERE, current, engine_for, using
 from tuner.engine.engine import Here
 
@@ -62,7 +61,6 @@ def test_workers_keep_to_cores_of_their_own(two_workers):
         assert first != second
     # XLA takes some threads; a pool a core would be many more
     assert all(len(one["cores"]) < 40 for one in processes)
-    assert not any(one["jax"] for one in processes), "no task has computed with it"
 
 
 def test_log_lines_come_back(two_workers, caplog):
@@ -121,10 +119,6 @@ def test_no_scheduler_is_one_line(monkeypatch):
         engine_for(None, "tcp://127.0.0.1:1"),
     ):
         pass
-
-
-def test_jax_is_set_up_before_an_argument_is_read(two_workers):
-    assert two_workers.map(jax_tasks.given, [jax_tasks.WhenRead()]) == [[kernel_folder()]]
 
 
 def test_a_result_that_is_lost_on_its_way_is_an_error(two_workers, monkeypatch):
