@@ -246,6 +246,11 @@ def test_a_second_lags_derivatives_agree_with_differences_also_where_it_vanishes
     np.testing.assert_allclose(slope, (there - here) / width, rtol=2e-3, atol=1e-3)
 
 
+def test_a_second_lag_goes_on_smoothly_below_zero_as_a_lead():
+    lag, nothing, lead = (after_two_lags(second) for second in (1e-5, 0.0, -1e-5))
+    np.testing.assert_allclose(lag - nothing, nothing - lead, rtol=0.02, atol=1e-6)
+
+
 def test_a_second_lag_of_nothing_changes_no_bit_of_a_flight_and_another_delays_it():
     def flown(**effects):
         craft = with_effects(**effects)
