@@ -60,22 +60,23 @@ class FromPython:
         ConfigError
             There is no such option, or its value is of another type or out of range.
         """
-        from tuner.core.yaml_section import build, section_of  # noqa: PLC0415 (pydantic)
+        from tuner.core.yaml_section import check_types  # noqa: PLC0415 (pydantic)
 
-        types = {field.name: field.type for field in fields(cls)}  # type: ignore[arg-type]
-        option_of = {IN_JOB_FILE.get(name, name): name for name in types}
+        types = get_type_hints(cls, include_extras=True)
+        option_of = {IN_JOB_FILE.get(f.name, f.name): f.name for f in fields(cls)}  # type: ignore[arg-type]
         for name in given:
             if name not in option_of:
                 known = [IN_JOB_FILE[name]] if name in IN_JOB_FILE else option_of
                 raise ConfigError(name, "is no option", did_you_mean(name, known))
-        words = {option_of[name]: plain(value) for name, value in given.items()}
+        words = {name: plain(value) for name, value in given.items()}
         if isinstance(words.get("flights"), str):
             words["flights"] = [words["flights"]]
         models = [name for name in MODELS if words.get(name) is not None]
         for name in models:
             check_model(name, words[name])
         checked = {name: value for name, value in words.items() if name not in models}
-        build(section_of(cls, leaving=models), checked, "options")
+        check_types(checked, {name: types[option_of[name]] for name in checked}, "options")
+        words = {option_of[name]: value for name, value in words.items()}
         folders = {name: Path(words[name]) for name in PATHS if words.get(name) is not None}
         return cls(**words | folders)
 

@@ -132,6 +132,7 @@ def test_wrong_input_is_the_same_one_line(tmp_path):
     ("function", "given", "words"),
     [
         (api.fit, {"mass": "2"}, "options: mass is '2'; it should be a number"),
+        (api.fit, {"fixed": [3]}, r"options: fixed\[0\] is 3; it should be text$"),
         (api.fit, {"out": 3}, "options: out is 3; it should be the name of a file"),
         (api.fit, {"flights": [None]}, r"flights\[0\] is None; it should be text, or the name of"),
         (

@@ -225,9 +225,7 @@ class FisherInformation:
         It crashes where the recorded vehicle flew, or most simulated flights have little to do with
         the recorded ones. Derivatives along them are not those along the recorded ones.
         """
-        if self.diverged is None:
-            return False
-        return bool(np.any(self.diverged & self.crashed) or np.mean(self.diverged) > 0.5)
+        return self.diverged is not None and _is_refuting(self.diverged, self.crashed)
 
     @property
     def slope(self) -> Array:
@@ -281,7 +279,11 @@ def leaves_flights(objective: Objective, point: Point, criterion: Criterion) -> 
             return False
         crashed.extend(crashes)
         diverged.extend(of_flights)
-    return bool(np.any(crashed) or np.mean(diverged) > 0.5)
+    return _is_refuting(np.array(diverged), np.array(crashed))
+
+
+def _is_refuting(diverged: NDArray[np.bool_], crashed: NDArray[np.bool_]) -> bool:
+    return bool(np.any(diverged & crashed) or np.mean(diverged) > 0.5)
 
 
 def with_start_values(space: Space, vector: ArrayLike, names: Collection[str]) -> Array:
