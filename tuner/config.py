@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import glob
+import os
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, fields
@@ -453,10 +454,13 @@ def find_job_file(flights: Iterable[Path]) -> Path | None:
     Raises
     ------
     ConfigError
-        The flights lie in several folders with a job file each.
+        The flights lie in several folders with a job file each, or one is called ``tune.yml``.
     """
     folders = {flight.parent.resolve(): flight.parent for flight in flights}
-    files = [shown / JOB_FILE for shown in folders.values() if (shown / JOB_FILE).is_file()]
+    files = [shown / JOB_FILE for shown in folders.values() if os.path.lexists(shown / JOB_FILE)]
+    misnamed = [shown / "tune.yml" for shown in folders.values() if (shown / "tune.yml").exists()]
+    if misnamed and not files:
+        raise ConfigError(misnamed[0], "is not read", f"call it {JOB_FILE}")
     if len(files) > 1:
         raise ConfigError(
             files[1], f"is a second job file beside {files[0]}", "name one of them with --config"

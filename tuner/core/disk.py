@@ -418,7 +418,8 @@ def read_bytes(path: Path, *, most: int, remedy: str) -> bytes:
         with open_file(path) as file:
             raw = file.read(most + 1)
     except (FileNotFoundError, NotADirectoryError):
-        raise ConfigError(path, "does not exist", remedy) from None
+        what = "is a link to nothing" if path.is_symlink() else "does not exist"
+        raise ConfigError(path, what, remedy) from None
     except OSError as error:
         raise ConfigError(path, f"cannot be read ({error.strerror})", remedy) from None
     if len(raw) > most:

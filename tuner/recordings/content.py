@@ -254,6 +254,8 @@ def content_of(signals: RecordedSignals, sidecar: Sidecar) -> Content:
     ------
     RecordingError
         They hold no pose.
+    ConfigError
+        The side-car names missions, or a time, that they do not hold.
     """
     if signals.no_pose is not None:
         raise signals.no_pose
@@ -262,9 +264,9 @@ def content_of(signals: RecordedSignals, sidecar: Sidecar) -> Content:
     series, shifted = align_pose(series, topics)
     series, turned = correct_frames(series, topics)
     cut, stale = without_stale_end(series)
-    missions = _choose_missions(cut, sidecar)
+    missions = _choose_missions(cut, sidecar, signals.recording.path)
     if stale and not missions:  # read for inspection; a fit leaves such a flight out
-        missions = _choose_missions(series, sidecar)
+        missions = _choose_missions(series, sidecar, signals.recording.path)
     else:
         series = cut
     denied = contradiction(series, missions)
@@ -337,10 +339,15 @@ def _without_dead_rotors(
     return others, tuple(notes)
 
 
-def _choose_missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:
+def _choose_missions(
+    series: Mapping[str, Series], sidecar: Sidecar, path: Path
+) -> tuple[Mission, ...]:
     missions = split_into_manoeuvres(series, find_missions(series))
     if sidecar.missions is not None:
         numbers = sidecar.missions
+        if missions and max(numbers) > len(missions):
+            what = f"names mission {max(numbers)}, and {path.name} holds {len(missions)}"
+            raise ConfigError(sidecar_path(path), what, "name those that tune inspect lists")
         missions = tuple(
             replace(mission, fitted=number in numbers) for number, mission in enumerate(missions, 1)
         )
@@ -351,7 +358,10 @@ def _choose_missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mi
     end = missions[-1].end if missions else float(pose[-1])
     start = start if sidecar.start is None else max(sidecar.start, float(pose[0]))
     end = end if sidecar.end is None else min(sidecar.end, float(pose[-1]))
-    return (Mission(start, end, "the side-car"),) if end > start else ()
+    if end <= start:
+        what = f"leaves nothing of {path.name}, from {start:g} to {end:g} s"
+        raise ConfigError(sidecar_path(path), what, f"give 'start' and 'end' up to {pose[-1]:g} s")
+    return (Mission(start, end, "the side-car"),)
 
 
 def extract(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -218,7 +219,7 @@ def _inspect(
 
         return inspect_recording(path, topics, namespace, keep=cache)
 
-    if not cache or topics is not None or sidecar_path(path).is_file():
+    if not cache or topics is not None or os.path.lexists(sidecar_path(path)):
         return found()
     before = load_or_compute(Inspection, cache_file("inspection", digest(path), namespace), found)
     return dataclasses.replace(before, path=str(path))

@@ -6,11 +6,13 @@ of the same name beside it.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+from annotated_types import Ge, Len
 from pydantic import BeforeValidator, model_validator
 
 from tuner.core.errors import ConfigError, did_you_mean
@@ -240,10 +242,16 @@ class Sidecar(Section):
     trajectory: Mapping[str, str | Number] | None = None
     start: Number | None = None
     end: Number | None = None
-    missions: tuple[Whole, ...] | None = None
+    missions: Annotated[tuple[Annotated[Whole, Ge(1)], ...], Len(min_length=1)] | None = None
     topics: str | None = None
     namespace: str = ""
     motor_order: MotorOrder | None = None
+
+    @model_validator(mode="after")
+    def _starts_before_it_ends(self) -> Self:
+        if self.start is not None and self.end is not None and self.start >= self.end:
+            raise refuse(f"start {self.start:g} is not before end {self.end:g}", "swap them")
+        return self
 
 
 def read_sidecar(recording: Path) -> Sidecar:
@@ -256,7 +264,7 @@ def read_sidecar(recording: Path) -> Sidecar:
     """
     path = sidecar_path(recording)
     try:
-        return read_model(Sidecar, path) if path.is_file() else Sidecar()
+        return read_model(Sidecar, path) if os.path.lexists(path) else Sidecar()
     except ConfigError as error:
         what = f"{error.what} (it is read as the side-car of {recording.name})"
         raise ConfigError(error.where, what, error.remedy) from None

@@ -8,6 +8,7 @@ from tuner.core.disk import find_flights
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder, find_config
 from tuner.options import Options
+from tuner.recordings.topics import read_sidecar
 from tuner.vehicle import read_vehicle
 
 
@@ -77,6 +78,18 @@ def test_without_a_job_file_the_defaults_hold(lab):
     assert s.vehicle.mass == 2.079
     assert s.origin["mass"] == "default (hovergames.yaml)"
     assert s.origin["controller"] == "default (hovergames.yaml)"
+
+
+def test_a_job_file_or_side_car_that_cannot_be_read_is_not_passed_over(lab):
+    (lab / "tune.yaml").rename(lab / "tune.yml")
+    with pytest.raises(ConfigError, match=r"tune.yml: is not read; call it tune.yaml"):
+        find_job_file([lab / "a.bag"])
+    for name in ("tune.yaml", "a.yaml"):
+        (lab / name).symlink_to(lab / "unmounted" / name)
+    with pytest.raises(ConfigError, match=r"tune.yaml: is a link to nothing"):
+        resolve_settings(Options([f"{lab}/*.bag"]))
+    with pytest.raises(ConfigError, match=r"a.yaml: is a link to nothing"):
+        read_sidecar(lab / "a.bag")
 
 
 def test_a_mass_that_ships_is_not_the_users(lab):

@@ -9,6 +9,7 @@ import pytest
 
 from tests.tuner.recordings import making
 from tuner.config import resolve_settings
+from tuner.core.errors import ConfigError
 from tuner.findings.findings import Code
 from tuner.options import Options
 from tuner.recordings.flight import Series
@@ -268,3 +269,24 @@ def test_a_side_car_names_the_missions(long_log: Path) -> None:
     finally:
         beside.unlink()
     assert [recording.flight.name for recording in recordings] == ["long-2", "long-7"]
+
+
+@pytest.mark.parametrize(
+    ("said", "what"),
+    [
+        ("missions: [1, 7]", "names mission 7, and spin.bag holds 1"),
+        ("missions: [0]", "should be at least 1"),
+        ("missions: []", "at least 1"),
+        ("start: 5\nend: 5", "start 5 is not before end 5"),
+        ("start: 1000", "leaves nothing of spin.bag, from 1000 to"),
+    ],
+)
+def test_a_side_car_that_leaves_nothing_to_fit_is_refused(
+    said: str, what: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "spin.bag"
+    path.symlink_to(making.FLIGHTS / "yaw_spin_3rps.bag")
+    path.with_suffix(".yaml").write_text(said)
+    with pytest.raises(ConfigError, match=what) as refusal:
+        load_flights(path, cache=False)
+    assert refusal.value.where == str(tmp_path / "spin.yaml")
