@@ -90,6 +90,9 @@ async def _invalid(request: Request, error: Exception) -> Response:
     ]  # from body, query
     if details[0]["type"] == "json_invalid":
         return _problem(request, 422, "the request", "is not JSON", "correct it")
+    if isinstance(details[0]["input"], bytes):  # as curl -d sends it
+        remedy = "send the header Content-Type: application/json"
+        return _problem(request, 422, "the request", "is not sent as JSON", remedy)
     what, remedy = first_complaint(details, "its body")  # type: ignore[arg-type]
     return _problem(request, 422, "the request", what, remedy)
 

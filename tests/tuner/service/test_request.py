@@ -79,6 +79,15 @@ def test_a_body_that_is_no_request_is_refused(client, body):
     assert "the file" not in answer.json()["detail"]
 
 
+def test_a_request_that_is_not_sent_as_json_is_told_how_to_be(client):
+    form = {"content-type": "application/x-www-form-urlencoded"}  # as curl -d has it
+    answer = client.post("/api/v1/jobs", content=b'{"recordings": []}', headers=form)
+    assert answer.status_code == 422
+    assert answer.json()["detail"] == (
+        "the request: is not sent as JSON; send the header Content-Type: application/json"
+    )
+
+
 def test_two_recordings_of_one_name_are_refused(client, table):
     ids = [upload(client, table.read_bytes() + extra, "a/hop.csv") for extra in (b"", b"3,1,1")]
     answer = client.post("/api/v1/jobs", json={"recordings": ids})
