@@ -15,17 +15,16 @@ from jax.extend.core import JaxprEqn
 from llvmlite import ir
 
 from lanes.dependence import dependent, dependent_in_scan, dependent_in_while, parts_of_scan
+from lanes.emitter import I64, constant, is_bool, type_of
 from lanes.linear import push_rows
 from lanes.lowering import (
     CONTROL,
-    I64,
     MAX_CARRIED_IN_REGISTERS,
     Lowering,
     dtype_of,
     read_only,
     shape_of,
 )
-from lanes.rules import constant, is_bool, type_of
 from lanes.values import (
     OF_COLUMN,
     OF_LANE,
@@ -132,7 +131,7 @@ class _Carry:
         """Write a loop; return the carried values after it."""
         slots = (e for v in self.values if isinstance(v, np.ndarray) for e in v.ravel())
         self.lower.carried.append({e.operands[0] for e in slots if isinstance(e, Tangent)})
-        nodes = self.lower.loop(
+        nodes = self.lower.e.loop(
             self.parts(self.values),
             lambda nodes: goes_on(self.with_llvm_values(nodes)),
             lambda nodes: self.parts(turn(self.with_llvm_values(nodes))),
@@ -178,14 +177,16 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
 
     # short rows are collected, and several of them laid at once
     collected = (
-        into if once or p["reverse"] else [lower.rows_of(memory) or memory for memory in into]
+        into
+        if once or p["reverse"]
+        else [lower.memory.rows_of(memory) or memory for memory in into]
     )
     together = sorted({few.shape[0] for few in collected if few not in into})
 
     def lay(end: ir.Value, rows: int, count: ir.Value) -> None:
         for memory, few in zip(into, collected, strict=True):
             if few is not memory and few.shape[0] == rows:
-                lower.lay_rows(memory, few, b.sub(end, count), count)
+                lower.memory.lay_rows(memory, few, b.sub(end, count), count, lower.columns)
 
     def turn(number: ir.Value, carry: Sequence[Value]) -> list[Value]:
         place = number

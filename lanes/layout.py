@@ -11,8 +11,8 @@ import numpy as np
 from jax.extend.core import Literal
 from llvmlite import ir
 
-from lanes.lowering import I64, Lowering
-from lanes.rules import BOOL, Emitter, constant, type_of
+from lanes.emitter import BOOL, I64, Emitter, constant, type_of
+from lanes.lowering import Lowering
 from lanes.values import Memory, Storage, Value
 
 Length: TypeAlias = "int | str"
@@ -191,7 +191,7 @@ def _arguments(
             (column if apart else constant(I64, 1)) if by_lane else None,
             (frame.first_lane if tangent else frame.own_lane) if by_lane else None,
             column_stride=column if tangent else None,
-            begins=lower.begins([(frame.segment, column)]) if apart else None,
+            begins=lower.memory.begins([(frame.segment, column)]) if apart else None,
         )
         memory = Memory(storage, shape)
         values.append(lower.elements(memory) if prod(shape) <= MAX_READ_AHEAD else memory)
@@ -219,7 +219,7 @@ def _results(
             own,
             None,
             column_stride=own if moves else None,
-            begins=lower.begins(parts),
+            begins=lower.memory.begins(parts),
             writable=True,
             guard=is_wanted if moves else b.and_(is_first, is_wanted),
         )

@@ -17,9 +17,11 @@ import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal
 from llvmlite import ir
 
+from lanes.columns import ColumnLoop, factors_of
 from lanes.dependence import CALLS, called, parts_of_scan
-from lanes.lowering import I64, MAX_IN_REGISTERS, Lowering, dtype_of, read_only, shape_of
-from lanes.rules import BOOL, constant, type_of
+from lanes.emitter import BOOL, I64, constant, type_of
+from lanes.lowering import MAX_IN_REGISTERS, Lowering, dtype_of, read_only, shape_of
+from lanes.rules import apply
 from lanes.tangents import Graph
 from lanes.values import (
     OF_LANE,
@@ -111,7 +113,7 @@ class _Map:
         lower.chooses = False
         elements = [e for out in outs for e in lower.elements(out).ravel()]
         self.graph = Graph(elements, shared_cost=SHARED_COST / eqn.params["length"], finite=True)
-        self.factors = lower.factors_of(self.graph)
+        self.factors = factors_of(lower.e, self.graph)
 
     def read(self, rows: Sequence[Memory]) -> None:
         """Take other matrices."""
@@ -144,7 +146,7 @@ def push_rows(lower: Lowering, eqn: JaxprEqn, operands: Sequence[Value]) -> list
     into = [lower.local(shape_of(v), type_of(dtype_of(v)), OF_LANE) for v in eqn.outvars]
     slots = [Tangent(m.storage.kind, READ, {}, at) for m in into for at in _places(m)]
     hand_on = list(map(lower.into, slots))
-    lower.each_column(made.graph, made.factors, hand_on, constant(I64, length))
+    ColumnLoop(lower.memory, made.graph, made.factors).write(hand_on, constant(I64, length))
     return list(into)
 
 
@@ -193,5 +195,5 @@ def _sum(lower: Lowering, terms: Sequence[tuple[ir.Value, Element]]) -> Element:
     """Return the sum of the elements whose flags are true."""
     kind = next(base(e.type) if isinstance(e, ir.Value) else e.kind for _, e in terms)
     zero = constant(kind, 0.0)
-    chosen = [lower.apply("select_n", {}, flag, zero, element) for flag, element in terms]
-    return reduce(lambda x, y: lower.apply("add", {}, x, y), chosen)
+    chosen = [apply(lower.e, "select_n", {}, flag, zero, element) for flag, element in terms]
+    return reduce(lambda x, y: apply(lower.e, "add", {}, x, y), chosen)

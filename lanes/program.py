@@ -28,7 +28,6 @@ import lanes.control
 import lanes.structural  # noqa: F401 (both fill in rules)
 from lanes.dependence import dependent
 from lanes.layout import Argument, Lengths, is_laid_by_loop, module_text
-from lanes.lowering import LINE_BYTES, MAX_COLUMNS
 from lanes.machine import (
     LoadedFunction,
     UnknownError,
@@ -40,6 +39,7 @@ from lanes.machine import (
     optimises,
     register_bytes,
 )
+from lanes.memory_access import LINE_BYTES, MAX_COLUMNS
 from lanes.values import UnsupportedError
 
 __all__ = ["Argument", "Program", "ProgramResults", "joined", "keep_code_in", "program_of"]

@@ -11,9 +11,10 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 from llvmlite import ir
 
+from lanes.emitter import I64, constant, converted, type_of
 from lanes.linear import sliced, updated
-from lanes.lowering import I64, STRUCTURAL, Lowering, Rule, shape_of
-from lanes.rules import constant, converted, type_of
+from lanes.lowering import STRUCTURAL, Lowering, Rule, shape_of
+from lanes.rules import apply
 from lanes.values import (
     OF_COLUMN,
     Deferred,
@@ -74,7 +75,7 @@ def _concatenate(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value
 
     def at(index: Index) -> Element:
         """Read every part at the place nearest to the one asked for, and choose."""
-        number, chosen = lower.as_index(index[axis]), None
+        number, chosen = lower.e.as_index(index[axis]), None
         for operand, first in zip(operands, firsts, strict=False):
             own = lower.b.sub(number, lower.e.number(number, first))
             own = lower.start_within(own, operand.shape[axis], 1)
@@ -83,7 +84,7 @@ def _concatenate(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value
                 chosen = read
                 continue
             behind = lower.b.icmp_signed(">=", number, lower.e.number(number, first))
-            chosen = lower.apply("select_n", {}, behind, chosen, read)
+            chosen = apply(lower.e, "select_n", {}, behind, chosen, read)
         return chosen
 
     return Deferred(shape, at, tuple(operands))
@@ -95,8 +96,8 @@ def _slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
 
     def at(index: Index) -> Element:
         moved = [
-            lower.sum_of(
-                constant(I64, start), lower.product_of(lower.as_index(i), constant(I64, stride))
+            lower.e.sum_of(
+                constant(I64, start), lower.e.product_of(lower.e.as_index(i), constant(I64, stride))
             )
             for i, start, stride in zip(index, p["start_indices"], strides, strict=True)
         ]
@@ -136,7 +137,7 @@ def _iota(lower: Lowering, eqn: JaxprEqn, _: list[Value]) -> Value:
     kind = type_of(eqn.params["dtype"])
 
     def at(index: Index) -> Element:
-        return converted(lower.e, lower.as_index(index[axis]), kind)
+        return converted(lower.e, lower.e.as_index(index[axis]), kind)
 
     if lower.is_long(shape):
         return Deferred(tuple(shape), at)
@@ -157,7 +158,7 @@ def _reduce(name: str) -> Rule:
         if rows.shape[1] == 0:
             raise UnsupportedError(f"{eqn.primitive.name} over nothing")
         return array_of(
-            [reduce(lambda x, y: lower.apply(name, {}, x, y), list(row)) for row in rows], shape
+            [reduce(lambda x, y: apply(lower.e, name, {}, x, y), list(row)) for row in rows], shape
         )
 
     return rule
@@ -175,8 +176,8 @@ def _dot_general(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value
     first, second = rows(left, left_batch, left_sum), rows(right, right_batch, right_sum)
 
     def dot(x: Elements, y: Elements) -> Element:
-        products = [lower.apply("mul", {}, a, b) for a, b in zip(x, y, strict=True)]
-        return reduce(lambda a, b: lower.apply("add", {}, a, b), products)
+        products = [apply(lower.e, "mul", {}, a, b) for a, b in zip(x, y, strict=True)]
+        return reduce(lambda a, b: apply(lower.e, "add", {}, a, b), products)
 
     found = [dot(x, y) for xs, ys in zip(first, second, strict=True) for x in xs for y in ys]
     return array_of(found, shape_of(eqn.outvars[0]))
@@ -193,10 +194,10 @@ def _dynamic_slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Val
             return sliced(lower, value, starts, sizes)
         value = lower.readable(value)
     if isinstance(value, Memory) and value.storage.begins and prod(sizes[:-1]) == 1:
-        return array_of(lower.read_row(value.storage, starts, sizes[-1]), sizes)
+        return array_of(lower.memory.read_row(value.storage, starts, sizes[-1]), sizes)
     found = [
         lower.at(
-            value, [lower.sum_of(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]
+            value, [lower.e.sum_of(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]
         )
         for place in np.ndindex(*sizes)
     ]
@@ -225,7 +226,7 @@ def _dynamic_update_slice(lower: Lowering, _: JaxprEqn, operands: list[Value]) -
         raise UnsupportedError("an array that is changed after it was changed in place")
     places = []
     for place in np.ndindex(update.shape):
-        at = [lower.sum_of(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]
+        at = [lower.e.sum_of(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]
         places.append((at, update[place]))
     lower.store(value, places)
     value.storage.version += 1

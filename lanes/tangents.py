@@ -15,7 +15,7 @@ from typing import Any, TypeAlias, TypeGuard
 
 from llvmlite import ir
 
-from lanes.rules import constant, is_bool
+from lanes.emitter import constant, is_bool
 from lanes.values import Element, Tangent
 
 Factor: TypeAlias = "float | ir.Value | _Operation"

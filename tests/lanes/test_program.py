@@ -20,8 +20,8 @@ from jax import lax
 import lanes.linear as lanes_linear
 import lanes.program
 from lanes import Argument, Program, dependent, joined, keep_code_in
-from lanes.lowering import LINE_BYTES
 from lanes.machine import object_code, register_bytes
+from lanes.memory_access import LINE_BYTES
 
 RANDOM = np.random.default_rng(1)
 

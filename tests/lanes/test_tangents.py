@@ -10,7 +10,7 @@ from jax import lax
 from llvmlite import ir
 
 from lanes import Argument, Program, joined
-from lanes.lowering import MAX_COLUMNS
+from lanes.memory_access import MAX_COLUMNS
 from lanes.tangents import Graph
 from lanes.values import READ, Tangent
 
