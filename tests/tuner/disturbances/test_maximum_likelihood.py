@@ -8,21 +8,28 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem
+from tuner.disturbances import maximum_likelihood
 from tuner.disturbances.disturbances import (
     INITIAL_STRENGTHS,
     MAX_STRENGTHS,
     MIN_STRENGTHS,
     STRENGTHS,
 )
+from tuner.disturbances.extended_kalman_filter import Filtered
 from tuner.disturbances.maximum_likelihood import (
     LEAST_CHANGE,
     MAX_STRENGTH_RATIO,
+    NEAR_GAIN,
     _Equations,
     _held,
     _strengths_step,
+    maximise_likelihood,
 )
 from tuner.disturbances.observer import FilterInput
 from tuner.disturbances.predictor import Predictor
+from tuner.objective.criterion import Point
+from tuner.objective.normal_equations import Objective
+from tuner.search.progress import plain_criterion
 
 
 def test_no_step_is_taken_where_a_filter_has_lost_a_flight():
@@ -84,6 +91,34 @@ def test_a_strength_near_none_stays_until_its_slope_points_up() -> None:
     for bound, outside in ((MIN_STRENGTHS, 1.0), (MAX_STRENGTHS, -1.0)):
         assert _held(bound, np.full(8, outside), flat).all()
         assert not _held(bound, np.full(8, -outside), flat).any()
+
+
+class LikeliestAtStart(Predictor):
+    """A predictor by which recordings are less likely at each point but the first."""
+
+    def at(self, objective: Objective, point: Point) -> Predictor:
+        rows, far = np.zeros((1, 0, 2)), bool((point.coefficients != objective.space.initial).any())
+        return replace(self, found=Filtered(rows, rows, np.full((1, 2), far, float), None))
+
+
+@pytest.mark.parametrize(("gain", "taken"), [(0.9 * NEAR_GAIN, True), (1.1 * NEAR_GAIN, False)])
+def test_a_step_near_the_estimate_is_taken_though_recordings_are_less_likely_after_it(
+    monkeypatch: pytest.MonkeyPatch, gain: float, taken: bool
+) -> None:
+    fit = problem(("inertia_xx", "motor_constant"))
+    point, criterion = fit.start(fit.space.initial), plain_criterion(fit, fit.samples)
+    moves = np.zeros(point.coefficients.size + point.offsets.size + len(STRENGTHS))
+    moves[0] = 1e-3
+    free, hessian = moves > 0.0, np.diag(np.full(len(moves), 2.0 * gain / moves[0] ** 2))
+    equations = _Equations(-hessian @ moves, hessian, free)
+    assert equations.gain(moves) == pytest.approx(gain)
+    monkeypatch.setattr(maximum_likelihood, "_equations", lambda *_: equations)
+    inputs = FilterInput(fit.segments, point.offsets, {})
+    predictor = LikeliestAtStart(fit.schedule, inputs, {}, INITIAL_STRENGTHS, {})
+    given = (fit, point, criterion)
+    _, end = maximise_likelihood(predictor, [], given, free[: -len(STRENGTHS)], steps=1)
+    change = end.coefficients - point.coefficients
+    np.testing.assert_allclose(fit.space.slope(point.coefficients) * change, taken * moves[:2])
 
 
 def test_a_filter_flies_on_the_voltage_that_another_problem_reads():
