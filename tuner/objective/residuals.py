@@ -96,11 +96,9 @@ def residuals(
     They may be called side by side.
     """
     measured = segments.measured[name]
-    time, values, weight = (
-        np.ascontiguousarray(np.moveaxis(np.asarray(part), -1, 0))
-        for part in (measured.time, measured.values, measured.weight)
-    )
-    used = (time * reading.rate < reading.horizon - 1) & (weight != 0.0).any(axis=-1)
+    time, values, weight = map(np.asarray, (measured.time, measured.values, measured.weight))
+    known = np.logical_or.reduce([*np.moveaxis(weight != 0.0, 1, 0)])
+    used = np.ascontiguousarray(((time * reading.rate < reading.horizon - 1) & known).T)
     most = int(used.sum(axis=1).max(initial=0))
     order = np.argsort(~used, axis=1, kind="stable")[:, :most]
     log, moved_log = _Series(flown.channels[name]), flown.columns[name]
@@ -113,16 +111,16 @@ def residuals(
         owners = np.arange(first, first + len(stamps))
 
         def at(rows: NDArray[Any]) -> NDArray[Any]:
-            return rows[owners[:, None], stamps]
+            return rows[stamps, ..., owners[:, None]]
 
-        weights = at(weight) * at(used)[..., None]
+        weights = at(weight) * at(used.T)[..., None]
         place = _Place(owners, at(time), name, reading)
         errors, moved = _compared(name, log, columns, place, at(values))
         errors = errors * weights
         moved *= weights[..., None]
         return Block(some, stamps, weights != 0.0, errors, moved)
 
-    for first in range(0, len(time), together):
+    for first in range(0, len(used), together):
         for begin in range(0, most, STAMPS_AT_ONCE):
             yield partial(block, first, begin)
 
