@@ -190,6 +190,7 @@ def with_disturbances(
             alternatives=alternatives,
             selection_shifts=selected.selection_shifts,
             model_errors=model_errors,
+            effects=False,
         )
         agree = _estimates_agree(examination.uncertainty, before.uncertainty)
         if not agree:

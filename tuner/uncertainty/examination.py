@@ -78,6 +78,7 @@ def examine(
     model_errors: ModelErrors | None = None,
     predictor: Predictor | None = None,
     at_minimum: bool = True,
+    effects: bool = True,
 ) -> Examination:
     """Examine a fit, or a point where nothing was fitted.
 
@@ -93,6 +94,8 @@ def examine(
         Filter whose innovations are used instead of residuals.
     at_minimum
         Whether a search led to the point: its distance from the minimum is then part of the error.
+    effects
+        Whether sensitivity and residuals are examined; without, there is no signal in them.
     """
     names = tuple(fitted.scales)
     full_problem = full_problem_of(fitted.objective, fitted.point)
@@ -120,6 +123,8 @@ def examine(
         moved = {name: other.residuals(*batch[1:]) for name, other in others.items()}
         compared = jacobian if predictor is None else jacobian.of(predictor.rows)
         informations.append(information_at(*batch, compared, alternatives=moved))
+        if not effects:
+            continue
         sensitivities.append(
             local_sensitivity(*batch, jacobian, reference=reference, flights=flight_names)
         )
@@ -165,7 +170,7 @@ def examine(
         uncertainty=known(),
         of_fixed={name: known(name) for name in full_problem.fixed},
         bias=_bias(full_problem, information, reference),
-        sensitivity=LocalSensitivity.joined(sensitivities),
+        sensitivity=LocalSensitivity.joined(sensitivities or [LocalSensitivity({}, [], [])]),
         residuals=tuple(residuals),
         full_problem=full_problem,
         information=information,

@@ -62,6 +62,17 @@ def test_flights_that_do_not_fit_the_memory_take_turns(
             assert here == (there if isinstance(there, str) else pytest.approx(there, rel=1e-6))
 
 
+def test_a_fit_that_is_only_compared_is_known_as_well_without_its_effects(
+    objective: Objective, examination: Examination
+) -> None:
+    known = examine(making.fitted_of(objective, making.truth(objective)), effects=False)
+    assert known.uncertainty.estimates == examination.uncertainty.estimates
+    assert examination.sensitivity.outputs
+    assert examination.residuals
+    assert not known.sensitivity.outputs
+    assert not known.residuals
+
+
 @pytest.mark.parametrize(("name", "factor"), [("motor_constant", 0.3), ("inertia_xx", 0.1)])
 def test_flights_that_the_fitted_vehicle_does_not_fly_say_nothing(
     objective: Objective, name: str, factor: float
