@@ -63,7 +63,9 @@ def loop_of(objective: Objective) -> Loop:
 
 
 def with_loop(objective: Objective, loop: Loop) -> Objective:
-    """Return the objective with these choices."""
+    """Return the objective with these choices; itself where it has them."""
+    if loop == loop_of(objective):
+        return objective  # what is laid out for it serves on
     changed: Objective = eqx.tree_at(
         lambda o: _leaves(o.model.controller), objective, [np.asarray(choice) for choice in loop]
     )
