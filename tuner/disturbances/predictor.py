@@ -184,7 +184,7 @@ class Predictor:
         slope, information, moved, sizes = slopes_of(
             here, self._with_strengths(objective, point, strengths, some), steps
         )
-        ticks = np.zeros((len(moved), *whole.shape))
+        ticks = np.moveaxis(np.zeros((len(moved), *np.moveaxis(whole, -1, 0).shape)), 1, -1)
         np.divide(moved, share, out=ticks[:, :some])
         return Slopes(slope / share, information / share, ticks, sizes / share)
 
@@ -230,9 +230,9 @@ class Predictor:
             of_segments = np.tile(strengths, len(segments) // times)
             assumed = self._assumed(objective, point, of_segments)
             found.append(self._filtered(tiled, assumed, self.latency, gains=False))
-        all_of = jax.tree.map(lambda *parts: np.concatenate(parts, axis=-1), *found)
         for number in range(times):
-            yield all_of.first(ticks, slice(number, None, times))
+            own = (part.first(ticks, slice(number, None, times)) for part in found)
+            yield jax.tree.map(_side_by_side, *own)
 
     @property
     def estimated_noise(self) -> dict[str, float]:
@@ -501,6 +501,11 @@ class Slopes(NamedTuple):
     sizes: Array
 
 
+def _side_by_side(*parts: Array) -> Array:
+    """Return arrays joined along their segments, which lie apart as kernels lay them."""
+    return np.moveaxis(np.concatenate([np.moveaxis(part, -1, 0) for part in parts]), 0, -1)
+
+
 def change_of_size(here: Filtered, there: Filtered, step: float) -> Array:
     """Return the derivative of the innovations' sizes by a step, as of `Slopes.sizes`."""
     return np.asarray(np.sqrt(0.5) * ((there.root / here.root) ** 2 - 1.0) / step)
@@ -523,18 +528,20 @@ def slopes_of(here: Filtered, beside: Iterable[Filtered], steps: Array) -> Slope
     steps
         (8,) see `difference_steps`.
     """
-    moves, spreads = np.zeros((2, len(steps), *here.white.shape))
+    # segments lie apart, as kernels lay them
+    moves, spreads = np.zeros((2, len(steps), *np.moveaxis(here.white, -1, 0).shape))
+    moved, sizes = np.moveaxis(moves, 1, -1), np.moveaxis(spreads, 1, -1)
     slope, loss = np.zeros(len(steps)), float(np.sum(here.loss))
     for number, (there, step) in enumerate(zip(beside, steps.tolist(), strict=True)):
         turn = there.root / here.root
-        moves[number] = (turn * there.white - here.white) / step
-        spreads[number] = change_of_size(here, there, step)
+        moved[number] = (turn * there.white - here.white) / step
+        sizes[number] = change_of_size(here, there, step)
         bend = np.sum(moves[number] ** 2) + np.sum(spreads[number] ** 2)
         slope[number] = (
             float(np.sum(there.loss)) - loss
         ) / step - 0.5 * step * bend  # where it begins
     flat = (part.reshape(len(steps), -1) for part in (moves, spreads))
-    return Slopes(slope, sum(part @ part.T for part in flat), moves, spreads)
+    return Slopes(slope, sum(part @ part.T for part in flat), moved, sizes)
 
 
 def hidden_by_setpoints(names: Sequence[str], model: Model) -> NDArray[np.bool_]:
