@@ -8,7 +8,7 @@ cross-correlation shows the offset.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,6 +20,7 @@ from tuner.recordings.interpolation import (
     RATE_HZ,
     body_rate_of,
     correlation,
+    correlation_aligned,
     correlations,
     middle_clock,
     resample,
@@ -51,6 +52,8 @@ MAX_MISMATCH_RATIO = 0.8
 #: rad/s, and a correlation: less is no evidence of an offset.
 MIN_TURN_RATE = 0.1
 MIN_CORRELATION = 0.6
+#: Rows beyond the delay that signals show as they are, for that which they show once aligned.
+ALIGNED_LAGS = 3
 #: Both signals are averaged over this window against noise.
 AVERAGING_WINDOW_S = 0.1
 
@@ -254,24 +257,43 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
         body_rate_of(resample("attitude", series["attitude"], clock)), AVERAGING_WINDOW_S
     )
     gyro = smooth(resample("body_rate", series["body_rate"], clock), AVERAGING_WINDOW_S)
-    return None if rms(gyro) < MIN_TURN_RATE else lag_between(turning, gyro)
+    late = None if rms(gyro) < MIN_TURN_RATE else lag_between(turning, gyro)
+    if not late:
+        return late
+    # on a circle, markers whose axes are askew look late
+    aligned = lag_between(turning, gyro, alike=correlation_aligned) or 0.0
+    delayed = correlation(*_overlapping(turning, gyro, round(late * RATE_HZ)))
+    askew, both = (
+        correlation_aligned(*_overlapping(turning, gyro, round(lag * RATE_HZ)))
+        for lag in (0.0, aligned)
+    )
+    is_askew = askew > delayed or 1 - both < MAX_MISMATCH_RATIO * (1 - delayed)
+    return aligned if is_askew else late
 
 
-def lag_between(one: Array, other: Array) -> float | None:
+def _overlapping(one: Array, other: Array, lag: int) -> tuple[Array, Array]:
+    """Return the rows that two signals share once the one is moved back by a lag."""
+    rows = len(one)
+    return one[max(0, lag) : rows + min(0, lag)], other[max(0, -lag) : rows - max(0, lag)]
+
+
+def lag_between(
+    one: Array, other: Array, *, alike: Callable[[Array, Array], float] = correlation
+) -> float | None:
     """Return the delay in s of one signal (n, k) against another, both at `RATE_HZ`.
 
     None if they are not alike; 0 if another delay makes them hardly more so.
     """
     # The best whole lag first, then a parabola through the three highest points.
     furthest = round(MAX_POSE_OFFSET_S * RATE_HZ)
-    count = len(one)
 
     def score(lag: int) -> float:
-        """Return the correlation with the one signal moved back by a lag."""
-        moved = one[max(0, lag) : count + min(0, lag)]
-        return correlation(moved, other[max(0, -lag) : count - max(0, lag)])
+        return alike(*_overlapping(one, other, lag))
 
     best, on_time = int(np.argmax(correlations(one, other, furthest))) - furthest, score(0)
+    if alike is not correlation:
+        lags = range(min(best, 0) - ALIGNED_LAGS, max(best, 0) + ALIGNED_LAGS + 1)
+        best = max((lag for lag in lags if abs(lag) <= furthest), key=score)
     left, peak, right = (score(best + side) for side in (-1, 0, 1))
     if (
         peak < MIN_CORRELATION

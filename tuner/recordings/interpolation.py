@@ -194,6 +194,32 @@ def correlation(a: Array, b: Array) -> float:
     return float((a * b).sum() / size) if size > 0 else 0.0
 
 
+MAX_ALIGNING_TURN = 0.1
+"""rad. A rigid body whose axes were set by eye is off by less."""
+
+
+def correlation_aligned(a: Array, b: Array) -> float:
+    """Return the `correlation` of two (n, 3) signals, with one turned a little so that it is best.
+
+    The turn is that of least squares, to the first order, of at most `MAX_ALIGNING_TURN`.
+    """
+    a, b = both_known(a, b)
+    if len(a) < 20:
+        return 0.0
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    together, spread = a.T @ b, b.T @ b
+    size = float(np.sqrt((a * a).sum() * np.trace(spread)))
+    if size == 0.0:
+        return 0.0
+    levers = np.trace(spread) * np.eye(3) - spread
+    skew = together - together.T
+    turn = np.linalg.pinv(levers, rcond=1e-3) @ [skew[2, 1], skew[0, 2], skew[1, 0]]
+    turn *= min(1.0, MAX_ALIGNING_TURN / max(float(np.linalg.norm(turn)), 1e-12))
+    crossed = np.cross(np.eye(3), turn)
+    turned = np.eye(3) + crossed + 0.5 * crossed @ crossed
+    return float((turned * together).sum() / size)
+
+
 def correlations(a: Array, b: Array, furthest: int) -> Array:
     """Return `correlation` with `a` moved back by each lag, but for rounding.
 

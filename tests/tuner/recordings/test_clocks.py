@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from tuner.recordings.clocks import fit_grid
+from tests.tuner.recordings import making
+from tuner.recordings.clocks import fit_grid, pose_offset
+from tuner.recordings.flight import Series
+from tuner.recordings.loader import load_flight
 
 
 def _late(count: int, rate: float, seed: int = 0) -> np.ndarray:
@@ -56,3 +60,15 @@ def test_free_running_signal_is_left_alone() -> None:
 def test_irregular_stamps_have_no_grid() -> None:
     random = np.random.default_rng(2)
     assert fit_grid(np.cumsum(random.uniform(0.005, 0.02, 500)), 100.0) is None
+
+
+@pytest.mark.parametrize("late", [0.0, 0.03, -0.08])
+@pytest.mark.parametrize("degrees", [-3.0, 0.0, 2.0])
+def test_markers_that_are_turned_a_little_are_not_late(degrees: float, late: float) -> None:
+    series = load_flight(making.FLIGHTS / "circle_4mps.bag").series
+    time, attitude = series["attitude"].time, series["attitude"].values
+    askew = Rotation.from_quat(attitude, scalar_first=True) * Rotation.from_euler(
+        "z", degrees, degrees=True
+    )
+    markers = Series(time + late, askew.as_quat(scalar_first=True))
+    assert pose_offset({**series, "attitude": markers}) == pytest.approx(late, abs=2e-3)
