@@ -41,6 +41,7 @@ from tuner.objective.setpoints import setpoint_findings
 from tuner.objective.space import extended
 from tuner.objective.trajectory import build_publishers
 from tuner.recordings.flight import Flight, Series
+from tuner.recordings.interpolation import body_rate_of, smooth
 from tuner.search.findings import MIN_TURNING_EXPLAINED, late_input_findings
 from tuner.search.job_flights import read_recordings
 from tuner.search.problem import Job, job_of
@@ -63,6 +64,8 @@ MIN_SPREADS = {"x": 0.2, "y": 0.2, "roll": 1.0, "pitch": 1.0}
 """Least range of an excited axis, m and degrees."""
 MIN_YAW_RATE = 0.5
 """Least yaw rate of excited yaw, rad/s."""
+YAWING_WINDOW_S = 0.1
+"""Over which the yaw rate is averaged that an attitude shows."""
 MAX_NAMED_FLIGHTS = 3
 """Largest number of flights that a finding names one by one."""
 MAX_LIFT_RATIO = 3.0
@@ -359,17 +362,19 @@ def _excitation(job: Job) -> Iterator[Finding]:
     still = tuple(axis for axis, least in MIN_SPREADS.items() if spread[axis] < least)
     if still:
         yield Code.STILL_AXES.warning("excitation", *still)
-    rate = max(
-        (
-            float(np.nanmax(np.abs(flight.signals["body_rate"][:, 2])))
-            for flight in job.fitted
-            if flight.has("body_rate")
-        ),
-        default=0.0,
-    )
+    rate = max(_yaw_rate(flight) for flight in job.fitted)
     turns = {"inertia_zz", "moment_constant"} & set(job.space.free)
     if rate < MIN_YAW_RATE and turns:
         yield Code.NO_YAW.warning("excitation", rate=rate)
+
+
+def _yaw_rate(flight: Flight) -> float:
+    """Return the fastest yaw rate of a flight, of its attitude where there is no gyro."""
+    if flight.has("body_rate"):
+        rates = flight.signals["body_rate"]
+    else:
+        rates = smooth(body_rate_of(flight.signals["attitude"]), YAWING_WINDOW_S)
+    return float(np.nanmax(np.abs(rates[:, 2]), initial=0.0))
 
 
 def _spread(flight: Flight, axis: str) -> float:

@@ -9,11 +9,12 @@ import pytest
 from sim_jax.schedule import Schedule
 from tests.tuner.evaluate.test_comparison import errors
 from tests.tuner.recorded import recordings_of
+from tests.tuner.recordings.making import FLIGHTS
 from tuner.config import JobFile, Search, resolve_settings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.evaluate.validation import flights_worse
 from tuner.findings.findings import Code, Finding
-from tuner.job.prepare import merged_by_flight, starts_on_bounds
+from tuner.job.prepare import _excitation, merged_by_flight, starts_on_bounds
 from tuner.objective.inlets import INLETS, also_free_by, bypassed_by
 from tuner.objective.segments import cut_windows, window_segments
 from tuner.objective.space import space_of
@@ -21,6 +22,7 @@ from tuner.objective.windows import windows_of
 from tuner.options import Options
 from tuner.recordings.defects import LIMITS, is_outlier
 from tuner.recordings.flight import Series
+from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Note, NoteCode
 from tuner.search import job_flights as recordings_module
 from tuner.search.findings import turning_findings
@@ -61,6 +63,22 @@ def test_a_start_outside_given_bounds_is_warned_of():
     ]
     found = starts_on_bounds(SimpleNamespace(space=SimpleNamespace(parameters=parameters)))
     assert [finding.level for finding in found] == ["info", "warning"]
+
+
+def test_a_yaw_spin_without_a_gyro_is_seen_to_yaw():
+    circle, spin = (load_flight(FLIGHTS / f"{n}.bag") for n in ("circle_3mps", "yaw_spin_3rps"))
+    space = SimpleNamespace(free=("inertia_zz",))
+
+    def codes(*flown):
+        bare = [
+            replace(f, signals={n: of for n, of in f.signals.items() if n != "body_rate"})
+            for f in flown
+        ]
+        found = _excitation(SimpleNamespace(fitted=bare, space=space))
+        return {finding.code for finding in found}
+
+    assert Code.NO_YAW in codes(circle)
+    assert Code.NO_YAW not in codes(circle, spin)
 
 
 def test_a_flight_without_any_command_is_refused_in_one_line(flight):
