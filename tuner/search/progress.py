@@ -374,12 +374,19 @@ def impossible_inertia(job: Job, fitted: Fitted) -> tuple[str, ...]:
 
 
 def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
-    """Return flight -> s by which its pose stamps are late."""
+    """Return flight -> s by which its pose stamps are late.
+
+    Those of fitted flights were estimated; held-out ones get their median, without spins, which
+    hardly show it.
+    """
     pose = np.asarray(fitted.point.offsets)[CLOCKS.index("pose")] * OFFSET_UNIT
-    offsets = {recording.flight.name: recording.time_offset or 0.0 for recording in job.recordings}
-    for flight, late in zip(job.fitted, pose, strict=True):
-        offsets[flight.name] += float(late)
-    return offsets
+    late = {flight.name: float(of) for flight, of in zip(job.fitted, pose, strict=True)}
+    free = [r.flight for r in job.recordings if r.time_offset is None]
+    shown = [late[f.name] for f in free if f.name in late and f.yaw_rate_setpoint is None]
+    late |= {f.name: float(np.median(shown)) for f in free if shown and f.name not in late}
+    return {
+        r.flight.name: (r.time_offset or 0.0) + late.get(r.flight.name, 0.0) for r in job.recordings
+    }
 
 
 def conditions_of(job: Job, fitted: Fitted) -> dict[str, dict[str, float]]:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from tuner.config import CHANNELS, JobFile, resolve_settings
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import Code, sentence
 from tuner.job.prepare import prepare
+from tuner.objective.criterion import OFFSET_UNIT
+from tuner.objective.segments import OFFSETS
 from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import (
@@ -19,6 +22,7 @@ from tuner.search.job_flights import (
     with_known,
 )
 from tuner.search.problem import job_of
+from tuner.search.progress import offsets_of
 from tuner.search.recorded_rotors import WINDOW_S, cut_at_rotor_changes, rotor_change_of
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
@@ -200,4 +204,24 @@ def test_little_is_not_looked_at(flown):
     assert (
         rotor_change_of(weakened(flight, settings.vehicle, 0.05, seconds=3.5), settings.vehicle)
         is None
+    )
+
+
+def test_a_held_out_flight_has_the_clock_of_the_fitted_ones(flights):
+    spin, circle = flights
+    fitted = [spin, *(replace(circle, name=name) for name in "abc")]
+    held_out, given = replace(circle, name="held out"), replace(circle, name="given")
+    recordings = [
+        *(JobFlight(flight, time_offset=None) for flight in fitted),
+        JobFlight(held_out, time_offset=None, holdout=True),
+        JobFlight(given, time_offset=0.005, holdout=True),
+    ]
+    offsets = np.zeros((len(OFFSETS), len(fitted)))
+    offsets[OFFSETS.index("pose")] = np.array([0.0, 0.017, 0.018, 0.03]) / OFFSET_UNIT
+    found = offsets_of(
+        SimpleNamespace(recordings=recordings, fitted=fitted),
+        SimpleNamespace(point=SimpleNamespace(offsets=offsets)),
+    )
+    assert found == pytest.approx(
+        {SPIN: 0.0, "a": 0.017, "b": 0.018, "c": 0.03, "held out": 0.018, "given": 0.005}
     )
