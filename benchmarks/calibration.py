@@ -41,7 +41,7 @@ from tuner.search.continuation import run_stages
 from tuner.search.estimation import free_parameters
 from tuner.search.job_flights import read_recordings
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Fitted, criterion_of, initial_progress
+from tuner.search.progress import Fit, criterion_of, initial_progress
 from tuner.search.stages import plan
 from tuner.terms.candidates import with_terms
 from tuner.uncertainty.estimates import uncertainty_of
@@ -222,7 +222,7 @@ def draw_truth(space: Space, random: np.random.Generator) -> Array:
             return space.at_share(share)
 
 
-def fitted(objective: Objective) -> Fitted:
+def fitted(objective: Objective) -> Fit:
     """Return the fit that the search leads to from the prior's mean."""
     space, names = objective.space, [flight.name for flight in reference_job().fitted]
     rate = float(objective.schedule.log_rate)
@@ -238,7 +238,7 @@ def fitted(objective: Objective) -> Fitted:
         on_progress=lambda _: None,
     )
     point = picked(progress.points, 0)
-    return Fitted(
+    return Fit(
         objective=objective,
         point=point,
         criterion=criterion_of(stages[-1], progress.scales, np.asarray(point.offsets), None),
@@ -257,7 +257,7 @@ def fitted(objective: Objective) -> Fitted:
     )
 
 
-def _vector(found: Fitted) -> Array:
+def _vector(found: Fit) -> Array:
     return np.asarray(found.point.coefficients)
 
 

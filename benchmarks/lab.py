@@ -50,8 +50,8 @@ from tuner.options import Options
 from tuner.recordings.flight import Flight
 from tuner.search.listener import Reporter
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted
-from tuner.terms.candidates import Selected
+from tuner.search.progress import Fit
+from tuner.terms.candidates import SelectionResult
 from tuner.terms.refit_with_disturbances import refit_and_examine
 from tuner.terms.selection import search_with_terms
 from tuner.uncertainty.agreement import flights_disagree
@@ -272,7 +272,7 @@ def job_at(lab: Lab, folder: Path, *, seed: int) -> tuple[Job, tuple[Finding, ..
     )
 
 
-def searched(job: Job, folder: Path) -> Selected:
+def searched(job: Job, folder: Path) -> SelectionResult:
     """Return the fit of a job, with the terms that its flights call for."""
     return search_with_terms(job, folder, resume=False, reporter=Reporter())
 
@@ -334,7 +334,7 @@ def _voltages(
 
 def _oracle(
     trial: Trial,
-    fitted: Fitted,
+    fitted: Fit,
     quoted: Uncertainty,
     volts: Callable[[np.random.Generator], Array | None],
     seed: int,

@@ -44,7 +44,7 @@ from tuner.core.disk import write_text
 from tuner.core.shipped import find_config
 from tuner.evaluate.closed_loop import Simulation
 from tuner.evaluate.simulation_files import write_bag
-from tuner.objective.trajectory import Published, published
+from tuner.objective.trajectory import FlightReference, published
 from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle, term_groups, with_values
 from tuner.vehicle.model import Model, model_of, schedule_of, vehicle_of, with_terms_computed
 
@@ -381,7 +381,7 @@ def _all_terms() -> tuple[str, ...]:
     return tuple(name for names in term_groups().values() for name in names)
 
 
-def _references(sent: list[Published]) -> ReferenceInlet:
+def _references(sent: list[FlightReference]) -> ReferenceInlet:
     """Return the references side by side; a yaw spin is held level."""
     points = jax.tree.map(
         lambda *leaves: jnp.stack(leaves, axis=-1), *(s.inlet.points for s in sent)
@@ -446,7 +446,7 @@ def _voltage(lab: Lab, flown: Rollout, ticks: int) -> Numbers:
 
 
 def _signals(
-    flown: Rollout, number: int, reference: Published, volts: Numbers
+    flown: Rollout, number: int, reference: FlightReference, volts: Numbers
 ) -> dict[str, Numbers]:
     """Return signal -> (samples, k) of a flight, the hover before it included."""
     log = flown.log

@@ -19,9 +19,9 @@ from tuner.core.numerics import Array, Inverse
 from tuner.objective.information import information_at
 from tuner.objective.normal_equations import Objective
 from tuner.objective.residuals import Reading, at_stamps
-from tuner.objective.segments import CLOCKS, OFFSETS, Measured
+from tuner.objective.segments import CLOCKS, OFFSETS, MeasuredChannel
 from tuner.objective.simulation import beginning_of, recorded_of
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.vehicle.model import Model
 
 DRAWS = 8
@@ -29,7 +29,7 @@ DRAWS = 8
 
 
 def oracle_error(
-    fitted: Fitted,
+    fitted: Fit,
     truth: Array,
     *,
     gusts: bool,
@@ -115,7 +115,7 @@ def simulate_like(
         weight = np.asarray(old.weight)
         noise = random.normal(size=weight.shape) / np.where(weight > 0.0, weight, np.inf)
         noisy = _rotate(clean, noise) if channel == "attitude" else clean + noise
-        measured[channel] = Measured(old.time, jnp.asarray(noisy), old.weight)
+        measured[channel] = MeasuredChannel(old.time, jnp.asarray(noisy), old.weight)
     segments = replace(objective.segments, measured=measured)
     return replace(objective, segments=segments)
 

@@ -37,7 +37,7 @@ from tuner.recordings.flight import Flight, Series  # noqa: E402
 from tuner.search.estimation import search  # noqa: E402
 from tuner.search.job_flights import read_recordings  # noqa: E402
 from tuner.search.problem import Job, job_of  # noqa: E402
-from tuner.search.progress import Fitted  # noqa: E402
+from tuner.search.progress import Fit  # noqa: E402
 from tuner.uncertainty.estimates import uncertainty_of  # noqa: E402
 from tuner.uncertainty.verdict import direction_in_words, verdict_in_words  # noqa: E402
 from tuner.vehicle import with_values  # noqa: E402 (jax is configured first)
@@ -63,7 +63,7 @@ def truth() -> dict[str, float]:
 
 def solved(
     settings: Settings, change: Callable[[Flight], Flight] = lambda flight: flight
-) -> tuple[Job, Fitted, float]:
+) -> tuple[Job, Fit, float]:
     """Return a job on changed recordings, its solution, and the s that the search took."""
     recordings = [replace(r, flight=change(r.flight)) for r in read_recordings(settings)[0]]
     job = job_of(settings, recordings)
@@ -73,7 +73,7 @@ def solved(
     return job, fitted, time.perf_counter() - began
 
 
-def worst(job: Job, fitted: Fitted) -> str:
+def worst(job: Job, fitted: Fit) -> str:
     """Return how far the coefficients are from the truth."""
     true, values = truth(), job.space.numbers(fitted.point.coefficients)
     off = {name: abs(float(value) / true[name] - 1.0) for name, value in values.items()}

@@ -33,7 +33,7 @@ from tuner.vehicle import VehicleFile
 if TYPE_CHECKING:
     from tuner.evaluate.closed_loop import Simulation
     from tuner.evaluate.records import RmseTable
-    from tuner.exporters.export import Exported
+    from tuner.exporters.export import ExportedFile
     from tuner.job.sensitivity import SensitivityResult
     from tuner.service.client import Client
 
@@ -248,7 +248,7 @@ def simulate(
 
 
 @taking(ExportOptions)
-def export(run: Run | Named, format: str, **options: Any) -> Exported:  # noqa: A002 (the option's name)
+def export(run: Run | Named, format: str, **options: Any) -> ExportedFile:  # noqa: A002 (the option's name)
     """Write a run's coefficients for a simulator, once they fly there as in it; ``tune export``.
 
     Parameters

@@ -16,7 +16,7 @@ from tuner.core.shipped import configs_folder
 from tuner.engine.engine import ClusterFile
 from tuner.ground.plan import BenchFile
 from tuner.result import RunResult
-from tuner.vehicle import COEFFICIENTS, Coefficient, ControllerFile, VehicleFile, Written
+from tuner.vehicle import COEFFICIENTS, Coefficient, ControllerFile, ExportTag, VehicleFile
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
@@ -144,4 +144,4 @@ def _cells(row: Coefficient) -> tuple[str, ...]:
 
 def _entry(row: Coefficient, target: str) -> str:
     entry = row.exported_as.get(target)
-    return f"`{entry.tag}`" if isinstance(entry, Written) else "–"
+    return f"`{entry.tag}`" if isinstance(entry, ExportTag) else "–"

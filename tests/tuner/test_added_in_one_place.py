@@ -33,7 +33,7 @@ from tuner.cli.tune import FLATTENED, MANY_WORDS
 from tuner.config import JobFile, resolve_settings
 from tuner.core import shipped
 from tuner.core.errors import ConfigError, ExportError
-from tuner.core.phrases import Worded
+from tuner.core.phrases import CodeWithText
 from tuner.core.yaml_section import build, section_of
 from tuner.evaluate.simulation_files import write_flights
 from tuner.exporters.simulators import THIS_PROJECT, registry_entries
@@ -47,8 +47,8 @@ from tuner.vehicle import (
     REGISTRY,
     Coefficient,
     ControllerFile,
-    NotCarried,
-    Written,
+    ExportTag,
+    NoExportTag,
     read_vehicle,
     values_of,
     with_values,
@@ -75,8 +75,8 @@ ROW = Coefficient(
     mass_exponent=1,
     neutral=0.0,
     exported_as={
-        "sdf": NotCarried("the motor plugins know no sail", 0.0),
-        "ini": Written("sail"),
+        "sdf": NoExportTag("the motor plugins know no sail", 0.0),
+        "ini": ExportTag("sail"),
     },
     informed_by="speed",
 )
@@ -155,7 +155,7 @@ def ini_target(monkeypatch):
         return Draft(text, vehicle, (), faults)
 
     def entry(row):
-        return registry_entries("ini")(row) or NotCarried("an ini file holds sails alone")
+        return registry_entries("ini")(row) or NoExportTag("an ini file holds sails alone")
 
     module = ModuleType("tuner.exporters.targets.ini")
     module.TARGET = Target("ini", ".ini", draft, replace(THIS_PROJECT, entry=entry))
@@ -253,7 +253,7 @@ def physical(run):
     return run.model_copy(update={"result": run.result.model_copy(update={"settings": settings})})
 
 
-class More(Worded):
+class More(CodeWithText):
     SAIL_TORN = ("sail_torn", "Its {first} tore after {seconds:.0f} s.", "Mend it.")  # seconds
 
 
@@ -262,7 +262,7 @@ def test_a_finding_is_one_entry_with_its_sentence_and_remedy():
     assert one_line(finding) == "warning: circle: Its main sail tore after 3 s. Mend it."
     assert shorten_finding(finding, 60).startswith("circle: Its main sail tore")
     with pytest.raises(TypeError):
-        Worded("SAIL", {"TORN": "torn"})  # no code without its sentence
+        CodeWithText("SAIL", {"TORN": "torn"})  # no code without its sentence
 
 
 class SwitchedMixer(Mixer):

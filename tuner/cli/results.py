@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tuner.config import Settings
     from tuner.evaluate.records import RmseTable
     from tuner.evaluate.simulation_files import Summary
-    from tuner.exporters.export import Exported
+    from tuner.exporters.export import ExportedFile
     from tuner.job.bench import BenchResult
     from tuner.job.sensitivity import SensitivityResult
     from tuner.recordings.inspection import Inspection, MissionReport
@@ -112,7 +112,7 @@ def print_flights(summaries: Sequence[Summary], path: Path) -> None:
     screen.print(f"written to {path}")
 
 
-def print_export(done: Exported) -> None:
+def print_export(done: ExportedFile) -> None:
     """Print the gates of an export, its notes, and its file."""
     screen = console()
     for gate in done.gates:

@@ -11,7 +11,7 @@ MIN_ERROR = 1e-9
 """Least error whose first digit is shown."""
 
 
-class Worded(StrEnum):
+class CodeWithText(StrEnum):
     """Codes, each with its text: what was noticed, and what to do about it."""
 
     text: Any

@@ -33,12 +33,12 @@ from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_at
 from tuner.objective.inlets import INLETS, STEADY_TORQUE
 from tuner.objective.normal_equations import Objective
-from tuner.objective.segments import Measured, Segments
-from tuner.objective.trajectory import Published, at_speed, published
+from tuner.objective.segments import MeasuredChannel, Segments
+from tuner.objective.trajectory import FlightReference, at_speed, published
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import JobFlight
 from tuner.search.problem import SPIN_CHANNELS, Job, job_of
-from tuner.search.progress import Fitted, plain_criterion
+from tuner.search.progress import Fit, plain_criterion
 from tuner.uncertainty.covariance import PRIOR_WIDENING
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.verdict import Verdict
@@ -166,7 +166,7 @@ def candidate_problem(
     )
 
 
-def _reference_inlet(references: Sequence[Published], recorded: Segments) -> ReferenceInlet:
+def _reference_inlet(references: Sequence[FlightReference], recorded: Segments) -> ReferenceInlet:
     """Return the references as lanes of one inlet, with their last points held."""
     assert isinstance(recorded.inlet, ReferenceInlet)
     inlets = [reference.inlet for reference in references]
@@ -201,8 +201,8 @@ def seconds_recorded(objective: Objective) -> Array:
 
 
 def _candidate_channel(
-    measured: Measured, *, silent: NDArray[np.bool_], seconds: float, recorded: Array
-) -> Measured:
+    measured: MeasuredChannel, *, silent: NDArray[np.bool_], seconds: float, recorded: Array
+) -> MeasuredChannel:
     """Return one channel of every candidate, with the best recorded rate and precision.
 
     Parameters
@@ -229,7 +229,9 @@ def _candidate_channel(
         values[:, 0] = 1.0  # an attitude
     constant = np.where(silent, 0.0, equivalent.max(axis=1)[:, None])
     weights = np.broadcast_to(constant, (rows, *constant.shape))
-    return Measured(time=np.asarray(time), values=np.asarray(values), weight=np.asarray(weights))
+    return MeasuredChannel(
+        time=np.asarray(time), values=np.asarray(values), weight=np.asarray(weights)
+    )
 
 
 def rank_next_flights(
@@ -356,7 +358,7 @@ INPUT_RATE_HZ = 250.0
 
 
 def signals_to_add(
-    fitted: Fitted, known: Array, inlets: Sequence[InletName], vehicle: VehicleFile
+    fitted: Fit, known: Array, inlets: Sequence[InletName], vehicle: VehicleFile
 ) -> list[LogProposal]:
     """Return proposals of signals that are not compared yet.
 
@@ -408,7 +410,7 @@ def residual_to_noise(criterion: Criterion) -> float:
     return float(np.median(np.concatenate([np.asarray(s) for s in criterion.scale.values()])))
 
 
-def _information(fitted: Fitted, signal: str, noise: float) -> Array:
+def _information(fitted: Fit, signal: str, noise: float) -> Array:
     """Return the information (K, K) of a signal at the fitted point, if it were logged."""
     objective, criterion = fitted.objective, fitted.criterion
     ends = seconds_recorded(objective)
@@ -418,7 +420,7 @@ def _information(fitted: Fitted, signal: str, noise: float) -> Array:
     )
     width = 3 if signal == "body_rate" else 4
     weight = np.repeat((time <= ends)[:, None] / noise, width, axis=1)
-    measured = Measured(
+    measured = MeasuredChannel(
         time=np.asarray(time), values=np.zeros(weight.shape), weight=np.asarray(weight)
     )
     alone: Objective = eqx.tree_at(lambda o: o.segments.measured, objective, {signal: measured})
@@ -429,7 +431,7 @@ def _information(fitted: Fitted, signal: str, noise: float) -> Array:
 
 
 def propose_logs(
-    job: Job, fitted: Fitted, known: NDArray[np.float64], vehicle: VehicleFile
+    job: Job, fitted: Fit, known: NDArray[np.float64], vehicle: VehicleFile
 ) -> tuple[LogProposal, ...]:
     """Return proposals that would narrow some interval, the most helpful first.
 
@@ -448,7 +450,7 @@ def propose_logs(
     return tuple(sorted(useful, key=lambda proposal: min(proposal.shrinks.values())))
 
 
-def _faster_inputs(job: Job, fitted: Fitted) -> list[LogProposal]:
+def _faster_inputs(job: Job, fitted: Fit) -> list[LogProposal]:
     """Return the proposal of the input at twice its rate, if all flights have the same inlet.
 
     Its gain is extrapolated from fits with every second and every fourth sample.
@@ -471,7 +473,7 @@ def _faster_inputs(job: Job, fitted: Fitted) -> list[LogProposal]:
     return [LogProposal(signal=signal, change="faster", rate=rate, shrinks=shrinks)]
 
 
-def _loss(fitted: Fitted, objective: Objective) -> float:
+def _loss(fitted: Fit, objective: Objective) -> float:
     sums = objective.sums(fitted.point, fitted.criterion, derivatives=False)
     return float(np.sum(np.asarray(sums.loss)))
 
@@ -484,7 +486,7 @@ def _thin(recording: JobFlight, signal: str, every: int) -> JobFlight:
     return replace(recording, flight=replace(flight, series={**flight.series, signal: some}))
 
 
-def _fed_inputs(job: Job, fitted: Fitted) -> list[LogProposal]:
+def _fed_inputs(job: Job, fitted: Fit) -> list[LogProposal]:
     """Return the proposal of commands as input, instead of the attitude.
 
     The logged commands represent faster ones, of similar torques.

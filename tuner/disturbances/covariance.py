@@ -27,7 +27,7 @@ ROW_BLOCK = 16
 """Numbers of a row that are summed in registers at a time."""
 
 
-class Sparse(NamedTuple):
+class SparseMatrix(NamedTuple):
     """A sparse matrix.
 
     Attributes
@@ -45,7 +45,7 @@ class Sparse(NamedTuple):
     values: Array
 
     @staticmethod
-    def of(push: Callable[[list[Array]], list[Array]], columns: int) -> Sparse:
+    def of(push: Callable[[list[Array]], list[Array]], columns: int) -> SparseMatrix:
         """Return the matrix of a linear map of ``columns`` numbers, given one by one, to vectors.
 
         A group of columns is evaluated at once: Curtis, Powell and Reid, "On the estimation of
@@ -68,7 +68,7 @@ class Sparse(NamedTuple):
             return jnp.concatenate(push([unit[number] for number in range(columns)]))
 
         values = lax.scan(lambda _, group: (None, pushed(group)), None, jnp.arange(len(taken)))[1]
-        return Sparse(rows, tuple(groups), values)
+        return SparseMatrix(rows, tuple(groups), values)
 
 
 class Samples(NamedTuple):
@@ -86,7 +86,7 @@ class Samples(NamedTuple):
 
     error: Array
     variance: Array
-    derivatives: Sparse
+    derivatives: SparseMatrix
     order: Callable[[Array], Array]
     used: Array
 

@@ -29,7 +29,7 @@ from sim_jax import terms
 from sim_jax.numeric import row_of
 from sim_jax.schedule import Schedule
 from sim_jax.state import State
-from tuner.disturbances.covariance import Samples, Sparse, at, innovations_of, propagated
+from tuner.disturbances.covariance import Samples, SparseMatrix, at, innovations_of, propagated
 from tuner.disturbances.disturbances import PROCESSES, SLOW
 from tuner.disturbances.observer import (
     AssumedModel,
@@ -108,7 +108,7 @@ class Gains(eqx.Module):
         return replace(self, **own)
 
 
-class Filtered(eqx.Module):
+class FilterResult(eqx.Module):
     """Result of a filter.
 
     Attributes
@@ -127,12 +127,12 @@ class Filtered(eqx.Module):
     loss: Float[AnyArray, "T F"]
     gains: Gains | None
 
-    def first(self, ticks: int, segments: slice = slice(None)) -> Filtered:
+    def first(self, ticks: int, segments: slice = slice(None)) -> FilterResult:
         """Return the same of some segments' first ticks, without gains."""
         white, root, loss = (
             np.asarray(rows[:ticks, ..., segments]) for rows in (self.white, self.root, self.loss)
         )
-        return Filtered(white, root, loss, None)
+        return FilterResult(white, root, loss, None)
 
 
 def _undelayed(schedule: Schedule) -> Schedule:
@@ -162,7 +162,7 @@ def filtered(
     gains: bool = True,
     latency: float = 0.0,
     few: bool = False,
-) -> Filtered:
+) -> FilterResult:
     """Return Kalman gains, innovations, and their likelihood.
 
     Parameters
@@ -183,7 +183,7 @@ def filtered(
     *rows, gain, factors, draught = run.values
     white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)
     kept = Gains(gain, factors, draught, schedule.physics_rate) if gains else None
-    return Filtered(white, root, loss, kept)
+    return FilterResult(white, root, loss, kept)
 
 
 def innovations(
@@ -219,7 +219,7 @@ def innovations(
     return np.moveaxis(run.values[0], 0, -1), run.columns and run.columns[1]
 
 
-class _Given(NamedTuple):
+class _FilterArguments(NamedTuple):
     """Input of a program.
 
     ``order`` (T, m + 1) are each tick's rows that are sampled in any segment, then their number.
@@ -231,19 +231,23 @@ class _Given(NamedTuple):
     gains: Gains | None
 
 
-def _given(inputs: FilterInput, assumed: AssumedModel, gains: Gains | None = None) -> _Given:
+def _given(
+    inputs: FilterInput, assumed: AssumedModel, gains: Gains | None = None
+) -> _FilterArguments:
     weights = [np.asarray(inputs.samples[name].weight) for name in inputs.widths]
     sampled = np.concatenate([(weight > 0).any(axis=-1) for weight in weights], axis=1)
     first = np.argsort(~sampled, axis=1, kind="stable")
     order = np.concatenate([first, np.count_nonzero(sampled, axis=1)[:, None]], axis=1)
     inputs = replace(inputs, segments=flown_part(inputs.segments))
-    given: _Given = jax.tree.map(np.asarray, _Given(inputs, assumed, order, gains))
+    given: _FilterArguments = jax.tree.map(
+        np.asarray, _FilterArguments(inputs, assumed, order, gains)
+    )
     return given
 
 
 def _run(
     static: tuple[Any, ...],
-    given: _Given,
+    given: _FilterArguments,
     wanted: Any,
     tangents: list[NDArray[np.float64]] | None = None,
     *,
@@ -259,7 +263,7 @@ def _run(
         return replace(Argument.of(leaf, lanes=True), shape=shape, apart=True)
 
     inputs, assumed, moves = given.inputs, given.assumed, tangents is not None
-    arguments = _Given(
+    arguments = _FilterArguments(
         FilterInput(
             segments=laid_out(inputs.segments),
             offsets=Argument.of(inputs.offsets, lanes=True, moves=moves),
@@ -291,7 +295,7 @@ def _run(
     return program(given, tangents, lanes=count, turns=ticks, wanted=wanted)
 
 
-def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Array]:
+def _sampled(given: _FilterArguments, tick: Array) -> tuple[Callable[[Array], Array], Array]:
     """Return the function from number to sampled row of a tick, and the count of rows."""
 
     def order(number: Array) -> Array:
@@ -300,8 +304,10 @@ def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Arra
     return order, order(jnp.asarray(given.order.shape[1] - 1))
 
 
-def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[str, int]) -> Any:
-    """Filter one segment: white, root and loss of `Filtered`, then the arrays of `Gains`."""
+def _filter(
+    schedule: Schedule, in_flight: int, given: _FilterArguments, lengths: Mapping[str, int]
+) -> Any:
+    """Filter one segment: white, root and loss of `FilterResult`, then the arrays of `Gains`."""
     observer, first = Observer.of(schedule, given.inputs, given.assumed)
     processes = observer.processes
     first_sd = jnp.asarray(first_errors(first, in_flight))
@@ -324,7 +330,10 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
         error, changes = jax.linearize(compare, [jnp.zeros(())] * shown)
         variance = jnp.where(observer.sampled(read), given.assumed.noise**2, 1.0)
         samples = Samples(
-            jnp.concatenate(error), variance, Sparse.of(changes, shown), *_sampled(given, number)
+            jnp.concatenate(error),
+            variance,
+            SparseMatrix.of(changes, shown),
+            *_sampled(given, number),
         )
         draught = jnp.sqrt(jnp.maximum(covariance[gust, gust], MIN_VARIANCE))
         update = innovations_of(covariance, gain, samples)
@@ -370,7 +379,7 @@ def _filter(schedule: Schedule, in_flight: int, given: _Given, lengths: Mapping[
 
 
 def _innovations(
-    schedule: Schedule, given: _Given, lengths: Mapping[str, int]
+    schedule: Schedule, given: _FilterArguments, lengths: Mapping[str, int]
 ) -> tuple[Array, Array]:
     """Return one segment's whitened innovations (ticks, m) with given gains.
 

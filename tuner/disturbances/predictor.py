@@ -33,7 +33,7 @@ from tuner.disturbances.disturbances import (
 from tuner.disturbances.extended_kalman_filter import (
     FEW_FLIGHTS,
     GATE,
-    Filtered,
+    FilterResult,
     filtered,
     innovations,
 )
@@ -109,7 +109,7 @@ class Predictor:
     noise: Mapping[str, float]
     computed: tuple[str, ...] = ()
     latency: float = 0.0
-    found: Filtered | None = None
+    found: FilterResult | None = None
 
     @staticmethod
     def of(
@@ -214,7 +214,7 @@ class Predictor:
 
     def _with_strengths(
         self, objective: Objective, point: Point, strengths: Array, ticks: int
-    ) -> Iterator[Filtered]:
+    ) -> Iterator[FilterResult]:
         """Yield the filter's results for the first ticks with each column of strengths (8, n).
 
         Filters run side by side as far as they fill a kernel's block of segments, those of one
@@ -308,7 +308,7 @@ class Predictor:
 
     def _filtered(
         self, inputs: FilterInput, assumed: AssumedModel, latency: float, *, gains: bool = True
-    ) -> Filtered:
+    ) -> FilterResult:
         few = self.inputs.offsets.shape[-1] <= FEW_FLIGHTS
         return filtered(self.schedule, inputs, assumed, gains=gains, latency=latency, few=few)
 
@@ -506,7 +506,7 @@ def _side_by_side(*parts: Array) -> Array:
     return np.moveaxis(np.concatenate([np.moveaxis(part, -1, 0) for part in parts]), 0, -1)
 
 
-def change_of_size(here: Filtered, there: Filtered, step: float) -> Array:
+def change_of_size(here: FilterResult, there: FilterResult, step: float) -> Array:
     """Return the derivative of the innovations' sizes by a step, as of `Slopes.sizes`."""
     return np.asarray(np.sqrt(0.5) * ((there.root / here.root) ** 2 - 1.0) / step)
 
@@ -516,7 +516,7 @@ def difference_steps(strengths: Array) -> Array:
     return np.where(strengths + STEP <= MAX_STRENGTHS, STEP, -STEP)
 
 
-def slopes_of(here: Filtered, beside: Iterable[Filtered], steps: Array) -> Slopes:
+def slopes_of(here: FilterResult, beside: Iterable[FilterResult], steps: Array) -> Slopes:
     """Return the derivatives of the likelihood by the strengths, by finite differences.
 
     Parameters

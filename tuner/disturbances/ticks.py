@@ -15,7 +15,7 @@ from sim_jax.inlet import BodyRateInlet
 from sim_jax.schedule import Schedule
 from tuner.core.numerics import Array
 from tuner.objective.criterion import AnyArray
-from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, repeat_counts
+from tuner.objective.segments import CLOCK_OF, CLOCKS, MeasuredChannel, repeat_counts
 from tuner.recordings.flight import Flight
 
 SETPOINTS = ("rate_setpoint", "thrust_setpoint")
@@ -45,7 +45,7 @@ class TickSamples(eqx.Module):
 
 
 def sampled(
-    channel: str, measured: Measured, late: Array, ticks: int, rate: float
+    channel: str, measured: MeasuredChannel, late: Array, ticks: int, rate: float
 ) -> tuple[TickSamples, NDArray[np.intp]]:
     """Assign a channel's samples to ticks.
 
@@ -88,7 +88,7 @@ def sampled(
     return TickSamples(*laid, place), rows
 
 
-def with_equal_weights(commands: Measured) -> Measured:
+def with_equal_weights(commands: MeasuredChannel) -> MeasuredChannel:
     """Return commands with equal weights, without the reduction for repeated values.
 
     Least squares takes equal values in a row for one reading (`repeat_counts`). A run's length

@@ -55,12 +55,12 @@ from tuner.engine.engine import (
 )
 
 
-class Stopped(Exception):  # noqa: N818 (no error: it was asked for)
+class StopRequested(Exception):  # noqa: N818 (no error: it was asked for)
     """Whoever asked for a task wants it no longer."""
 
 
 @dataclass(frozen=True)
-class SetUp(WorkerPlugin):  # type: ignore[misc]
+class WorkerSetup(WorkerPlugin):  # type: ignore[misc]
     """What a worker does before its first task; a plugin of Dask's.
 
     Attributes
@@ -126,7 +126,7 @@ def run_task(content: bytes, identity: str, topic: str) -> Any:
     def report(message: Any) -> None:
         # to ask a cluster that is ending would connect anew, and leave that open
         if worker.status in (Status.closing, Status.closed) or stop.is_set():
-            raise Stopped
+            raise StopRequested
         worker.log_event(topic, {"task": identity, "report": message})
 
     def log(name: str, level: int, line: str) -> None:
@@ -163,7 +163,7 @@ def _logging_to(send: Callable[[str, int, str], None]) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Shared:
+class StoredValue:
     """A value that lies in a store, by its content.
 
     Only this program's own processes write such values, and the digest comes with the task, over
@@ -187,7 +187,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-class OnDask(Engine):
+class DaskEngine(Engine):
     """Computes tasks in the workers of a Dask cluster."""
 
     def __init__(self, client: Client, at_once: int, store: ContentStore) -> None:
@@ -232,7 +232,7 @@ class OnDask(Engine):
 
     def share(self, value: T) -> Callable[[], T]:
         """Return what gives workers a value, through the store."""
-        return Shared(self._store.url, self._store.put(pickle.dumps(value, protocol=5)))
+        return StoredValue(self._store.url, self._store.put(pickle.dumps(value, protocol=5)))
 
     def _heard(self, event: tuple[float, Any]) -> None:
         _, message = event
@@ -293,10 +293,10 @@ def on_dask(file: ClusterFile) -> Iterator[Engine]:
             cluster = stack.enter_context(cluster_of(file))
             client = stack.enter_context(connected(cluster, file))
             client.register_plugin(
-                SetUp(tuple(pool) if local else (), cores=file.cores, gpus=file.gpus)
+                WorkerSetup(tuple(pool) if local else (), cores=file.cores, gpus=file.gpus)
             )
         at_once = file.workers if file.address is None else max(1, len(client.nthreads()))
-        yield OnDask(client, at_once, store)
+        yield DaskEngine(client, at_once, store)
 
 
 @contextlib.contextmanager

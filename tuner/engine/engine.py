@@ -114,7 +114,7 @@ class Engine(ABC):
                 future.cancel()
 
 
-class Here(Engine):
+class InProcessEngine(Engine):
     """Computes each task when it is submitted, in this process."""
 
     at_once = 1
@@ -131,7 +131,7 @@ class Here(Engine):
         return lambda: value
 
 
-HERE = Here()
+HERE = InProcessEngine()
 _CURRENT: ContextVar[Engine] = ContextVar("ENGINE", default=HERE)
 
 

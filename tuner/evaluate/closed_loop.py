@@ -39,7 +39,7 @@ from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.core.shipped import find_config
 from tuner.core.yaml_section import Number, Section, build
-from tuner.engine import Here, Report, current
+from tuner.engine import InProcessEngine, Report, current
 from tuner.objective.simulation import (
     BODY_ATTITUDE,
     CODE,
@@ -48,7 +48,7 @@ from tuner.objective.simulation import (
     TRUE_ROTOR_SPEED,
     recorded_of,
 )
-from tuner.objective.trajectory import Published, at_speed, published
+from tuner.objective.trajectory import FlightReference, at_speed, published
 from tuner.options import SimulationOptions
 from tuner.recordings.flight import Series
 from tuner.recordings.interpolation import resample
@@ -354,7 +354,7 @@ def simulate(
     flown = vehicle, controller, trajectory, duration, rate, precision, forces
     pieces = ((columns, *flown) for columns in _grid_pieces(grid or {}))
     engine = current()
-    here = isinstance(engine, Here)  # flights then need not be in memory all at once
+    here = isinstance(engine, InProcessEngine)  # flights then need not be in memory all at once
     for flights in starmap(_flights_in, pieces) if here else engine.stream(_fly_piece, pieces):
         yield from flights
 
@@ -483,7 +483,9 @@ def _fly_lane(
     return logged, last.crash_time
 
 
-def _reference_on(reference: Published, clock: Array, control_rate: float) -> dict[str, Array]:
+def _reference_on(
+    reference: FlightReference, clock: Array, control_rate: float
+) -> dict[str, Array]:
     """Return the reference in force at each instant of a clock."""
     tick = np.floor(clock * control_rate + 1e-9).astype(int)
     sent = {name: values[tick] for name, values in reference.signals.items()}

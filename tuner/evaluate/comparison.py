@@ -41,7 +41,13 @@ from tuner.objective.segments import (
     segments_of,
     window_segments,
 )
-from tuner.objective.simulation import BODY_ATTITUDE, MOTION, TRUE_ROTOR_SPEED, Flown, fly
+from tuner.objective.simulation import (
+    BODY_ATTITUDE,
+    MOTION,
+    TRUE_ROTOR_SPEED,
+    SimulatedChannels,
+    fly,
+)
 from tuner.objective.space import Space
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight
@@ -214,7 +220,7 @@ class Comparison:
         *,
         fitted_starts: bool = False,
         forces: bool = False,
-        flier: Callable[..., Flown] = fly,
+        flier: Callable[..., SimulatedChannels] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name to its errors with a vehicle, in the recordings' order.
 
@@ -308,7 +314,7 @@ class _Group:
         *,
         fitted_starts: bool = False,
         forces: bool = False,
-        flier: Callable[..., Flown] = fly,
+        flier: Callable[..., SimulatedChannels] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name -> its errors, concatenated over windows."""
         check_rotors(vehicle)
@@ -352,7 +358,7 @@ class _Group:
         segments: Segments,
         states: Array | None,
         forces: bool,
-        flier: Callable[..., Flown],
+        flier: Callable[..., SimulatedChannels],
     ) -> tuple[dict[str, Array], dict[str, Array] | None, Array]:
         """Return simulated signals, forces if asked for, and crash times (F,) in s.
 

@@ -26,7 +26,7 @@ from tuner.recordings.flight import Flight
 from tuner.search.job_flights import with_known
 from tuner.search.problem import Job
 from tuner.search.progress import (
-    Fitted,
+    Fit,
     conditions_of,
     controller_flown,
     offsets_of,
@@ -35,7 +35,7 @@ from tuner.search.progress import (
 from tuner.vehicle.controller import PositionControl
 
 
-def comparison_of(job: Job, fitted: Fitted) -> Comparison:
+def comparison_of(job: Job, fitted: Fit) -> Comparison:
     """Return the comparison of a job with the fitted controller, clocks and conditions."""
     recordings = with_known(
         job.recordings, time_offset=offsets_of(job, fitted), conditions=conditions_of(job, fitted)
@@ -78,7 +78,7 @@ class Validation:
     turning_explained: dict[str, float] = field(default_factory=dict)
 
 
-def validate(job: Job, fitted: Fitted) -> Validation:
+def validate(job: Job, fitted: Fit) -> Validation:
     """Fly every flight with the initial and with the fitted vehicle."""
     comparison, controller = comparison_of(job, fitted), controller_flown(job, fitted)
     vehicle = vehicle_fitted(job, fitted)

@@ -36,15 +36,15 @@ from tuner.search.job_flights import (
     with_known,
 )
 from tuner.search.problem import Job, job_of
-from tuner.search.progress import Fitted, Progress, plain_criterion
+from tuner.search.progress import Fit, Progress, plain_criterion
 from tuner.vehicle import (
     COEFFICIENTS,
     REGISTRY,
     Coefficient,
     ControllerFile,
-    NotCarried,
+    ExportTag,
+    NoExportTag,
     VehicleFile,
-    Written,
     read_vehicle,
     values_of,
     with_values,
@@ -169,7 +169,7 @@ def carried_terms(simulator: Simulator, vehicle: VehicleFile) -> tuple[str, ...]
     return tuple(
         name
         for name, value in vehicle.effects.items()
-        if isinstance(simulator.entry(COEFFICIENTS[name]), Written)
+        if isinstance(simulator.entry(COEFFICIENTS[name]), ExportTag)
         and value != COEFFICIENTS[name].neutral
     )
 
@@ -218,7 +218,7 @@ def fit_effective(
         left=MIN_TOLERANCE,
     )
 
-    def vehicle(fitted: Fitted) -> VehicleFile:
+    def vehicle(fitted: Fit) -> VehicleFile:
         values = space.numbers(fitted.point.coefficients)
         return simulator.flown(with_values(start, values))
 
@@ -246,7 +246,7 @@ def _bounds(run: Run, start: VehicleFile, free: Sequence[str]) -> dict[str, Coef
     }
 
 
-def _start_of_fit(run: Run, problem: Job, lost: Collection[str]) -> Fitted:
+def _start_of_fit(run: Run, problem: Job, lost: Collection[str]) -> Fit:
     """Return where a fit begins, with clocks, air and weights as the run ended with them."""
     objective = problem.objective
     offsets: Any = run.result.settings.get("offsets", {})
@@ -258,7 +258,7 @@ def _start_of_fit(run: Run, problem: Job, lost: Collection[str]) -> Fitted:
         [0.0 if name in lost else of_flight.get(name, 0.0) for of_flight in known]
         for name in objective.of_flight
     ]
-    return Fitted(
+    return Fit(
         objective=objective,
         point=Point(problem.space.initial, np.array(rows) / units_of(objective.of_flight)[:, None]),
         criterion=plain_criterion(objective, objective.samples),
@@ -284,7 +284,7 @@ def free_coefficients(run: Run, simulator: Simulator, bare: VehicleFile) -> list
     for name, row in COEFFICIENTS.items():
         found = run.result.coefficients.get(name)
         fitted = found is not None and found.fitted and found.verdict != "held"
-        has = name not in simulator.fixed and not isinstance(simulator.entry(row), NotCarried)
+        has = name not in simulator.fixed and not isinstance(simulator.entry(row), NoExportTag)
         moves = name in simulator.free or (fitted and has and not row.is_effect)
         if moves and row.scope == "vehicle" and values.get(name, 0.0) != 0.0:
             names.append(name)
@@ -452,7 +452,7 @@ def exported_numbers(effective: EffectiveResult, simulator: str) -> str:
 
 def lost_groups(
     effective: EffectiveResult,
-    entry: Callable[[Coefficient], Written | NotCarried | None],
+    entry: Callable[[Coefficient], ExportTag | NoExportTag | None],
     deviations: Sequence[str],
 ) -> tuple[str, ...]:
     """Return a clause on each missing group: the reason, and the RMSE without it.
@@ -467,7 +467,7 @@ def lost_groups(
                 f"the simulator computes otherwise: {'; '.join(deviations)}; that alone misses the "
                 f"flights by {rmse}"
             )
-        elif isinstance(held := entry(REGISTRY[term.names[0]]), NotCarried):
+        elif isinstance(held := entry(REGISTRY[term.names[0]]), NoExportTag):
             clauses.append(
                 f"{term.group} is not exported: {held.reason}; without it alone the flights are "
                 f"missed by {rmse}"

@@ -74,7 +74,7 @@ RUN_CONDITIONS = (
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportedFile:
     """An exported file.
 
     Attributes
@@ -97,7 +97,7 @@ def export(
     today: date,
     refly: Refly = refly,
     copies: Path | None = None,
-) -> Exported:
+) -> ExportedFile:
     """Write a run's coefficients in a format, if they pass the gates.
 
     Parameters
@@ -155,7 +155,7 @@ def export(
     if places[0].is_relative_to(run.folder):
         file = places[0].relative_to(run.folder).as_posix()
         _record(run.folder, ExportRecord(format=options.format, file=file, gates=gates))
-    return Exported(places[0], gates, notes)
+    return ExportedFile(places[0], gates, notes)
 
 
 def _refuse_overwrite(out: Path, read: Path) -> None:
@@ -170,7 +170,7 @@ def _record(folder: Path, made: ExportRecord) -> None:
     ExportRecords(exports={**known.exports, made.format: made}).write(folder)
 
 
-def export_vehicle(file: Path, options: ExportOptions, *, today: date) -> Exported:
+def export_vehicle(file: Path, options: ExportOptions, *, today: date) -> ExportedFile:
     """Write the coefficients of a vehicle file in a format, without a check by flights.
 
     Parameters
@@ -206,12 +206,12 @@ def export_vehicle(file: Path, options: ExportOptions, *, today: date) -> Export
     write(draft, *places)
     lacks = (f"{simulator.name} computes otherwise: {what}" for what in simulator.deviations)
     notes = (*sources, *draft.notes, *not_carried(vehicle, target), *lacks)
-    return Exported(places[0], gates, notes)
+    return ExportedFile(places[0], gates, notes)
 
 
 def export_draws(
     run: Run, options: ExportOptions, *, today: date, refly: Refly = refly
-) -> Exported:
+) -> ExportedFile:
     """Write draws of a run's joint posterior in a format, once the run itself may be exported.
 
     Parameters

@@ -27,7 +27,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.state import Limits, State
 from tuner.core.numerics import Array
 from tuner.objective.segments import Segments
-from tuner.objective.simulation import Flown, beginning_of, recorded_of
+from tuner.objective.simulation import SimulatedChannels, beginning_of, recorded_of
 from tuner.vehicle.model import Model
 
 
@@ -48,7 +48,7 @@ class ExternalBody(Protocol):
         """
 
 
-def flier_of(make: Callable[[float], ExternalBody]) -> Callable[..., Flown]:
+def flier_of(make: Callable[[float], ExternalBody]) -> Callable[..., SimulatedChannels]:
     """Return a function like `tuner.objective.simulation.fly` for an external simulator.
 
     Parameters
@@ -67,7 +67,7 @@ def flier_of(make: Callable[[float], ExternalBody]) -> Callable[..., Flown]:
         states: Any = None,
         conditions: Mapping[str, Any] = MappingProxyType({}),
         channels: tuple[str, ...],
-    ) -> Flown:
+    ) -> SimulatedChannels:
         start, inlet, environment = beginning_of(
             model, segments, schedule, states=states, conditions=conditions
         )
@@ -102,7 +102,7 @@ def flier_of(make: Callable[[float], ExternalBody]) -> Callable[..., Flown]:
 
         last, log = jax.jit(lambda: lax.scan(sample, state, jnp.arange(samples)))()
         flown = {name: np.asarray(rows).swapaxes(0, 1) for name, rows in log.items()}
-        return Flown(flown, dict.fromkeys(channels), np.asarray(last.crash_time))
+        return SimulatedChannels(flown, dict.fromkeys(channels), np.asarray(last.crash_time))
 
     return fly
 

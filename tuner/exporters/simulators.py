@@ -17,18 +17,18 @@ from tuner.vehicle import (
     COEFFICIENTS,
     REGISTRY,
     Coefficient,
-    NotCarried,
+    ExportTag,
+    NoExportTag,
     VehicleFile,
-    Written,
     values_of,
     with_values,
 )
 from tuner.vehicle.registry import NO_LOSS
 
-Entry = Written | NotCarried
+Entry = ExportTag | NoExportTag
 Law = Callable[[VehicleFile], VehicleFile]
 
-_SETUP_ENTRY = NotCarried("it belongs to the set-up, not to the vehicle")
+_SETUP_ENTRY = NoExportTag("it belongs to the set-up, not to the vehicle")
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Simulator:
     def built_in(self, name: str) -> float | None:
         """Return its built-in value of a coefficient; None if it has the coefficient."""
         entry = self.entry(REGISTRY[name])
-        return entry.built_in if isinstance(entry, NotCarried) else None
+        return entry.built_in if isinstance(entry, NoExportTag) else None
 
     def lost(self, acting: Mapping[str, float]) -> dict[str, tuple[str, ...]]:
         """Return group -> its coefficients whose built-in value differs from the given one."""
@@ -106,7 +106,7 @@ class Simulator:
 
 
 def registry_entries(
-    target: str, other: Mapping[str, NotCarried] = MappingProxyType({})
+    target: str, other: Mapping[str, NoExportTag] = MappingProxyType({})
 ) -> Callable[..., Entry | None]:
     """Return the `Simulator.entry` of a target in the registry, with exceptions."""
     return lambda row: other.get(row.name) or row.exported_as.get(target)
@@ -134,10 +134,10 @@ GZ_SIM = Simulator(
     entry=registry_entries(
         "sdf",
         {
-            "max_relative_airspeed": NotCarried(
+            "max_relative_airspeed": NoExportTag(
                 "thrust in gz-sim does not depend on the airspeed", NO_LOSS
             ),
-            "rolling_moment_coefficient": NotCarried(
+            "rolling_moment_coefficient": NoExportTag(
                 "gz-sim adds rolling moments up whichever way rotors turn, so that 0 is written",
                 0.0,
             ),
@@ -147,8 +147,8 @@ GZ_SIM = Simulator(
 )
 MOTORS = ("input_scaling", "zero_position_armed", "input_offset", "quadratic")
 _NOT_MODELLED = {
-    "rolling_moment_coefficient": NotCarried("it has no such term", 0.0),
-    "max_relative_airspeed": NotCarried("its thrust does not depend on the airspeed", NO_LOSS),
+    "rolling_moment_coefficient": NoExportTag("it has no such term", 0.0),
+    "max_relative_airspeed": NoExportTag("its thrust does not depend on the airspeed", NO_LOSS),
 }
 """Coefficients of Gazebo's motor model that the others lack, and why."""
 _BODY = ("mass", "inertia_xx", "inertia_yy", "inertia_zz")
@@ -166,12 +166,12 @@ def entries(title: str, *groups: tuple[str, ...], **keys: str) -> Callable[..., 
 
     def entry(row: Coefficient) -> Entry:
         if row.name in held:
-            return Written(held[row.name])
+            return ExportTag(held[row.name])
         if row.name in _NOT_MODELLED:
             return _NOT_MODELLED[row.name]
         if row.scope != "vehicle":
             return _SETUP_ENTRY
-        return NotCarried(f"{title} has no such term", row.neutral)
+        return NoExportTag(f"{title} has no such term", row.neutral)
 
     return entry
 
@@ -182,6 +182,6 @@ THIS_PROJECT = Simulator(
     version="",
     source="sim_jax",
     deviations=(),
-    entry=lambda row: Written(".".join(row.place)),
+    entry=lambda row: ExportTag(".".join(row.place)),
     laws=(),
 )

@@ -18,7 +18,7 @@ from tuner.core.errors import ConfigError, ExportError, did_you_mean
 from tuner.exporters import targets
 from tuner.exporters.simulators import THIS_PROJECT, Simulator
 from tuner.result import Gate
-from tuner.vehicle import COEFFICIENTS, Coefficient, NotCarried, VehicleFile, values_of
+from tuner.vehicle import COEFFICIENTS, Coefficient, NoExportTag, VehicleFile, values_of
 
 MAX_BYTES = 10_000_000
 #: Relative. Numbers are written with twelve digits; mass and inertia are sums over links.
@@ -278,7 +278,7 @@ def not_carried(vehicle: VehicleFile, target: Target) -> Iterator[str]:
     for name, value in values_of(vehicle).items():
         row = COEFFICIENTS[name]
         entry = target.simulator.entry(row)
-        if not isinstance(entry, NotCarried):
+        if not isinstance(entry, NoExportTag):
             continue
         same = (at for at in (row.neutral, entry.built_in) if at is not None)
         # a bound may differ in the last digits

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from tuner.core.phrases import Worded, as_sentence, listed, percent, shorten
+from tuner.core.phrases import CodeWithText, as_sentence, listed, percent, shorten
 from tuner.findings import sentences
 from tuner.vehicle.motor_orders import order_in_words
 
@@ -33,7 +33,7 @@ CLAUSE_END = re.compile(r"[;.] | \(|, (?=and|as|at|or|if)|: (?!false|true)(?=[a-
 """The end of a sentence's first clause; never before the value of a setting."""
 
 
-class Code(Worded):
+class Code(CodeWithText):
     """Codes of findings; the comment after each lists its numbers and names."""
 
     RECORDING = (

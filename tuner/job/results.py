@@ -47,7 +47,7 @@ from tuner.result import (
 from tuner.search.job_flights import JobFlight
 from tuner.search.problem import Job
 from tuner.search.progress import (
-    Fitted,
+    Fit,
     best_values,
     conditions_of,
     controller_flown,
@@ -55,7 +55,7 @@ from tuner.search.progress import (
     offsets_of,
     vehicle_fitted,
 )
-from tuner.terms.candidates import Selected
+from tuner.terms.candidates import SelectionResult
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.records import Sources
@@ -76,7 +76,7 @@ CONTROLLER_FILE = "controller.yaml"
 
 
 def run_result(
-    selected: Selected,
+    selected: SelectionResult,
     validation: Validation,
     uncertainty: Uncertainty | None,
     *,
@@ -130,7 +130,7 @@ def run_result(
 
 
 def settings_record(
-    settings: Settings, controller: ControllerFile, fitted: Fitted
+    settings: Settings, controller: ControllerFile, fitted: Fit
 ) -> dict[str, JsonValue]:
     """Return the files of a fit, their origin, and the weights of its residuals, for JSON."""
     return {
@@ -143,7 +143,7 @@ def settings_record(
     }
 
 
-def _loss_at_start(job: Job, fitted: Fitted) -> float:
+def _loss_at_start(job: Job, fitted: Fit) -> float:
     """Return the loss with the initial coefficients, as the fit's last stage counts it."""
     objective, criterion = fitted.objective, fitted.criterion
     start = objective.start(job.space.initial)
@@ -152,7 +152,7 @@ def _loss_at_start(job: Job, fitted: Fitted) -> float:
     return float(loss)
 
 
-def shifts_of_starts(fitted: Fitted) -> dict[str, JsonValue]:
+def shifts_of_starts(fitted: Fit) -> dict[str, JsonValue]:
     """Return the root mean square shifts of free initial states of windows and spins.
 
     State -> shift in its unit: the part of the data explained by initial states, not coefficients.
@@ -166,7 +166,7 @@ def shifts_of_starts(fitted: Fitted) -> dict[str, JsonValue]:
 
 
 def _coefficients(
-    job: Job, fitted: Fitted, uncertainty: Uncertainty | None
+    job: Job, fitted: Fit, uncertainty: Uncertainty | None
 ) -> dict[str, CoefficientResult]:
     best, judgements = best_values(job, fitted), _judgements(job, fitted, uncertainty)
     bounds = {
@@ -211,7 +211,7 @@ def _coefficients(
 
 
 def _judgements(
-    job: Job, fitted: Fitted, uncertainty: Uncertainty | None
+    job: Job, fitted: Fit, uncertainty: Uncertainty | None
 ) -> dict[str, tuple[Verdict, Reason]]:
     values = job.space.numbers(fitted.point.coefficients)
     judgements = dict.fromkeys(values, (Verdict.NOT_EXAMINED, NOT_EXAMINED))
@@ -257,7 +257,7 @@ def _regressed(
     )
 
 
-def _flight(job: Job, fitted: Fitted, recording: JobFlight, validation: Validation) -> FlightResult:
+def _flight(job: Job, fitted: Fit, recording: JobFlight, validation: Validation) -> FlightResult:
     flight, name = recording.flight, recording.flight.name
     met = validation.fitted_starts.get(name)
     horizon = None
@@ -284,7 +284,7 @@ def _flight(job: Job, fitted: Fitted, recording: JobFlight, validation: Validati
     )
 
 
-def _clock(job: Job, fitted: Fitted, recording: JobFlight) -> Literal["given", "fitted", "assumed"]:
+def _clock(job: Job, fitted: Fit, recording: JobFlight) -> Literal["given", "fitted", "assumed"]:
     """Return where a flight's clock offset comes from."""
     if recording.time_offset is not None:
         return "given"
@@ -295,7 +295,7 @@ def _clock(job: Job, fitted: Fitted, recording: JobFlight) -> Literal["given", "
 def write_folder(
     folder: Path,
     result: RunResult,
-    selected: Selected,
+    selected: SelectionResult,
     effective: VehicleFile | None = None,
 ) -> None:
     """Write the vehicles, ``controller.yaml``, ``metrics.csv``, and last ``result.json``.
@@ -350,7 +350,7 @@ ones; s. The publisher takes ten to wind up."""
 
 
 def write_next_flight(
-    folder: Path, job: Job, examination: Examination, fitted: Fitted, arena: Arena | None = None
+    folder: Path, job: Job, examination: Examination, fitted: Fit, arena: Arena | None = None
 ) -> Proposals | None:
     """Write the proposals of next flights into a result folder, and return them.
 

@@ -47,7 +47,7 @@ from tuner.search.job_flights import with_logged_parameters
 from tuner.search.listener import SILENT, Iteration, Listener, Reporter
 from tuner.search.problem import Job
 from tuner.search.progress import Progress, controller_flown, vehicle_fitted
-from tuner.terms.candidates import Selected
+from tuner.terms.candidates import SelectionResult
 from tuner.terms.refit_with_disturbances import refit_and_examine
 from tuner.terms.selection import search_with_terms
 from tuner.uncertainty.agreement import flights_disagree, ground_conflicts, sources_of
@@ -243,7 +243,7 @@ class _Run:
         best.keep(job, progress)
         self.reporter.listener.on_iteration(progress.iterations[-1], progress.left)
 
-    def validated(self, selected: Selected) -> Validation:
+    def validated(self, selected: SelectionResult) -> Validation:
         """Return the errors of all flights."""
         self.reporter.on_message(
             "Simulating each flight with the initial and the fitted coefficients."
@@ -253,7 +253,7 @@ class _Run:
 
     def written(
         self,
-        selected: Selected,
+        selected: SelectionResult,
         validation: Validation,
         examination: Examination | None = None,
         *,
@@ -276,7 +276,7 @@ class _Run:
             )
         return result
 
-    def sources(self, selected: Selected, examination: Examination) -> dict[str, Sources]:
+    def sources(self, selected: SelectionResult, examination: Examination) -> dict[str, Sources]:
         """Keep the findings of an examination; return coefficients by flights and by ground."""
         fitted, uncertainty = selected.fitted, examination.uncertainty
         self.reporter.add(
@@ -293,7 +293,7 @@ class _Run:
         self.reporter.add(ground_conflicts(sources, fitted.objective.space.fixed.get("mass")))
         return sources
 
-    def effective(self, physical: Run, selected: Selected) -> Effective | None:
+    def effective(self, physical: Run, selected: SelectionResult) -> Effective | None:
         """Return the effective coefficients in Gazebo, None where it has every term."""
         job = selected.job
         flown = replace(job.settings, controller=controller_flown(job, selected.fitted))
@@ -312,7 +312,7 @@ class _Run:
         for kind, outcome in export_formats_of_job(self.folder, formats, today=today):
             self.reporter.on_message(export_sentence(kind, outcome))
 
-    def with_refits(self, selected: Selected, result: RunResult) -> RunResult:
+    def with_refits(self, selected: SelectionResult, result: RunResult) -> RunResult:
         """Return the result with the standard errors of requested refits, and write it again."""
         job, fitted, listener = selected.job, selected.fitted, self.reporter.listener
         errors: dict[str, dict[str, float]] = {}

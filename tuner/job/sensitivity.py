@@ -27,7 +27,7 @@ from tuner.search.findings import UNMATCHED_RATIO, loop_findings
 from tuner.search.job_flights import read_recordings, with_logged_parameters
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import (
-    Fitted,
+    Fit,
     by_flight,
     initial_progress,
     loop_of,
@@ -43,7 +43,7 @@ from tuner.uncertainty.sensitivity import global_sensitivity
 from tuner.vehicle import check_names
 
 
-def unfitted(job: Job) -> Fitted:
+def unfitted(job: Job) -> Fit:
     """Return a job's start values as a fit, with the better of the loop's choices."""
     configured = loop_of(job.objective)
     loops = [configured, *map(configured.switched, job.undecided(job.objective))]
@@ -63,7 +63,7 @@ def unfitted(job: Job) -> Fitted:
     return replace(best, evaluations=len(tried), findings=findings)
 
 
-def _simulated(job: Job, objective: Objective) -> Fitted:
+def _simulated(job: Job, objective: Objective) -> Fit:
     """Return a problem at the job's vehicle as a fit, with noise scaled up to its residuals."""
     start = job.initial
     vector = job.space.vector_of(start)
@@ -72,7 +72,7 @@ def _simulated(job: Job, objective: Objective) -> Fitted:
     sums = sums_at(objective, points, unscaled, derivatives=False)
     residual = root_mean_squares(objective, sums)
     scale = misfit({name: of_starts[0] for name, of_starts in residual.items()})
-    return Fitted(
+    return Fit(
         objective=objective,
         point=objective.start(vector),
         criterion=plain_criterion(objective, objective.samples, scale),
@@ -161,7 +161,7 @@ def examine_vehicle(
 def _write_requested(
     options: ExaminationOptions,
     job: Job,
-    fitted: Fitted,
+    fitted: Fit,
     examination: Examination,
     *,
     folder: Path,

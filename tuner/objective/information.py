@@ -36,7 +36,7 @@ fit. Disturbances are in the recording, too, so that the right model leaves at m
 flights leave 2."""
 
 
-class Change(NamedTuple):
+class ResidualChange(NamedTuple):
     """The change of residuals of C channels and F segments in B stretches by another simulation.
 
     Attributes
@@ -116,7 +116,7 @@ class FisherInformation:
     scale: Array
     ground: Array | None = None
     lost: Array | None = None
-    changes: Mapping[str, Change] = field(default_factory=dict)
+    changes: Mapping[str, ResidualChange] = field(default_factory=dict)
     selection_shifts: Array | None = None
     diverged: NDArray[np.bool_] | None = None
     pull: Array | None = None
@@ -155,7 +155,9 @@ class FisherInformation:
 
         along_segments = partial(np.concatenate, axis=1)
         changes = {
-            name: Change(*map(along_segments, zip(*(p.changes[name] for p in parts), strict=True)))
+            name: ResidualChange(
+                *map(along_segments, zip(*(p.changes[name] for p in parts), strict=True))
+            )
             for name in first.changes
         }
         return replace(
@@ -193,7 +195,7 @@ class FisherInformation:
             },
         )
 
-    def with_change(self, change: Change) -> FisherInformation:
+    def with_change(self, change: ResidualChange) -> FisherInformation:
         """Return the same with the size of a change as the last of K + 1 coefficients.
 
         It is 0 in this simulation and 1 with the change; it has no prior.
@@ -498,7 +500,7 @@ def _nuisance_directions(
 
 def _change(
     information: Array, score: Array, number: int, along: Array, movable: NDArray[np.bool_]
-) -> Change:
+) -> ResidualChange:
     """Return a change of the residuals, one of the columns, with nuisances at best.
 
     ``movable`` (F, N) says which of a segment's nuisances move.
@@ -512,7 +514,7 @@ def _change(
         square = whole[segment][np.ix_(there, there)] + np.eye(len(there)) / OFFSET_SD**2
         follow[segment, there] = -np.linalg.solve(square, right[segment, there])
     beside = across + np.einsum("clbpq,lq->clbp", information[..., :size, :size], follow)
-    return Change(
+    return ResidualChange(
         np.einsum("lap,clbp->clba", along, beside),
         information[..., number, number] + np.einsum("clbp,lp->clb", beside + across, follow),
         score + np.einsum("clbp,lp->clb", own, follow),

@@ -43,7 +43,7 @@ from tuner.objective.criterion import (
 from tuner.objective.initial_conditions import eliminate_states
 from tuner.objective.residuals import Block, Reading, gauss_newton, huber_loss, residuals
 from tuner.objective.segments import OFFSETS, Segments
-from tuner.objective.simulation import EFFECTS, Flown, flight_program, fly
+from tuner.objective.simulation import EFFECTS, SimulatedChannels, flight_program, fly
 from tuner.objective.space import Space
 from tuner.vehicle.model import Model, with_coefficients
 
@@ -127,7 +127,7 @@ class Objective(eqx.Module):
 
     def fly(
         self, point: Point, criterion: Criterion, moving: Mapping[str, int] = MappingProxyType({})
-    ) -> Flown:
+    ) -> SimulatedChannels:
         """Fly the segments up to the criterion's horizon.
 
         Parameters

@@ -16,7 +16,7 @@ from sim_jax.numeric import Array as JaxArray
 from tuner.core.numerics import Array, huber_weights
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Segments
-from tuner.objective.simulation import CODE, Flown
+from tuner.objective.simulation import CODE, SimulatedChannels
 
 RAMP_SHARE = 0.25
 """Share of the time between two jumps of a zero-order hold that the ramp to the next takes."""
@@ -89,7 +89,7 @@ class Reading:
 
 
 def residuals(
-    flown: Flown, segments: Segments, name: str, reading: Reading
+    flown: SimulatedChannels, segments: Segments, name: str, reading: Reading
 ) -> Iterator[Callable[[], Block]]:
     """Yield functions that return one channel's residuals up to the horizon, of some stamps each.
 

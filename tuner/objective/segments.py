@@ -144,7 +144,7 @@ POSE = ("position", "attitude")
 OFFSETS = tuple(recording_offsets())
 
 
-class Measured(eqx.Module):
+class MeasuredChannel(eqx.Module):
     """One channel of every segment, padded to one length.
 
     Attributes
@@ -171,7 +171,7 @@ class Segments(eqx.Module):
 
     inlet: Inlet
     start: Start
-    measured: dict[str, Measured]
+    measured: dict[str, MeasuredChannel]
     flight: Int[Array, " F"]
     """Number of the flight that a segment belongs to."""
     turning: Float[Array, "4 F"] | None = None
@@ -374,7 +374,7 @@ def _measured(
     channel: str,
     sigma: float,
     weights: Mapping[str, Mapping[str, float]],
-) -> Measured:
+) -> MeasuredChannel:
     """Return a channel of all flights, padded with zeros, or with a level attitude."""
     width = 4 if channel in ("attitude", "rotor_speed", "command") else 3
     first = 1 if channel == "attitude" else 0
@@ -394,4 +394,4 @@ def _measured(
         time[:length, number] = series.time
         values[:length, :, number] = np.where(finite, series.values, 0.0)
         weight[:length, :, number] = scale[:, first:]
-    return Measured(time, values, weight)
+    return MeasuredChannel(time, values, weight)

@@ -66,7 +66,7 @@ CODE = ("sim_jax", "tuner")
 """Packages whose code is run while a program of this one is traced."""
 
 
-class Flown(NamedTuple):
+class SimulatedChannels(NamedTuple):
     """Simulated channels at ``schedule.log_rate``; the pose is the markers'.
 
     Attributes
@@ -85,7 +85,7 @@ class Flown(NamedTuple):
     crash_time: Array
 
 
-class _Given(NamedTuple):
+class _FlightArguments(NamedTuple):
     """Input of a program: a model and one segment."""
 
     model: Model
@@ -108,7 +108,7 @@ def fly(
     tangents: Mapping[str, Array] | None = None,
     channels: tuple[str, ...] | None = None,
     differentiated: bool = False,
-) -> Flown:
+) -> SimulatedChannels:
     """Fly segments.
 
     Parameters
@@ -155,7 +155,7 @@ def fly(
     )
     found, crash_time = run.values
     still: dict[str, Array | None] = dict.fromkeys(names)
-    return Flown(
+    return SimulatedChannels(
         {name: found[name] for name in names},
         still if run.columns is None else run.columns[0],
         crash_time,
@@ -191,24 +191,26 @@ def _prepared(
     conditions: Mapping[str, Any] = MappingProxyType({}),
     channels: tuple[str, ...] | None = None,
     moves: bool,
-) -> tuple[_Given, Program, tuple[str, ...]]:
+) -> tuple[_FlightArguments, Program, tuple[str, ...]]:
     """Return the input of a program, the program, and the channels that it logs."""
     several = any(np.ndim(value) for value in coefficients.values())
-    how = _How(schedule, limits, tuple(coefficients), tuple(conditions), channels, several, moves)
-    key = id(model), id(segments), how
-    fixed = _FIXED.get(key)
+    structure = _ProgramStructure(
+        schedule, limits, tuple(coefficients), tuple(conditions), channels, several, moves
+    )
+    key = id(model), id(segments), structure
+    fixed = _PREPARED.get(key)
     if fixed is None or fixed.owner is not model:
-        fixed = _Fixed.of(model, segments, how)
-        if len(_FIXED) >= MAX_FIXED:
-            _FIXED.clear()
-        _FIXED[key] = fixed
-        weakref.finalize(segments, _FIXED.pop, key, None).atexit = False
+        fixed = _PreparedProgram.of(model, segments, structure)
+        if len(_PREPARED) >= MAX_PREPARED:
+            _PREPARED.clear()
+        _PREPARED[key] = fixed
+        weakref.finalize(segments, _PREPARED.pop, key, None).atexit = False
     given = fixed.given
     values = {
         name: np.asarray(coefficients.get(name, value), float)
         for name, value in given.coefficients.items()
     }
-    if how.own:
+    if structure.own:
         values = {name: np.broadcast_to(v, (segments.count,)) for name, v in values.items()}
     given = given._replace(coefficients=values, conditions={**given.conditions, **conditions})
     if states is not None and given.states is not None:
@@ -216,8 +218,8 @@ def _prepared(
     return given, fixed.program, fixed.logged
 
 
-class _How(NamedTuple):
-    """What a program is made for besides a model and segments, as `_prepared` is given it.
+class _ProgramStructure(NamedTuple):
+    """What a program depends on besides a model and segments.
 
     ``several`` is whether segments have coefficients of their own.
     """
@@ -236,7 +238,7 @@ class _How(NamedTuple):
         return self.several or not self.moves
 
 
-class _Fixed(NamedTuple):
+class _PreparedProgram(NamedTuple):
     """A program, and of its input what is the same at every point.
 
     Attributes
@@ -246,19 +248,20 @@ class _Fixed(NamedTuple):
     """
 
     owner: Model
-    given: _Given
+    given: _FlightArguments
     program: Program
     logged: tuple[str, ...]
 
     @staticmethod
-    def of(model: Model, segments: Segments, how: _How) -> _Fixed:
+    def of(model: Model, segments: Segments, structure: _ProgramStructure) -> _PreparedProgram:
         """Lay out a program for a model and segments."""
         owner, still = model, np.zeros(segments.count)
-        calm = dict.fromkeys(how.conditions, still)
-        if how.conditions or {*model.vehicle.effects, *how.coefficients}.intersection(EFFECTS):
+        calm = dict.fromkeys(structure.conditions, still)
+        free = {*model.vehicle.effects, *structure.coefficients}
+        if structure.conditions or free.intersection(EFFECTS):
             model, segments = _with_all_terms(model, segments)
             calm = dict.fromkeys(("wind_x", "wind_y", "battery_decline"), still) | calm
-            if not how.moves and segments.disturbance is None:
+            if not structure.moves and segments.disturbance is None:
                 zero = Vec3(*np.zeros((3, 1, segments.count)))
                 segments = replace(
                     segments, disturbance=Disturbance(moment=zero, rate=TORQUE_RATE_HZ)
@@ -266,16 +269,16 @@ class _Fixed(NamedTuple):
         else:  # nothing reads the voltage: recordings with and without it share a program
             model = replace(model, reference_voltage=None)
             segments = replace(segments, log_voltage=None)
-        names = tuple(segments.measured) if how.channels is None else how.channels
+        names = tuple(segments.measured) if structure.channels is None else structure.channels
         # in one order, for it tells programs apart
         logged = tuple(sorted({*LOGGED, *names}))
         none = np.zeros((len(segments.free_rows), segments.count))
         if segments.start_sd is None and segments.free_rows:
             # as if they were free: one program serves both
             segments = replace(segments, start_sd=none)
-        shape = (segments.count,) if how.own else ()
-        values = dict.fromkeys(how.coefficients, np.zeros(())) | coefficients_in(model)
-        given = _Given(
+        shape = (segments.count,) if structure.own else ()
+        values = dict.fromkeys(structure.coefficients, np.zeros(())) | coefficients_in(model)
+        given = _FlightArguments(
             model=jax.tree.map(np.asarray, model),
             coefficients={
                 name: np.broadcast_to(np.asarray(value, float), shape)
@@ -285,22 +288,22 @@ class _Fixed(NamedTuple):
             states=None if segments.start_sd is None else none,
             conditions=calm,
         )
-        arguments = _arguments(given, own_coefficients=how.own, moves=how.moves)
-        static = (how.schedule, how.limits, logged)
+        arguments = _arguments(given, own_coefficients=structure.own, moves=structure.moves)
+        static = (structure.schedule, structure.limits, logged)
         program = program_of(
             _flight,
             arguments,
             *static,
             name="flight of a segment",
-            made_of=(static, how.moves, terms.TERMS),
+            made_of=(static, structure.moves, terms.TERMS),
             packages=CODE,
         )
-        return _Fixed(owner, given, program, logged)
+        return _PreparedProgram(owner, given, program, logged)
 
 
-MAX_FIXED = 16
+MAX_PREPARED = 16
 """Most layouts that are kept: a stage of a fit takes turns with two."""
-_FIXED: dict[tuple[Any, ...], _Fixed] = {}
+_PREPARED: dict[tuple[Any, ...], _PreparedProgram] = {}
 """What was laid out for segments that are still there: a fit asks for the same at every point."""
 
 
@@ -322,10 +325,10 @@ def flown_part(segments: Segments) -> Segments:
     return flown
 
 
-def _arguments(given: _Given, *, own_coefficients: bool, moves: bool) -> _Given:
+def _arguments(given: _FlightArguments, *, own_coefficients: bool, moves: bool) -> _FlightArguments:
     """Return the layout of each leaf: segments along the last axis, except for shared ones."""
     each = partial(Argument.of, lanes=True, moves=moves)
-    return _Given(
+    return _FlightArguments(
         model=jax.tree.map(partial(Argument.of, lanes=False), given.model),
         coefficients=jax.tree.map(
             partial(Argument.of, lanes=own_coefficients, moves=moves), given.coefficients
@@ -371,7 +374,7 @@ def _tables(inlet: Inlet) -> Inlet:
     return tables
 
 
-def _directions(given: _Given, tangents: Mapping[str, Array]) -> list[Array]:
+def _directions(given: _FlightArguments, tangents: Mapping[str, Array]) -> list[Array]:
     """Return the tangents of all differentiated leaves, in their order."""
     count = len(next(iter(tangents.values())))
     still = np.zeros(count)
@@ -385,7 +388,7 @@ def _flight(
     schedule: Schedule,
     limits: Limits,
     channels: tuple[str, ...],
-    given: _Given,
+    given: _FlightArguments,
     lengths: Mapping[str, int],
 ) -> tuple[dict[str, Any], Any]:
     """Fly one segment: channel -> (samples, c), and the time of a crash."""

@@ -25,7 +25,7 @@ from tuner.recordings.flight import Flight
 
 
 @dataclass(frozen=True)
-class Published:
+class FlightReference:
     """A reference over a whole flight.
 
     Attributes
@@ -56,7 +56,9 @@ class Published:
         return {n: np.column_stack([v.x, v.y, v.z]).astype(float) for n, v in parts.items()}
 
 
-def published(settings: TrajectorySettings, *, duration: float, control_rate: float) -> Published:
+def published(
+    settings: TrajectorySettings, *, duration: float, control_rate: float
+) -> FlightReference:
     """Return the reference of a trajectory from rest.
 
     Parameters
@@ -79,7 +81,7 @@ def published(settings: TrajectorySettings, *, duration: float, control_rate: fl
     rows = seen.astype(int)
     seen_axes = [axis[0, rows] for axis in axes]
     points = ReferencePoint(*(Vec3(*seen_axes[first : first + 3]) for first in (0, 3, 6)))
-    return Published(
+    return FlightReference(
         ReferenceInlet(
             points,
             spins=np.asarray(shape.spins),

@@ -102,11 +102,11 @@ MAX_CLOCK_DIFFERENCE = 0.05
 MIN_SATURATED_RUN, MIN_SATURATED = 3, 12
 """Samples in a row, and in all, at the limit of a gyro that saturates."""
 
-Flown = Mapping[str, Array]
+FlownSignals = Mapping[str, Array]
 """Signal -> (n, k) on one clock; NaN where unknown."""
 
 
-def _turning(flown: Flown) -> tuple[Array, Array]:
+def _turning(flown: FlownSignals) -> tuple[Array, Array]:
     """Return the change of the attitude over two steps, and the rate's mean over both.
 
     By Simpson's rule: rotors at their limits may shake a vehicle at 15 Hz.
@@ -116,7 +116,7 @@ def _turning(flown: Flown) -> tuple[Array, Array]:
     return smooth(body_rate_of(flown["attitude"]), 0.1), smooth(rate, 0.1)
 
 
-def _specific_force(flown: Flown) -> Array:
+def _specific_force(flown: FlownSignals) -> Array:
     """Return the motion's specific force in world axes, (n, 3) m/s^2."""
     push = smooth(derivative(smooth(derivative(smooth(flown["position"], 0.2)), 0.2)), 0.2)
     return np.asarray(push + np.array([0.0, 0.0, GRAVITY]))
@@ -126,12 +126,12 @@ def _smooth_thrice(force: Array) -> Array:
     return smooth(smooth(smooth(force, 0.2), 0.2), 0.2)
 
 
-def _body_forces(flown: Flown) -> tuple[Array, Array]:
+def _body_forces(flown: FlownSignals) -> tuple[Array, Array]:
     own = rotate(flown["attitude"] * INVERSE, _specific_force(flown))
     return own, _smooth_thrice(flown["acceleration"])
 
 
-def _world_forces(flown: Flown) -> tuple[Array, Array]:
+def _world_forces(flown: FlownSignals) -> tuple[Array, Array]:
     felt = rotate(flown["attitude"], flown["acceleration"])
     return _specific_force(flown), _smooth_thrice(felt)
 
@@ -161,7 +161,7 @@ class SignalPair:
     """
 
     other: str
-    compared: Sequence[Callable[[Flown], tuple[Array, Array]]]
+    compared: Sequence[Callable[[FlownSignals], tuple[Array, Array]]]
     min_motion: float
     min_size: float = 0.0
     max_share: float = np.inf
@@ -279,7 +279,7 @@ def _saturation(gyro: Series, topic: str) -> list[Note]:
     return [NoteCode.GYRO_SATURATED.note(topic=topic, count=count, limit=limit)]
 
 
-def _judge(signal: str, flown: Flown) -> tuple[SignalReading | None, Sequence[Note]]:
+def _judge(signal: str, flown: FlownSignals) -> tuple[SignalReading | None, Sequence[Note]]:
     """Return the right reading of a signal of `PAIRS`, or a doubt."""
     pair = PAIRS[signal]
     change, recorded = pair.compared[-1](flown)
@@ -330,7 +330,7 @@ def _residual_share(change: Array, recorded: Array) -> float:
     return rms(change - recorded) / size if size > 0.0 else np.inf
 
 
-def _judge_attitude(_: str, flown: Flown) -> tuple[SignalReading | None, Sequence[Note]]:
+def _judge_attitude(_: str, flown: FlownSignals) -> tuple[SignalReading | None, Sequence[Note]]:
     """Return the right reading of the attitude, or a doubt on it or on the felt weight."""
     q, pull = flown["attitude"], _specific_force(flown)
     push = pull - np.array([0.0, 0.0, GRAVITY])
@@ -392,7 +392,7 @@ def _score(fit: float, upright: float) -> float:
     return fit + min(upright, 1.0)
 
 
-def _single_axis_doubts(signal: str, flown: Flown) -> list[Note]:
+def _single_axis_doubts(signal: str, flown: FlownSignals) -> list[Note]:
     """Return doubts on single axes of a signal of `PAIRS`, or on the direction of all."""
     pair, doubts = PAIRS[signal], list[Note]()
     for compared in pair.compared:
@@ -461,7 +461,7 @@ def _angle_of(rotation: Array) -> float:
     return float(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0)))
 
 
-def _heading_of_markers(flown: Flown) -> float:
+def _heading_of_markers(flown: FlownSignals) -> float:
     """Return by how much, in rad, the attitude's body axes are turned left of the gyro's about z.
 
     0 where that is little or uncertain, or the axis is another. Near a multiple of 90 degrees it is

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from tuner.core.phrases import Worded, listed
+from tuner.core.phrases import CodeWithText, listed
 
 Kind = Literal["info", "warning"]
 
 
-class NoteCode(Worded):
+class NoteCode(CodeWithText):
     """Codes of notes; a comment lists the names of each.
 
     A text has the note's count and numbers in braces; ``first`` and ``second`` for one of its
@@ -251,7 +251,7 @@ class Note:
     names: tuple[str, ...] = ()
 
 
-class Cause(Worded):
+class Cause(CodeWithText):
     """Causes of damage.
 
     A text has the damage's ``subject`` in braces, its occurrences as ``chunks`` or ``times``, and

@@ -30,7 +30,7 @@ from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles
 
 if TYPE_CHECKING:
     from tuner.evaluate.comparison import FlightErrors
-    from tuner.search.progress import Fitted
+    from tuner.search.progress import Fit
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class About(ResultFile):
     flights: list[ExaminedFlight]
 
 
-def write_search(folder: Path, fitted: Fitted) -> None:
+def write_search(folder: Path, fitted: Fit) -> None:
     """Write ``search.json`` of a finished search."""
     iterations, starts = list(fitted.iterations), list(fitted.outcomes)
     SearchRecord(iterations=iterations, starts=starts).write(folder)

@@ -20,9 +20,9 @@ from tuner.report.section import (
     RECORDED,
     Bars,
     Chart,
-    Heat,
+    HeatMap,
     Line,
-    Look,
+    LineStyle,
     Panel,
     rounded,
 )
@@ -55,9 +55,16 @@ def flight_figure(flight: Simulation, title: str) -> Chart:
         for n, axis in enumerate("xyz")
     ]
     speed = np.linalg.norm(signals["velocity"], axis=1)
-    panels.append(Panel([Line("speed", time, rounded(speed, 4), Look(PALETTE[2]))], "speed [m/s]"))
+    panels.append(
+        Panel([Line("speed", time, rounded(speed, 4), LineStyle(PALETTE[2]))], "speed [m/s]")
+    )
     rotors = [
-        Line(f"rotor {n + 1}", time, rounded(column, 2), Look(PALETTE[n % len(PALETTE)], width=1.0))
+        Line(
+            f"rotor {n + 1}",
+            time,
+            rounded(column, 2),
+            LineStyle(PALETTE[n % len(PALETTE)], width=1.0),
+        )
         for n, column in enumerate(signals["rotor_speed"].T)
     ]
     panels.append(Panel(rotors, y_title="rotors [rad/s]"))
@@ -66,7 +73,7 @@ def flight_figure(flight: Simulation, title: str) -> Chart:
 
 def comparison_figure(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Chart:
     """Return the position error over time of each vehicle, a panel a flight."""
-    looks = [Look(colour) for colour in PALETTE] + [Look(GREY, dash="dash")]
+    looks = [LineStyle(colour) for colour in PALETTE] + [LineStyle(GREY, dash="dash")]
     flights = list(dict.fromkeys(name for errors in flown.values() for name in errors))[
         :MAX_COLUMNS
     ]
@@ -207,7 +214,7 @@ def _draw(panel: Panel, place: Axes) -> None:
         else:
             _heat(mark, place)
     place.set_ylabel(panel.y_title)
-    if not any(isinstance(mark, Heat) for mark in panel.marks):  # whose ticks it would take away
+    if not any(isinstance(mark, HeatMap) for mark in panel.marks):  # whose ticks it would take away
         tabular = any(isinstance(mark, Bars) for mark in panel.marks)
         if panel.y_scale == "log" and not tabular and place.dataLim.y1 > 0:
             place.set_yscale("log")
@@ -258,7 +265,7 @@ def _bars(bars: Bars, place: Axes, left: Any) -> Any:
     return left + values
 
 
-def _heat(heat: Heat, place: Axes) -> None:
+def _heat(heat: HeatMap, place: Axes) -> None:
     values = np.array([[np.nan if v is None else v for v in row] for row in heat.values])
     look = {"cmap": "RdBu_r", "vmin": -1.0, "vmax": 1.0} if heat.diverging else {"cmap": "cividis"}
     image = place.imshow(values, aspect="auto", **look)

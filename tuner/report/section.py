@@ -113,7 +113,7 @@ Dash = Literal["solid", "dot", "dash"]
 
 
 @dataclass(frozen=True)
-class Look:
+class LineStyle:
     """The style of a line; colour alone never distinguishes two."""
 
     colour: str
@@ -122,9 +122,9 @@ class Look:
     marks: bool = False
 
 
-RECORDED = Look(GREY, width=4.0)
-INITIAL = Look(PALETTE[1], dash="dot")
-FITTED = Look(PALETTE[0])
+RECORDED = LineStyle(GREY, width=4.0)
+INITIAL = LineStyle(PALETTE[1], dash="dot")
+FITTED = LineStyle(PALETTE[0])
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Line:
     name: str
     x: Sequence[float | None]
     y: Sequence[float | None]
-    look: Look
+    look: LineStyle
     joined: bool = True
     text: Sequence[str] = ()
 
@@ -151,7 +151,7 @@ class Bars:
 
 
 @dataclass(frozen=True)
-class Heat:
+class HeatMap:
     """A table of colours.
 
     Attributes
@@ -184,7 +184,7 @@ class Heat:
 class Panel:
     """One pair of axes."""
 
-    marks: Sequence[Line | Bars | Heat]
+    marks: Sequence[Line | Bars | HeatMap]
     y_title: str = ""
     y_scale: Scale = "linear"
     x_scale: Scale = "linear"
@@ -228,7 +228,7 @@ class Chart:
         return any(sum(map(_size, panel.marks)) > 1 for panel in self.panels)
 
 
-def _size(mark: Line | Bars | Heat) -> int:
+def _size(mark: Line | Bars | HeatMap) -> int:
     if isinstance(mark, Line):
         return sum(value is not None for value in mark.y)
     return len(mark.labels) if isinstance(mark, Bars) else len(mark.rows) * len(mark.columns)

@@ -33,7 +33,7 @@ from tuner.search.listener import Iteration, Outcome
 from tuner.search.optimisers import MIN_DAMPING
 from tuner.search.problem import Job
 from tuner.search.progress import (
-    Fitted,
+    Fit,
     Loop,
     Progress,
     by_flight,
@@ -172,7 +172,7 @@ def search(
     on_progress: OnProgress,
     findings: tuple[Finding, ...] = (),
     provisional: bool = False,
-) -> Fitted:
+) -> Fit:
     """Search for the best coefficients of a job.
 
     With the method ``auto``, ``hybrid`` follows least squares where its end is doubtful.
@@ -221,7 +221,7 @@ def search(
     )
 
 
-def _doubt(job: Job, fitted: Fitted) -> Finding | None:
+def _doubt(job: Job, fitted: Fit) -> Finding | None:
     """Return the finding that the end of least squares is doubtful, if it is."""
     losses = np.array([np.inf if end.loss is None else end.loss for end in fitted.outcomes])
     if len(losses) > 2 and (losses < (1.0 + SAME_MINIMUM_TOLERANCE) * losses.min()).sum() < 2:
@@ -241,7 +241,7 @@ def _is_far_off(progress: Progress) -> bool:
     return bool(np.median(worst) > FAR_OFF_RATIO)
 
 
-def _misfit(fitted: Fitted) -> float:
+def _misfit(fitted: Fit) -> float:
     """Return the mean logarithm of residuals over noise, of all channels of all flights."""
     return float(np.mean([np.log(s) for scale in fitted.scales.values() for s in scale.values()]))
 
@@ -255,7 +255,7 @@ def _attempt(
     on_progress: OnProgress,
     findings: tuple[Finding, ...],
     provisional: bool,
-) -> Fitted:
+) -> Fit:
     """Run one method from the starts, or from its checkpoint."""
     key, starts = fingerprint(job), starting_vectors(job)
     stages = stages_of(job, job.objective, method)
@@ -301,7 +301,7 @@ def _attempt(
     seconds = time.perf_counter() - began
     save(checkpoint, key, progress, seconds)
     ends = zip(starts, progress.points.coefficients, progress.losses, strict=True)
-    fitted = Fitted(
+    fitted = Fit(
         **_end(job, job.objective, stages[-1], progress),
         noise=job.noise,
         outcomes=tuple(
@@ -321,7 +321,7 @@ def _attempt(
 
 
 def _end(job: Job, objective: Objective, stage: Stage, progress: Progress) -> dict[str, Any]:
-    """Return the fields of a `Fitted` at the end of a search's last stage."""
+    """Return the fields of a `Fit` at the end of a search's last stage."""
     best = int(np.argmin(progress.losses))
     point = picked(progress.points, best)
     return {
@@ -394,7 +394,7 @@ def starting_vectors(job: Job) -> Array:
 
 def polished(
     job: Job,
-    fitted: Fitted,
+    fitted: Fit,
     *,
     free: Point,
     title: str,
@@ -402,7 +402,7 @@ def polished(
     stages: slice = BOTH_POLISHES,
     left: float | None = None,
     start: Array | None = None,
-) -> Fitted:
+) -> Fit:
     """Return a fit searched again, by some stages from its point or from a start vector.
 
     A search from a start forgets the bias by missing terms, such as a coefficient at its bound; the

@@ -11,7 +11,7 @@ from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.problem import Job
-from tuner.search.progress import COLOURED_RATIO, Fitted, Loop, loop_of
+from tuner.search.progress import COLOURED_RATIO, Fit, Loop, loop_of
 from tuner.vehicle import VehicleFile
 
 UNMATCHED_RATIO = 10.0
@@ -65,7 +65,7 @@ END_CODES = UNMATCHED_CODES | frozenset(
 """Codes of findings that hold for one end of a search, and not for the next."""
 
 
-def with_end_findings(job: Job, fitted: Fitted) -> Fitted:
+def with_end_findings(job: Job, fitted: Fit) -> Fit:
     """Return a fit with the findings at its end instead of those of the fits before it."""
     findings = [finding for finding in fitted.findings if finding.code not in END_CODES]
     findings += loop_findings(job, loop_of(fitted.objective), "warning")

@@ -265,7 +265,7 @@ def plain_criterion(
 
 
 @dataclass(frozen=True)
-class Fitted:
+class Fit:
     """A search's result.
 
     Attributes
@@ -330,7 +330,7 @@ class Fitted:
         return max(max(scale.values()) for scale in self.scales.values()) < COLOURED_RATIO
 
 
-def controller_flown(job: Job, fitted: Fitted) -> ControllerFile:
+def controller_flown(job: Job, fitted: Fit) -> ControllerFile:
     """Return the controller file with the choices of the loop that the search ended with."""
     controller, loop = job.settings.controller, loop_of(fitted.objective)
     return controller.replace(
@@ -339,12 +339,12 @@ def controller_flown(job: Job, fitted: Fitted) -> ControllerFile:
     )
 
 
-def vehicle_fitted(job: Job, fitted: Fitted) -> VehicleFile:
+def vehicle_fitted(job: Job, fitted: Fit) -> VehicleFile:
     """Return the vehicle with the best coefficients, see `best_values`."""
     return with_values(job.settings.vehicle, best_values(job, fitted))
 
 
-def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
+def best_values(job: Job, fitted: Fit) -> dict[str, float]:
     """Return each free coefficient's reported value: fitted, or initial if it is held."""
     initial, values = job.initial, job.space.numbers(fitted.point.coefficients)
     tied = (p.ratios for p in job.space.parameters if p.name in fitted.held.values())
@@ -352,7 +352,7 @@ def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
     return {name: initial[name] if name in held else v for name, v in values.items()}
 
 
-def point_estimates(job: Job, fitted: Fitted) -> tuple[PointEstimate, ...]:
+def point_estimates(job: Job, fitted: Fit) -> tuple[PointEstimate, ...]:
     """Return each free coefficient's initial and reported value."""
     initial = job.initial
     return tuple(
@@ -363,7 +363,7 @@ def point_estimates(job: Job, fitted: Fitted) -> tuple[PointEstimate, ...]:
     )
 
 
-def impossible_inertia(job: Job, fitted: Fitted) -> tuple[str, ...]:
+def impossible_inertia(job: Job, fitted: Fit) -> tuple[str, ...]:
     """Return the fitted moments of inertia if no rigid body can have them."""
     fit, initial = job.space.numbers(fitted.point.coefficients), job.initial
     inertia = [name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia"]
@@ -373,7 +373,7 @@ def impossible_inertia(job: Job, fitted: Fitted) -> tuple[str, ...]:
     return tuple(name for name in inertia if name in fit)
 
 
-def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
+def offsets_of(job: Job, fitted: Fit) -> dict[str, float]:
     """Return flight -> s by which its pose stamps are late.
 
     Those of fitted flights were estimated; held-out ones get their median, without spins, which
@@ -389,7 +389,7 @@ def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
     }
 
 
-def conditions_of(job: Job, fitted: Fitted) -> dict[str, dict[str, float]]:
+def conditions_of(job: Job, fitted: Fit) -> dict[str, dict[str, float]]:
     """Return flight -> name -> its condition (wind, battery).
 
     Those of fitted flights were estimated; held-out ones get their mean.

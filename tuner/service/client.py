@@ -477,7 +477,7 @@ Marks = tuple[int, int]
 """bytes, and ns of the last change"""
 
 
-class Submitted(ResultFile):
+class SubmissionRecord(ResultFile):
     """Submitted recordings of a folder: name -> its marks and its job."""
 
     FILE = ".tune-submitted.json"
@@ -534,7 +534,7 @@ def watch(
 
 def _new_recordings(folder: Path) -> dict[Path, Marks]:
     """Return the recordings that were not submitted as they are now."""
-    before = Submitted.read_if_any(folder) or Submitted()
+    before = SubmissionRecord.read_if_any(folder) or SubmissionRecord()
     found = {}
     try:
         paths = sorted(folder.iterdir())
@@ -572,7 +572,7 @@ def _submit(
             new = {other: marks for other, marks in new.items() if other != path}
     key = hashlib.sha256(repr([(str(path.absolute()), *new[path]) for path in new]).encode())
     job = client.submit(FitOptions([str(path) for path in new]), key=key.hexdigest())
-    before = Submitted.read_if_any(folder) or Submitted()
+    before = SubmissionRecord.read_if_any(folder) or SubmissionRecord()
     done = {path.name: (*marks, job if path in new else "") for path, marks in arrived.items()}
-    Submitted(recordings=before.recordings | done).write(folder)
+    SubmissionRecord(recordings=before.recordings | done).write(folder)
     return f"{', '.join(path.name for path in new)}: job {job}"

@@ -14,7 +14,7 @@ from tuner.objective.inlets import bypassed_by
 from tuner.objective.normal_equations import Objective, with_conditions
 from tuner.objective.space import Space, extended
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, loop_of, with_loop
+from tuner.search.progress import Fit, loop_of, with_loop
 from tuner.terms.score import ACCEPTED
 from tuner.vehicle import COEFFICIENTS, condition_rows, term_groups, values_of
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
@@ -120,8 +120,8 @@ def with_terms(
 
 
 def with_free(
-    job: Job, fitted: Fitted, names: Sequence[str], *, conditions_added: Sequence[str] = ()
-) -> tuple[Job, Fitted]:
+    job: Job, fitted: Fit, names: Sequence[str], *, conditions_added: Sequence[str] = ()
+) -> tuple[Job, Fit]:
     """Return job and fit with more coefficients and conditions free, at neutral values."""
     objective, point = with_terms(fitted.objective, fitted.point, names, job.settings.job)
     objective, point = with_conditions(objective, point, conditions_added)
@@ -138,12 +138,12 @@ def with_free(
 
 
 def with_groups(
-    base: tuple[Job, Fitted],
+    base: tuple[Job, Fit],
     groups: Groups,
-    fitted: Fitted,
+    fitted: Fit,
     *,
     vector: Mapping[str, float] | None = None,
-) -> tuple[Job, Fitted]:
+) -> tuple[Job, Fit]:
     """Return a base job with some groups added, and its fit at the values of another fit.
 
     Parameters
@@ -172,7 +172,7 @@ def with_groups(
     return job, moved
 
 
-def offsets_for(fitted: Fitted, objective: Objective, *, reset: Collection[str] = ()) -> Array:
+def offsets_for(fitted: Fit, objective: Objective, *, reset: Collection[str] = ()) -> Array:
     """Return a fit's offsets as rows of another problem of the same flights; some reset to zero."""
     rows = np.asarray(fitted.point.offsets)
     by_name = dict(zip(fitted.objective.of_flight, rows, strict=True))
@@ -182,7 +182,7 @@ def offsets_for(fitted: Fitted, objective: Objective, *, reset: Collection[str] 
 
 
 @dataclass(frozen=True)
-class Selected:
+class SelectionResult:
     """A job and its fit with the terms that were kept, and the table of all that were tried.
 
     Attributes
@@ -200,10 +200,10 @@ class Selected:
     """
 
     job: Job
-    fitted: Fitted
+    fitted: Fit
     rows: tuple[SelectionRow, ...] = ()
     selection_shifts: Mapping[str, float] = field(default_factory=dict)
-    base: tuple[Job, Fitted] | None = None
+    base: tuple[Job, Fit] | None = None
     refuted: bool = False
     substitutes: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 

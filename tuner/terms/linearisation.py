@@ -27,7 +27,7 @@ from tuner.objective.normal_equations import Objective, flight_batch, flight_bat
 from tuner.objective.residuals import huber_loss
 from tuner.objective.space import Space
 from tuner.search.continuation import RIDGE
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.uncertainty.covariance import Stretches
 from tuner.vehicle import COEFFICIENTS, REGISTRY
 from tuner.vehicle.coefficient import Parameter
@@ -235,7 +235,7 @@ class LinearisedFit:
         The loss about the fit, by the base model's coefficients and all candidates.
     """
 
-    fitted: Fitted
+    fitted: Fit
     added: Groups
     linear: LinearisedLoss
 
@@ -454,7 +454,7 @@ MAX_STEP_PRIOR_SD = 1.0
 
 
 def predicted_losses(
-    fitted: Fitted, linear: LinearisedLoss, model: Columns, own: Columns, scale: Mapping[str, Array]
+    fitted: Fit, linear: LinearisedLoss, model: Columns, own: Columns, scale: Mapping[str, Array]
 ) -> Array:
     """Return the loss (N,) of each flight with the coefficients of a fit to the others.
 
@@ -507,7 +507,7 @@ def vector_after(space: Space, vector: Array, change: Array) -> Array:
     return space.vector_at(scaled)
 
 
-def offsets_fitted(fitted: Fitted) -> NDArray[np.bool_]:
+def offsets_fitted(fitted: Fit) -> NDArray[np.bool_]:
     """Return which offsets (offsets, N) a fit moved: those that are not exactly zero."""
     return np.asarray(np.asarray(fitted.point.offsets) != 0.0)
 

@@ -23,9 +23,9 @@ from tuner.search.estimation import LAST_POLISH, ROUGH_TOLERANCE, free_parameter
 from tuner.search.findings import UNMATCHED_CODES, outlying_flights, unmatched_findings
 from tuner.search.listener import Reporter
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.terms.candidates import (
-    Selected,
+    SelectionResult,
     is_lumped,
     names_of,
     prior_presence_of,
@@ -68,8 +68,8 @@ ROUGH_STEPS = 2
 
 
 def refit_and_examine(
-    selected: Selected, reporter: Reporter
-) -> tuple[Selected, Examination | None]:
+    selected: SelectionResult, reporter: Reporter
+) -> tuple[SelectionResult, Examination | None]:
     """Return the fit with estimated disturbances, or with undetermined coefficients held.
 
     And its examination; None where that failed. Innovations may change the terms. Disturbances are
@@ -93,14 +93,14 @@ def refit_and_examine(
     hold = partial(
         hold_undetermined, selected.job, selected.fitted, reporter, selection_shifts=shifts
     )
-    unexamined: tuple[Fitted, Examination | None] = selected.fitted, None
+    unexamined: tuple[Fit, Examination | None] = selected.fitted, None
     fitted, examination = reporter.attempt("examination", hold, unexamined)
     return replace(selected, fitted=fitted), examination
 
 
 def with_disturbances(
-    selected: Selected, reporter: Reporter
-) -> tuple[Selected, Examination] | None:
+    selected: SelectionResult, reporter: Reporter
+) -> tuple[SelectionResult, Examination] | None:
     """Return the fit in which disturbances are estimated too, and its examination.
 
     None where the job does not ask for it, the residuals are at the noise level, set-points were
@@ -214,11 +214,11 @@ def _without_contradicted_lag(
 
 def _with_lag_terms(
     seen: LinearisedInnovations,
-    there: Fitted,
+    there: Fit,
     predictor: Predictor,
     on_message: Callable[[str], None],
     among: Collection[str] | None = None,
-) -> tuple[LinearisedInnovations, Fitted, Predictor]:
+) -> tuple[LinearisedInnovations, Fit, Predictor]:
     """Return the fit with lag terms, if innovations are likelier with them and call for them.
 
     Of all groups of lags, or of some. The fit without a lag has made up for it with other lags and
@@ -255,8 +255,8 @@ def _with_lag_terms(
 
 
 def _fit_innovations(
-    selected: Selected, fitted: Fitted, predictor: Predictor, *, steps: int = MAX_STEPS
-) -> tuple[Fitted, Predictor]:
+    selected: SelectionResult, fitted: Fit, predictor: Predictor, *, steps: int = MAX_STEPS
+) -> tuple[Fit, Predictor]:
     """Return the maximum-likelihood fit to innovations, started at a fit, and its predictor.
 
     The filter starts from its own strengths and clocks.
@@ -300,7 +300,7 @@ def _common_estimates(new: Uncertainty, old: Uncertainty) -> list[tuple[Estimate
     return [(new.estimates[name], old.estimates[name]) for name in old.estimates if name in both]
 
 
-def _changed_terms(before: Selected, after: Selected) -> str:
+def _changed_terms(before: SelectionResult, after: SelectionResult) -> str:
     """Return the message that names the terms that innovations add and remove."""
     changes = [row for row in after.rows if row not in before.rows]
     groups = [row.group for row in changes if row.kept]
@@ -311,9 +311,7 @@ def _changed_terms(before: Selected, after: Selected) -> str:
     return f"Samples are predicted better so: fitting again {' and '.join(changed)}."
 
 
-def _findings_with_disturbances(
-    job: Job, fitted: Fitted, predictor: Predictor
-) -> tuple[Finding, ...]:
+def _findings_with_disturbances(job: Job, fitted: Fit, predictor: Predictor) -> tuple[Finding, ...]:
     """Return a fit's findings, with the strengths of the disturbances.
 
     Flights that are matched with their disturbances are not reported as unmatched.
@@ -364,16 +362,16 @@ class LinearisedInnovations:
         The loss of the innovations about ``vector``.
     """
 
-    selected: Selected
-    fitted: Fitted
+    selected: SelectionResult
+    fitted: Fit
     space: Space
     vector: Array
     linear: LinearisedLoss
 
     @staticmethod
     def of(
-        selected: Selected,
-        fitted: Fitted,
+        selected: SelectionResult,
+        fitted: Fit,
         predictor: Predictor,
         model_errors: ModelErrors | None = None,
     ) -> LinearisedInnovations:
@@ -408,7 +406,7 @@ class LinearisedInnovations:
             return self
         return LinearisedInnovations.of(self.selected, self.fitted, predictor, model_errors)
 
-    def with_doubts(self) -> Selected:
+    def with_doubts(self) -> SelectionResult:
         """Return the terms with the shifts by omitted ones, and with those that may act instead.
 
         The shifts of coefficients that set-points hide are those of least squares.
@@ -447,7 +445,7 @@ class LinearisedInnovations:
         apart = evidence.value - value / self.linear.prior_sd[column]
         return bool(np.any(apart**2 > CONTRADICTION_SE**2 * evidence.variance))
 
-    def selection(self, had: Collection[str], *, first: bool = False) -> Selected | None:
+    def selection(self, had: Collection[str], *, first: bool = False) -> SelectionResult | None:
         """Return the terms that innovations select and their fit, one linear step on.
 
         Backward elimination starts from all terms but lumped ones, and those already in the fit.
@@ -509,7 +507,7 @@ class LinearisedInnovations:
         )
         return tuple(kept)
 
-    def with_lag_terms(self, among: Collection[str] | None = None) -> Selected | None:
+    def with_lag_terms(self, among: Collection[str] | None = None) -> SelectionResult | None:
         """Return the terms with lags added, of all or of some groups.
 
         No linear approximation tests them; it only shows which are worth a fit. None if none is.
@@ -540,8 +538,8 @@ class LinearisedInnovations:
         )
 
     def _with(
-        self, base: tuple[Job, Fitted], judged: Groups, kept: Collection[str], moved: Array
-    ) -> Selected:
+        self, base: tuple[Job, Fit], judged: Groups, kept: Collection[str], moved: Array
+    ) -> SelectionResult:
         """Return the selection with ``kept`` of the tested groups, at a vector (P,)."""
         rows = [
             _row_after(row, kept=row.group in kept) if row.group in judged else row
@@ -586,7 +584,7 @@ class LinearisedInnovations:
         return hidden_by_setpoints(names, self.fitted.objective.model)
 
 
-def groups_left_out(selected: Selected) -> Groups:
+def groups_left_out(selected: SelectionResult) -> Groups:
     """Return the groups left out but per-flight conditions: a filter estimates steady wind too."""
     return {names[0]: names for names in selected.left_out if not {*condition_rows()} & {*names}}
 

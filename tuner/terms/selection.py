@@ -41,9 +41,9 @@ from tuner.search.estimation import (
 )
 from tuner.search.listener import Reporter
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, Progress, loop_of, point_estimates, with_loop
+from tuner.search.progress import Fit, Progress, loop_of, point_estimates, with_loop
 from tuner.terms.candidates import (
-    Selected,
+    SelectionResult,
     candidate_groups,
     coefficient_names,
     condition_groups,
@@ -91,11 +91,11 @@ class Selection:
     """
 
     job: Job
-    fitted: Fitted
+    fitted: Fit
     candidates: Groups
     reporter: Reporter
 
-    def run(self) -> Selected:
+    def run(self) -> SelectionResult:
         """Add groups until no other is accepted."""
         state = self.linearised(self.fitted, {})
         dropped: dict[str, SelectionCode] = {}
@@ -116,7 +116,7 @@ class Selection:
                 break
             state = grown
         base, rows = (self.job, self.fitted), self._rows(state, dropped)
-        selected = Selected(*base, rows, base=base)
+        selected = SelectionResult(*base, rows, base=base)
         selected = self._with_doubts(state, selected)
         if state.added:
             fitted = self._fitted(state, state.added, roughly=False)
@@ -124,7 +124,7 @@ class Selection:
             selected = replace(selected, job=job, fitted=fitted)
         return selected
 
-    def _with_doubts(self, state: LinearisedFit, selected: Selected) -> Selected:
+    def _with_doubts(self, state: LinearisedFit, selected: SelectionResult) -> SelectionResult:
         """Return the terms with the shifts by omitted ones, and with those that may act instead."""
         names = [*self.job.space.names, *names_of(state.added)]
         linear, model = state.linear, state.linear.columns_of(names)
@@ -236,7 +236,7 @@ class Selection:
 
     def _fitted(
         self, state: LinearisedFit, groups: Groups, *, anew: bool = False, roughly: bool = True
-    ) -> Fitted:
+    ) -> Fit:
         """Return the fit with exactly these groups, from the last fit's end or from the start."""
         wanted, around = coefficient_names(groups), condition_names(self.candidates)
         idle = tuple(name for name in around if name not in condition_names(groups))
@@ -277,7 +277,7 @@ class Selection:
             start=start,
         )
 
-    def linearised(self, fitted: Fitted, added: Groups) -> LinearisedFit:
+    def linearised(self, fitted: Fit, added: Groups) -> LinearisedFit:
         """Return a fit linearised by all candidates."""
         objective, vector = self._problem(fitted, coefficient_names(self.candidates))
         at = Point(vector, offsets_for(fitted, objective))
@@ -291,7 +291,7 @@ class Selection:
         )
         return LinearisedFit(fitted, added, linear)
 
-    def _problem(self, fitted: Fitted, names: Sequence[str]) -> tuple[Objective, Array]:
+    def _problem(self, fitted: Fit, names: Sequence[str]) -> tuple[Objective, Array]:
         """Return the base problem with some coefficients free, and a fit's values in it (K,).
 
         The model has all candidate terms and conditions, at their neutral values.
@@ -465,7 +465,7 @@ def search_with_terms(
     resume: bool,
     reporter: Reporter,
     findings: tuple[Finding, ...] = (),
-) -> Selected:
+) -> SelectionResult:
     """Look for the best coefficients of a job, and for the terms that its flights call for.
 
     Where most flights are far off, terms are tried before the base model is polished, and before
@@ -474,7 +474,7 @@ def search_with_terms(
     the search stopped early, findings about gains from recorded commands as doubts.
     """
 
-    def searched(*, resume: bool, provisional: bool) -> Selected:
+    def searched(*, resume: bool, provisional: bool) -> SelectionResult:
         with span("search"):
             fitted = search(
                 job,
@@ -487,7 +487,7 @@ def search_with_terms(
         if fitted.polished:
             reporter.listener.on_estimates(point_estimates(job, fitted))
         if _is_refuted(fitted, leaves_flights):
-            return Selected(job, fitted, refuted=True)
+            return SelectionResult(job, fitted, refuted=True)
         if not fitted.polished:
             for finding in gains_far_off(fitted, job.fitted):
                 reporter.listener.on_doubt(finding)
@@ -501,13 +501,13 @@ def search_with_terms(
     return searched(resume=True, provisional=False)
 
 
-def _is_refuted(fitted: Fitted, by: Callable[[Objective, Point, Criterion], bool]) -> bool:
+def _is_refuted(fitted: Fit, by: Callable[[Objective, Point, Criterion], bool]) -> bool:
     if fitted.residuals_at_noise_level:
         return False
     return by(fitted.objective, fitted.point, fitted.criterion)
 
 
-def with_terms_selected(job: Job, fitted: Fitted, reporter: Reporter) -> Selected:
+def with_terms_selected(job: Job, fitted: Fit, reporter: Reporter) -> SelectionResult:
     """Return the fit with the terms that the job names, or that the flights select.
 
     A job with a ``free`` list selects none, unless ``terms`` names some.
@@ -515,7 +515,7 @@ def with_terms_selected(job: Job, fitted: Fitted, reporter: Reporter) -> Selecte
     clock, candidates = time.perf_counter(), candidates_of(job)
     selection = Selection(job, fitted, candidates, reporter)
     if not isinstance(job.settings.job.terms, str):
-        selected = Selected(job, fitted, selection.rows_of_named())
+        selected = SelectionResult(job, fitted, selection.rows_of_named())
     elif candidates:
         selected = selection.run()
         if refuted := refuted_by_commands(selected):
@@ -526,12 +526,12 @@ def with_terms_selected(job: Job, fitted: Fitted, reporter: Reporter) -> Selecte
             selected = replace(without, rows=(*without.rows, *gone))
     else:
         rows = () if job.accelerations is None else job.accelerations.rows
-        selected = Selected(job, fitted, rows)
+        selected = SelectionResult(job, fitted, rows)
     spent = time.perf_counter() - clock
     return replace(selected, fitted=replace(selected.fitted, wall_time=fitted.wall_time + spent))
 
 
-def refuted_by_commands(selected: Selected) -> tuple[str, ...]:
+def refuted_by_commands(selected: SelectionResult) -> tuple[str, ...]:
     """Return the groups of fitted gains that recorded commands refute.
 
     In a closed-loop simulation wrong gains may make up for model errors; the regression of recorded
@@ -549,7 +549,7 @@ def refuted_by_commands(selected: Selected) -> tuple[str, ...]:
     return tuple(group for group, names in kept.items() if any(map(matches_file, names)))
 
 
-def with_refuted(selected: Selected, groups: Collection[str]) -> Selected:
+def with_refuted(selected: SelectionResult, groups: Collection[str]) -> SelectionResult:
     """Return a selection with some groups marked as refuted by recorded commands."""
     refuted = {"kept": False, "reason": SelectionCode.REFUTED}
     rows = (row.model_copy(update=refuted if row.group in groups else {}) for row in selected.rows)

@@ -18,8 +18,8 @@ from scipy.special import ndtri  # scipy.stats takes a quarter of a second to im
 from tuner.core.numerics import Array, scaled_inverse, unit_diagonal
 from tuner.disturbances.predictor import hidden_by_setpoints
 from tuner.findings.findings import Code, Finding
-from tuner.objective.information import Change, FisherInformation
-from tuner.search.progress import Fitted
+from tuner.objective.information import FisherInformation, ResidualChange
+from tuner.search.progress import Fit
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.estimates import READINGS, STUDENT_FACTOR, Uncertainty
 from tuner.uncertainty.examination import Examination
@@ -53,7 +53,7 @@ class Split(NamedTuple):
         return self.difference / float(np.hypot(self.error, self.read))
 
 
-def flights_disagree(fitted: Fitted, examination: Examination) -> tuple[Finding, ...]:
+def flights_disagree(fitted: Fit, examination: Examination) -> tuple[Finding, ...]:
     """Return the finding on the most significant split of flights, if one is significant.
 
     There is none where a flight already is reported as unmatched, or with gains of its own, and,
@@ -128,10 +128,10 @@ def _with_two_values(information: FisherInformation, split: Split) -> FisherInfo
     inside = np.isin(information.flight, split.flights)[:, None]
     across = np.where(inside[..., None], information.blocks[..., split.number], 0.0)
     score = np.where(inside, information.score[..., split.number], 0.0)
-    return information.with_change(Change(across, across[..., split.number], score))
+    return information.with_change(ResidualChange(across, across[..., split.number], score))
 
 
-def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[str, Sources]:
+def sources_of(fitted: Fit, uncertainty: Uncertainty, total: Array) -> dict[str, Sources]:
     """Return each measured coefficient's value on the ground, from flights alone, and from both.
 
     It is empty for a fit without ground measurements.

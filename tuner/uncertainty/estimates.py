@@ -20,9 +20,9 @@ from tuner.core.numerics import (
 )
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
-from tuner.objective.information import Change, FisherInformation, information_at
+from tuner.objective.information import FisherInformation, ResidualChange, information_at
 from tuner.objective.space import Space
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.uncertainty.covariance import Covariance, IndependentErrors, covariance_of, flight_parts
 from tuner.uncertainty.verdict import Direction, ErrorParts, Reason, ReasonCode, Verdict, judge
 from tuner.vehicle import COEFFICIENTS, scale_group, term_groups
@@ -111,9 +111,7 @@ class Uncertainty:
     directions: tuple[Direction, ...]
 
 
-def uncertainty_of(
-    fitted: Fitted, *, offsets_fitted: NDArray[np.bool_] | None = None
-) -> Uncertainty:
+def uncertainty_of(fitted: Fit, *, offsets_fitted: NDArray[np.bool_] | None = None) -> Uncertainty:
     """Return the uncertainty of a fit's coefficients.
 
     Parameters
@@ -340,7 +338,7 @@ SHAPES = ("tachometer_memory",)
 
 
 def term_findings(
-    fitted: Fitted,
+    fitted: Fit,
     uncertainty: Uncertainty,
     substitutes: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
 ) -> Iterator[Finding]:
@@ -435,7 +433,7 @@ def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> d
     return {name: part for name, part in parts.items() if part is not None}
 
 
-def plausible_share(information: FisherInformation, change: Change) -> float:
+def plausible_share(information: FisherInformation, change: ResidualChange) -> float:
     """Return the share of a change of the simulation that the residuals allow, at most 1.
 
     It is the root mean square of its size, estimated from the residuals, which hold all effects

@@ -20,7 +20,7 @@ from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.normal_equations import Objective, flight_batch, flight_batches
 from tuner.objective.space import Space
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.uncertainty.estimates import (
     MODEL_ERRORS,
     Uncertainty,
@@ -71,7 +71,7 @@ class Examination:
 
 
 def examine(
-    fitted: Fitted,
+    fitted: Fit,
     *,
     alternatives: Mapping[str, Objective] = MappingProxyType({}),
     selection_shifts: Mapping[str, float] = MappingProxyType({}),

@@ -30,7 +30,7 @@ from tuner.search.estimation import BOTH_POLISHES, LAST_POLISH, free_parameters,
 from tuner.search.listener import Reporter
 from tuner.search.optimisers import advance, initial_step
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.uncertainty.covariance import PRIOR_WIDENING
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, FullProblem, examine
@@ -50,11 +50,11 @@ CLOSED_LOOP_TOLERANCE = 2.0
 
 def hold_undetermined(
     job: Job,
-    fitted: Fitted,
+    fitted: Fit,
     reporter: Reporter,
     *,
     selection_shifts: Mapping[str, float] = MappingProxyType({}),
-) -> tuple[Fitted, Examination]:
+) -> tuple[Fit, Examination]:
     """Return the fit with undetermined coefficients held, and its examination.
 
     A fit that predicts from recorded states holds only those that trade off: together the others
@@ -63,7 +63,7 @@ def hold_undetermined(
     """
     model_errors = model_errors_of(fitted, job.fitted)
 
-    def examined(fitted: Fitted) -> Examination:
+    def examined(fitted: Fit) -> Examination:
         alternatives = alternatives_of(fitted.objective, fitted.point, job.fitted)
         return examine(
             fitted,
@@ -117,7 +117,7 @@ def hold_undetermined(
     return fitted, examination
 
 
-def _undetermined_terms(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> tuple[str, ...]:
+def _undetermined_terms(job: Job, fitted: Fit, uncertainty: Uncertainty) -> tuple[str, ...]:
     """Return the undetermined coefficients of selected terms that ended at a bound.
 
     Those elsewhere may improve predictions.
@@ -136,7 +136,7 @@ def _undetermined_terms(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> t
     )
 
 
-def _loss_ratio(fitted: Fitted, other: Fitted) -> float:
+def _loss_ratio(fitted: Fit, other: Fit) -> float:
     """Return the loss at another fit over that at a fit, both by the noise of the fit."""
     before, after = (
         float(np.sum(fitted.objective.sums(f.point, fitted.criterion, derivatives=False).loss))
@@ -189,12 +189,12 @@ def _narrow_by_noise(uncertainty: Uncertainty) -> frozenset[str]:
 
 def hold(
     job: Job,
-    fitted: Fitted,
+    fitted: Fit,
     stand_ins: Mapping[str, str],
     reporter: Reporter,
     *,
     stages: slice = BOTH_POLISHES,
-) -> Fitted:
+) -> Fit:
     """Return the fit with the stand-ins held at their initial values and the others refitted.
 
     The refit starts where the others make up for that to first order.
@@ -226,7 +226,7 @@ def hold(
     )
 
 
-def _point_after_holding(fitted: Fitted, vector: NDArray[np.float64], free: Point) -> Point:
+def _point_after_holding(fitted: Fit, vector: NDArray[np.float64], free: Point) -> Point:
     """Return the point with the coefficients at a vector (K,), and the free ones moved to suit."""
     objective, point = fitted.objective, fitted.point
     sums = objective.sums(point, fitted.criterion)

@@ -49,7 +49,7 @@ from tuner.objective.simulation import (
     MOTION,
     SETPOINTS,
     TRUE_ROTOR_SPEED,
-    Flown,
+    SimulatedChannels,
     environment_of,
     fly,
 )
@@ -57,7 +57,7 @@ from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.interpolation import with_gaps_filled
 from tuner.search.findings import outlying_flights
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.uncertainty.estimates import (
     INPUT,
     LIMIT,
@@ -134,7 +134,7 @@ class ModelErrors:
         return _with_speeds_earlier(pushed, self.speed_lag) if self.speed_lag else pushed
 
 
-def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | None:
+def model_errors_of(fitted: Fit, flights: Sequence[Flight]) -> ModelErrors | None:
     """Return the errors of a fit's model; None if there are none, or they cannot be estimated.
 
     They are estimated from all flights but crashed ones and those of `outlying_flights`.
@@ -205,7 +205,7 @@ def model_errors_of(fitted: Fitted, flights: Sequence[Flight]) -> ModelErrors | 
     return ModelErrors(found.laws, pushed, differing, found.speed_lag, gain_shifts)
 
 
-def answers_of(fitted: Fitted, flights: Sequence[Flight]) -> tuple[ControllerEstimate, ...]:
+def answers_of(fitted: Fit, flights: Sequence[Flight]) -> tuple[ControllerEstimate, ...]:
     """Return the estimates of the rate controller that differ; arguments of `model_errors_of`."""
     simulated, objective = _flown(fitted), fitted.objective
     if simulated is None:
@@ -215,7 +215,7 @@ def answers_of(fitted: Fitted, flights: Sequence[Flight]) -> tuple[ControllerEst
     return tuple(estimate for estimate in estimates if estimate.differs)
 
 
-def _flown(fitted: Fitted) -> tuple[Flown, Mask] | None:
+def _flown(fitted: Fit) -> tuple[SimulatedChannels, Mask] | None:
     """Return a fit's flights as simulated, and which (F,) show errors; None if not flown whole."""
     objective, segments = fitted.objective, fitted.objective.segments
     if segments.windowed or not isinstance(segments.inlet, ReferenceInlet):
@@ -379,7 +379,7 @@ def model_error_findings(
             yield Code.LAW_LACKING.warning("model", law.axis, law.feature, *moved, share=law.share)
 
 
-def gains_far_off(fitted: Fitted, flights: Sequence[Flight]) -> Iterator[Finding]:
+def gains_far_off(fitted: Fit, flights: Sequence[Flight]) -> Iterator[Finding]:
     """Return findings on gains far from the file's; arguments are those of `model_errors_of`."""
     return _controller_findings(
         one
@@ -417,7 +417,11 @@ def _with_gain(gains: RateGains, estimate: ControllerEstimate) -> RateGains:
 
 
 def _controller_estimates(
-    flights: Sequence[Flight], flown: Flown, mixer: MixerSettings, rate: float, usable: Mask
+    flights: Sequence[Flight],
+    flown: SimulatedChannels,
+    mixer: MixerSettings,
+    rate: float,
+    usable: Mask,
 ) -> tuple[ControllerEstimate, ...]:
     """Return the estimates of recorded rate controllers relative to those of the fit.
 

@@ -22,7 +22,7 @@ from tuner.objective.normal_equations import Objective
 from tuner.search.estimation import free_parameters, polished
 from tuner.search.listener import Iteration
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted, best_values
+from tuner.search.progress import Fit, best_values
 from tuner.uncertainty.records import Refit
 from tuner.vehicle import with_values
 
@@ -46,7 +46,7 @@ class Draw(NamedTuple):
 
 
 def refits(
-    job: Job, fitted: Fitted, draws: Sequence[Draw], on_iteration: Callable[[Iteration], None]
+    job: Job, fitted: Fit, draws: Sequence[Draw], on_iteration: Callable[[Iteration], None]
 ) -> list[Refit]:
     """Polish a fit again for each draw of its flights, by the engine in force.
 
@@ -72,7 +72,7 @@ def refits(
     return outcomes
 
 
-def _refit(task: tuple[Callable[[], tuple[Job, Fitted]], Draw], report: Report) -> Refit:
+def _refit(task: tuple[Callable[[], tuple[Job, Fit]], Draw], report: Report) -> Refit:
     (job, fitted), draw = task[0](), task[1]
     end = polished(
         job,
@@ -110,7 +110,7 @@ BOOTSTRAP_FILE = "bootstrap.csv"
 
 
 def bootstrap(
-    job: Job, fitted: Fitted, count: int, folder: Path, on_iteration: Callable[[Iteration], None]
+    job: Job, fitted: Fit, count: int, folder: Path, on_iteration: Callable[[Iteration], None]
 ) -> dict[str, float]:
     """Refit to two or more flights, drawn with replacement; write the table, return the errors.
 
@@ -146,7 +146,7 @@ CROSS_VALIDATION_FILE = "cross_validation.csv"
 
 
 def cross_validate(
-    job: Job, fitted: Fitted, folder: Path, on_iteration: Callable[[Iteration], None]
+    job: Job, fitted: Fit, folder: Path, on_iteration: Callable[[Iteration], None]
 ) -> list[Refit]:
     """Leave each fitted flight out in turn, polish the fit to the others, and write the table.
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from tuner.core.files import FiniteOrNone, Part
 from tuner.core.numerics import Z95
-from tuner.core.phrases import Worded, listed, percent, quantity
+from tuner.core.phrases import CodeWithText, listed, percent, quantity
 from tuner.vehicle import scale_group
 
 WELL_KNOWN = 0.05
@@ -117,7 +117,7 @@ class Verdict(StrEnum):
     """A constant multiple of another coefficient, as the job file says."""
 
 
-class ReasonCode(Worded):
+class ReasonCode(CodeWithText):
     """Main reason of a verdict; ``{prior}`` and so on in its text are those of `_main_clause`."""
 
     INTERVAL = "interval", "±{half_width} (95 %){source}"

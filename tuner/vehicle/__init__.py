@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tuner.vehicle.coefficient import EFFECTS, Coefficient, NotCarried, Written
+from tuner.vehicle.coefficient import EFFECTS, Coefficient, ExportTag, NoExportTag
 from tuner.vehicle.controller import ControllerFile, read_controller
 from tuner.vehicle.registry import (
     COEFFICIENTS,
@@ -33,9 +33,9 @@ __all__ = [
     "REGISTRY",
     "Coefficient",
     "ControllerFile",
-    "NotCarried",
+    "ExportTag",
+    "NoExportTag",
     "VehicleFile",
-    "Written",
     "check_filter",
     "check_names",
     "check_rotors",

@@ -23,8 +23,8 @@ LoopPart = Literal["", "estimate", "rate control", "motors", "tachometer", "turn
 
 
 @dataclass(frozen=True)
-class Written:
-    """An export target holds the coefficient.
+class ExportTag:
+    """The place of a coefficient in an export target's file.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Written:
 
 
 @dataclass(frozen=True)
-class NotCarried:
+class NoExportTag:
     """An export target has no place for the coefficient.
 
     Attributes
@@ -54,8 +54,8 @@ class NotCarried:
     built_in: float | None = None
 
 
-class Scaled:
-    """What has a scaled coordinate: the logarithm of its value, or the value itself."""
+class ScaledQuantity:
+    """A quantity with a scaled coordinate: the logarithm of its value, or the value itself."""
 
     scale: Scale
 
@@ -73,7 +73,7 @@ class Scaled:
 
 
 @dataclass(frozen=True)
-class Coefficient(Scaled):
+class Coefficient(ScaledQuantity):
     """A number that a fit can move: one row of the registry.
 
     Attributes
@@ -171,7 +171,7 @@ class Coefficient(Scaled):
     begin: float | None = None
     equivalent_to: str = ""
     reads: str = ""
-    exported_as: Mapping[str, Written | NotCarried] = field(default_factory=dict)
+    exported_as: Mapping[str, ExportTag | NoExportTag] = field(default_factory=dict)
     informed_by: str | None = None
     plausible: tuple[float, float] | None = None
     fallback: Place | None = None
@@ -202,7 +202,7 @@ class Coefficient(Scaled):
 
 
 @dataclass(frozen=True)
-class Parameter(Scaled):
+class Parameter(ScaledQuantity):
     """One coordinate of the search: a coefficient, or several that are tied to it.
 
     Attributes

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from tuner.vehicle.coefficient import EFFECTS, Coefficient, LoopPart, NotCarried
+from tuner.vehicle.coefficient import EFFECTS, Coefficient, LoopPart, NoExportTag
 
-_OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
+_OF_SETUP = NoExportTag("it belongs to the set-up, not to the vehicle")
 _OUTSIDE = {"sdf": _OF_SETUP, "px4": _OF_SETUP}
 _AXES = {"x": "forward", "y": "left", "z": "up"}
 _CLOCKS = "clocks of the recording"
@@ -254,8 +254,8 @@ SURROUNDING_ROWS = (
         prior_sd=0.004,
         group="battery_decline",
         exported_as={
-            "sdf": NotCarried("the motor plugins know no battery", 0.0),
-            "px4": NotCarried("the SIH model's thrust does not depend on the battery", 0.0),
+            "sdf": NoExportTag("the motor plugins know no battery", 0.0),
+            "px4": NoExportTag("the SIH model's thrust does not depend on the battery", 0.0),
         },
     ),
     *(

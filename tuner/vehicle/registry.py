@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections import ChainMap
 from collections.abc import Mapping
 
-from tuner.vehicle.coefficient import Coefficient, NotCarried, Scope, Written
+from tuner.vehicle.coefficient import Coefficient, ExportTag, NoExportTag, Scope
 from tuner.vehicle.flight_conditions import SURROUNDING_ROWS
 from tuner.vehicle.terms import EFFECT_ROWS
 
-_FROM_SPEEDS = Written("CA_ROTOR*_CT, SIH_T_MAX, SIM_GZ_EC_*")
+_FROM_SPEEDS = ExportTag("CA_ROTOR*_CT, SIH_T_MAX, SIM_GZ_EC_*")
 
 NO_LOSS = 1e6
 """m/s, of ``max_relative_airspeed`` in a simulator whose thrust does not depend on the airspeed."""
@@ -32,7 +32,7 @@ _ROWS = (
         prior_sd=0.3,
         mass_exponent=1,
         hold_rank=0,
-        exported_as={"sdf": Written("mass", "inertial"), "px4": Written("SIH_MASS")},
+        exported_as={"sdf": ExportTag("mass", "inertial"), "px4": ExportTag("SIH_MASS")},
         informed_by="weighing",
     ),
     *(
@@ -48,8 +48,8 @@ _ROWS = (
             free=True,
             mass_exponent=1,
             exported_as={
-                "sdf": Written(f"i{axes}", "inertia"),
-                "px4": Written(f"SIH_I{axes.upper()}"),
+                "sdf": ExportTag(f"i{axes}", "inertia"),
+                "px4": ExportTag(f"SIH_I{axes.upper()}"),
             },
             informed_by=turn,
         )
@@ -71,7 +71,7 @@ _ROWS = (
         prior_sd=0.1,
         free=True,
         hold_rank=1,
-        exported_as={"sdf": Written("input_scaling", "channel"), "px4": _FROM_SPEEDS},
+        exported_as={"sdf": ExportTag("input_scaling", "channel"), "px4": _FROM_SPEEDS},
         informed_by="thrust curve",
     ),
     Coefficient(
@@ -85,7 +85,7 @@ _ROWS = (
         prior_sd=0.5,
         free=True,
         hold_rank=2,
-        exported_as={"sdf": Written("zero_position_armed", "channel"), "px4": _FROM_SPEEDS},
+        exported_as={"sdf": ExportTag("zero_position_armed", "channel"), "px4": _FROM_SPEEDS},
         informed_by="thrust curve",
     ),
     Coefficient(
@@ -100,7 +100,7 @@ _ROWS = (
         prior_sd=0.05,
         step=0.1,
         neutral=0.0,
-        exported_as={"sdf": Written("input_offset", "channel"), "px4": _FROM_SPEEDS},
+        exported_as={"sdf": ExportTag("input_offset", "channel"), "px4": _FROM_SPEEDS},
     ),
     Coefficient(
         name="quadratic",
@@ -115,7 +115,7 @@ _ROWS = (
         step=100.0,
         neutral=0.0,
         exported_as={
-            "sdf": NotCarried("the control channels map commands to speeds by a line", 0.0),
+            "sdf": NoExportTag("the control channels map commands to speeds by a line", 0.0),
             "px4": _FROM_SPEEDS,
         },
     ),
@@ -130,7 +130,7 @@ _ROWS = (
             bounds=20.0,
             prior_sd=0.7,
             free=True,
-            exported_as={"sdf": Written(tag, "motor"), "px4": Written("SIH_T_TAU")},
+            exported_as={"sdf": ExportTag(tag, "motor"), "px4": ExportTag("SIH_T_TAU")},
             informed_by="rotor lag",
             plausible=(0.001, 1.0),
         )
@@ -151,8 +151,8 @@ _ROWS = (
         free=True,
         mass_exponent=1,
         exported_as={
-            "sdf": Written("motorConstant", "motor"),
-            "px4": Written("CA_ROTOR*_CT, SIH_T_MAX, MPC_THR_HOVER"),
+            "sdf": ExportTag("motorConstant", "motor"),
+            "px4": ExportTag("CA_ROTOR*_CT, SIH_T_MAX, MPC_THR_HOVER"),
         },
         informed_by="thrust",
     ),
@@ -167,8 +167,8 @@ _ROWS = (
         prior_sd=0.7,
         free=True,
         exported_as={
-            "sdf": Written("momentConstant", "motor"),
-            "px4": Written("CA_ROTOR*_KM, SIH_Q_MAX"),
+            "sdf": ExportTag("momentConstant", "motor"),
+            "px4": ExportTag("CA_ROTOR*_KM, SIH_Q_MAX"),
         },
         informed_by="yaw",
         plausible=(0.001, 0.5),
@@ -183,7 +183,10 @@ _ROWS = (
         prior_sd=1.5,
         free=True,
         mass_exponent=1,
-        exported_as={"sdf": Written("rotorDragCoefficient", "motor"), "px4": Written("SIH_KDV")},
+        exported_as={
+            "sdf": ExportTag("rotorDragCoefficient", "motor"),
+            "px4": ExportTag("SIH_KDV"),
+        },
         informed_by="speed",
     ),
     Coefficient(
@@ -197,8 +200,8 @@ _ROWS = (
         prior_sd=2.0,
         mass_exponent=1,
         exported_as={
-            "sdf": Written("rollingMomentCoefficient", "motor"),
-            "px4": NotCarried("the SIH model has no rolling moment", 0.0),
+            "sdf": ExportTag("rollingMomentCoefficient", "motor"),
+            "px4": NoExportTag("the SIH model has no rolling moment", 0.0),
         },
         informed_by="nothing",
     ),
@@ -211,8 +214,8 @@ _ROWS = (
         bounds=10.0,
         prior_sd=1.0,
         exported_as={
-            "sdf": NotCarried("the motor plugins have 25 m/s built in", 25.0),
-            "px4": NotCarried("the SIH model's thrust does not depend on the airspeed", NO_LOSS),
+            "sdf": NoExportTag("the motor plugins have 25 m/s built in", 25.0),
+            "px4": NoExportTag("the SIH model's thrust does not depend on the airspeed", NO_LOSS),
         },
         informed_by="climb",
     ),

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from tuner.core.files import Part
-from tuner.core.phrases import Worded
+from tuner.core.phrases import CodeWithText
 
 Groups = Mapping[str, tuple[str, ...]]
 """Group -> its coefficients."""
 
 
-class SelectionCode(Worded):
+class SelectionCode(CodeWithText):
     """Why a group of coefficients is in the model, or is not; texts are clauses on the group."""
 
     # kept

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
-from tuner.vehicle.coefficient import EFFECTS, Coefficient, NotCarried, Written
+from tuner.vehicle.coefficient import EFFECTS, Coefficient, ExportTag, NoExportTag
 
 _AXES = {"x": "forward", "y": "left", "z": "up"}
 _CENTRED = {"x": 0.01, "y": 0.01, "z": 0.03}
@@ -34,8 +34,8 @@ _ROWS = (
         step=0.2,
         reads="battery_voltage",
         exported_as={
-            "sdf": NotCarried("the motor plugins know no battery", 0.0),
-            "px4": NotCarried("the SIH model's thrust does not depend on the battery", 0.0),
+            "sdf": NoExportTag("the motor plugins know no battery", 0.0),
+            "px4": NoExportTag("the SIH model's thrust does not depend on the battery", 0.0),
         },
     ),
     _ratio(
@@ -61,7 +61,7 @@ _ROWS = (
             mass_exponent=1,
             length_exponent=-0.5,
             is_aggregate=True,
-            exported_as={"px4": Written("SIH_KDV")},
+            exported_as={"px4": ExportTag("SIH_KDV")},
         )
         for axis, direction in _AXES.items()
     ),
@@ -78,8 +78,8 @@ _ROWS = (
         length_exponent=-1.0,
         informed_by="speed",
         exported_as={
-            "sdf": NotCarried("the motor plugins know no drag of the body", 0.0),
-            "px4": NotCarried("the SIH model's drag is linear in the velocity", 0.0),
+            "sdf": NoExportTag("the motor plugins know no drag of the body", 0.0),
+            "px4": NoExportTag("the SIH model's drag is linear in the velocity", 0.0),
         },
     ),
     _effect(
@@ -93,8 +93,8 @@ _ROWS = (
         step=0.05,
         neutral=2.0,
         exported_as={
-            "sdf": NotCarried("the motor plugins' thrust goes with the squared rotor speed", 2.0),
-            "px4": NotCarried("the SIH model's thrust goes with the command", 2.0),
+            "sdf": NoExportTag("the motor plugins' thrust goes with the squared rotor speed", 2.0),
+            "px4": NoExportTag("the SIH model's thrust goes with the command", 2.0),
         },
     ),
     _effect(
@@ -108,7 +108,7 @@ _ROWS = (
         step=1e-4,
         mass_exponent=1,
         exported_as={
-            "sdf": NotCarried(
+            "sdf": NoExportTag(
                 "the motor plugins' thrust falls with the length of the axial airspeed, unsigned",
                 0.0,
             )
@@ -126,8 +126,8 @@ _ROWS = (
             step=0.005,
             length_exponent=1.0,
             exported_as={
-                "sdf": Written("pose", "centre"),
-                "px4": NotCarried("the control allocation is left as it flew", 0.0),
+                "sdf": ExportTag("pose", "centre"),
+                "px4": NoExportTag("the control allocation is left as it flew", 0.0),
             },
         )
         for axis, direction in _AXES.items()
@@ -142,7 +142,7 @@ _ROWS = (
             bounds=1.5,
             prior_sd=0.03,
             step=0.015,
-            exported_as={"sdf": Written("motorConstant", "rotor")},
+            exported_as={"sdf": ExportTag("motorConstant", "rotor")},
         )
         for number in range(1, 5)
     ),
@@ -176,7 +176,7 @@ _ROWS = (
         mass_exponent=1,
         length_exponent=2.0,
         exported_as={
-            "sdf": NotCarried(
+            "sdf": NoExportTag(
                 "the rotor links' inertia turns no body in the motor model's moment", 0.0
             )
         },
@@ -244,7 +244,7 @@ _ROWS = (
             mass_exponent=1,
             length_exponent=1.5,
             is_aggregate=True,
-            exported_as={"px4": Written("SIH_KDW")},
+            exported_as={"px4": ExportTag("SIH_KDW")},
         )
         for axis, usual, source in (
             ("x", 0.01, "what is left of inflow and flapping: -c·ω"),
@@ -263,7 +263,7 @@ _ROWS = (
             prior_sd=0.7,
             step=0.2,
             exported_as={
-                target: NotCarried(
+                target: NoExportTag(
                     "a simulated loop's rotors answer what it simulates, and no more"
                 )
                 for target in ("sdf", "px4")
@@ -284,8 +284,8 @@ def _with_defaults(row: Coefficient) -> Coefficient:
     if not ratio and isinstance(bounds, float):
         bounds = (neutral - bounds, neutral + bounds)
     lost = {
-        "sdf": NotCarried(f"Gazebo's motor model has no such {kind}", neutral),
-        "px4": NotCarried(f"the SIH model has no such {kind}", neutral),
+        "sdf": NoExportTag(f"Gazebo's motor model has no such {kind}", neutral),
+        "px4": NoExportTag(f"the SIH model has no such {kind}", neutral),
     }
     held = lost | dict(row.exported_as)
     return replace(row, place=(EFFECTS, row.name), bounds=bounds, exported_as=held)

@@ -20,7 +20,7 @@ from tuner.design.proposals import (
 )
 from tuner.design.ranking import CLEARANCE_M, Arena, candidates, rank_next_flights
 from tuner.objective.normal_equations import Objective
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.uncertainty.examination import Examination, examine
 
 FREE = ("inertia_xx", "inertia_zz", "input_scaling", "motor_constant", "moment_constant")
@@ -35,7 +35,7 @@ def only(objective: Objective, segment: int) -> Objective:
 
 
 @pytest.fixture(scope="module")
-def fitted() -> Fitted:
+def fitted() -> Fit:
     """A fit to the swing alone, which hardly turns about up, met 200 times worse than noise."""
     noisy = making.problem(FREE, seed=0)
     swing = only(noisy, 0)
@@ -47,11 +47,11 @@ def fitted() -> Fitted:
 
 
 @pytest.fixture(scope="module")
-def examination(fitted: Fitted) -> Examination:
+def examination(fitted: Fit) -> Examination:
     return examine(fitted)
 
 
-def ranked(examination: Examination, fitted: Fitted) -> Proposals:
+def ranked(examination: Examination, fitted: Fit) -> Proposals:
     return rank_next_flights(
         examination,
         fitted.criterion,
@@ -61,12 +61,12 @@ def ranked(examination: Examination, fitted: Fitted) -> Proposals:
 
 
 @pytest.fixture(scope="module")
-def proposals(examination: Examination, fitted: Fitted) -> Proposals:
+def proposals(examination: Examination, fitted: Fit) -> Proposals:
     return ranked(examination, fitted)
 
 
 def test_candidates_are_flown_by_the_program_of_the_examination(
-    fitted: Fitted, monkeypatch: pytest.MonkeyPatch
+    fitted: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     examination = examine(fitted)
 
@@ -97,7 +97,7 @@ def test_no_flight_widens_an_interval(proposals: Proposals) -> None:
 
 def test_fewer_samples_of_larger_weight_carry_nearly_the_same_information(
     examination: Examination,
-    fitted: Fitted,
+    fitted: Fit,
     proposals: Proposals,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -10,7 +10,7 @@ from scipy.linalg import solve_discrete_are
 
 from tuner.disturbances.covariance import (
     Samples,
-    Sparse,
+    SparseMatrix,
     innovations_of,
     propagated,
 )
@@ -39,7 +39,7 @@ def test_samples_tell_and_time_spreads_what_products_of_matrices_say() -> None:
             for some, row in zip(columns, derivatives, strict=True)
         ]
 
-    sparse = Sparse.of(push, SHOWN)
+    sparse = SparseMatrix.of(push, SHOWN)
     assert [list(row) for row in sparse.rows] == [np.flatnonzero(r).tolist() for r in derivatives]
     error, variance = rng.standard_normal(WIDE), rng.random(WIDE) + 0.1
     weights, process_noise = rng.standard_normal(WIDE), rng.random(SIZE)
@@ -90,7 +90,9 @@ def test_the_covariance_of_an_unstable_vehicle_settles_as_riccatis_equation_says
     samples = Samples(
         jnp.zeros(2),
         jnp.ones(2),
-        Sparse.of(lambda c: [sum(map(jnp.multiply, row, c))[None] for row in derivatives], size),
+        SparseMatrix.of(
+            lambda c: [sum(map(jnp.multiply, row, c))[None] for row in derivatives], size
+        ),
         lambda number: number,
         jnp.asarray(2),
     )

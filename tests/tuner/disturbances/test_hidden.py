@@ -15,7 +15,7 @@ from tuner.disturbances.predictor import (
     with_hidden_coefficients,
     with_strengths,
 )
-from tuner.objective.information import Change, FisherInformation
+from tuner.objective.information import FisherInformation, ResidualChange
 from tuner.uncertainty.estimates import _shares
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.model import model_of
@@ -83,7 +83,7 @@ def coupled_with_strengths(size: float) -> tuple[FisherInformation, FisherInform
     random, said, count = np.random.default_rng(1), looped(), len(STRENGTHS)
     nothing = np.zeros((1, 3, 1))
     across = {
-        name: Change(5.0 * random.standard_normal((1, 3, 1, len(NAMES))), nothing, nothing)
+        name: ResidualChange(5.0 * random.standard_normal((1, 3, 1, len(NAMES))), nothing, nothing)
         for name in STRENGTHS
     }
     coupling = size * random.standard_normal((count, len(NAMES)))

@@ -15,7 +15,7 @@ from tuner.disturbances.disturbances import (
     MIN_STRENGTHS,
     STRENGTHS,
 )
-from tuner.disturbances.extended_kalman_filter import Filtered
+from tuner.disturbances.extended_kalman_filter import FilterResult
 from tuner.disturbances.maximum_likelihood import (
     LEAST_CHANGE,
     MAX_STRENGTH_RATIO,
@@ -98,7 +98,7 @@ class LikeliestAtStart(Predictor):
 
     def at(self, objective: Objective, point: Point) -> Predictor:
         rows, far = np.zeros((1, 0, 2)), bool((point.coefficients != objective.space.initial).any())
-        return replace(self, found=Filtered(rows, rows, np.full((1, 2), far, float), None))
+        return replace(self, found=FilterResult(rows, rows, np.full((1, 2), far, float), None))
 
 
 @pytest.mark.parametrize(("gain", "taken"), [(0.9 * NEAR_GAIN, True), (1.1 * NEAR_GAIN, False)])

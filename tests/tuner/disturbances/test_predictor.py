@@ -25,7 +25,7 @@ from tuner.disturbances.disturbances import (
     processes_of,
 )
 from tuner.disturbances.disturbances import STRENGTHS as NAMED
-from tuner.disturbances.extended_kalman_filter import GATE, Filtered
+from tuner.disturbances.extended_kalman_filter import GATE, FilterResult
 from tuner.disturbances.maximum_likelihood import _equations, maximise_likelihood
 from tuner.disturbances.observer import Observer
 from tuner.disturbances.predictor import (
@@ -271,7 +271,7 @@ def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitt
     problem, predictor, point = fitted
     ticks = predictor.ticks
 
-    def alone(strengths: np.ndarray) -> Filtered:
+    def alone(strengths: np.ndarray) -> FilterResult:
         return replace(predictor, strengths=strengths).at(problem, point).found.first(ticks)
 
     steps = difference_steps(predictor.strengths)

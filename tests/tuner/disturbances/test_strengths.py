@@ -21,7 +21,7 @@ from tuner.disturbances.disturbances import (
     clipped,
     processes_of,
 )
-from tuner.disturbances.extended_kalman_filter import Filtered
+from tuner.disturbances.extended_kalman_filter import FilterResult
 from tuner.disturbances.predictor import STEP, Slopes, difference_steps, slopes_of
 
 ORDER = (*SLOW, *FAST)
@@ -30,7 +30,7 @@ ORDER = (*SLOW, *FAST)
 SAMPLES, WIDE = 3000, 5
 
 
-def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Filtered]:
+def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], FilterResult]:
     """Return the likelihood of samples whose covariance strengths make up, and trade off in."""
     rng = np.random.default_rng(seed)
     shapes = np.random.default_rng(0).standard_normal((len(STRENGTHS), WIDE, WIDE))
@@ -42,17 +42,17 @@ def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Filtered]:
 
     samples = rng.standard_normal((SAMPLES, WIDE)) @ root(truth).T
 
-    def filtered(strengths: np.ndarray) -> Filtered:
+    def filtered(strengths: np.ndarray) -> FilterResult:
         factor = root(strengths)
         white = np.linalg.solve(factor, samples.T).T
         loss = 0.5 * np.sum(white**2) + SAMPLES * np.log(np.diag(factor)).sum()
         spread = np.broadcast_to(np.diag(factor), white.shape)
-        return Filtered(white, spread, np.asarray(loss), None)
+        return FilterResult(white, spread, np.asarray(loss), None)
 
     return filtered
 
 
-def differenced(filtered: Callable[[np.ndarray], Filtered], strengths: np.ndarray) -> Slopes:
+def differenced(filtered: Callable[[np.ndarray], FilterResult], strengths: np.ndarray) -> Slopes:
     steps = difference_steps(strengths)
     beside = (filtered(strengths + step) for step in np.diag(steps))
     return slopes_of(filtered(strengths), beside, steps)

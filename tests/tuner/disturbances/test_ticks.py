@@ -15,7 +15,7 @@ from tuner.disturbances.ticks import (
     setpoints_on_ticks,
     with_equal_weights,
 )
-from tuner.objective.segments import Measured, repeat_counts
+from tuner.objective.segments import MeasuredChannel, repeat_counts
 from tuner.recordings.flight import Flight, InitialState, Series
 
 RATE = 400.0
@@ -23,13 +23,13 @@ TICKS = 400
 NOT_LATE = np.zeros((2, 2))
 
 
-def measured(time: np.ndarray, width: int = 3) -> Measured:
+def measured(time: np.ndarray, width: int = 3) -> MeasuredChannel:
     """Two segments whose second ends half-way; each value is its own time."""
     both = np.stack([time, time], axis=-1)
     weight = np.ones((len(time), width, 2))
     weight[len(time) // 2 :, :, 1] = 0.0
     values = np.repeat(both[:, None], width, axis=1)
-    return Measured(jnp.asarray(both), jnp.asarray(values), jnp.asarray(weight))
+    return MeasuredChannel(jnp.asarray(both), jnp.asarray(values), jnp.asarray(weight))
 
 
 def test_a_sample_lies_between_its_tick_and_the_one_before() -> None:

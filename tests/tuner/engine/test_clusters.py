@@ -124,7 +124,7 @@ def test_workers_take_gpus_in_turn_though_their_starter_keeps_to_the_processor(m
     monkeypatch.setattr(dask_engine, "configure", lambda: None)
     for name, gpu in {0: "0", 1: "1", 4: "1"}.items():
         monkeypatch.setattr(os, "environ", {"JAX_PLATFORMS": "cpu"})
-        dask_engine.SetUp(gpus=3).setup(SimpleNamespace(name=name))
+        dask_engine.WorkerSetup(gpus=3).setup(SimpleNamespace(name=name))
         assert os.environ["CUDA_VISIBLE_DEVICES"] == gpu
         assert os.environ["JAX_PLATFORMS"] == ""
         assert os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] == "false"

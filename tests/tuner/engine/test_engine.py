@@ -7,7 +7,7 @@ import pytest
 from tests.tuner.engine import tasks
 from tuner.core.errors import EngineError, InputError, RecordingError
 from tuner.engine import HERE, current, engine_for, using
-from tuner.engine.engine import Here
+from tuner.engine.engine import InProcessEngine
 
 
 @pytest.fixture(params=["here", "two workers"])
@@ -93,10 +93,10 @@ def test_the_task_of_a_worker_that_dies_is_computed_again(two_workers, tmp_path)
 
 
 def test_the_engine_in_force(two_workers):
-    assert isinstance(current(), Here)
+    assert isinstance(current(), InProcessEngine)
     with using(two_workers):
         assert current() is two_workers
-    assert isinstance(current(), Here)
+    assert isinstance(current(), InProcessEngine)
 
 
 def test_without_options_this_process_computes():

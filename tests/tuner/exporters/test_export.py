@@ -23,7 +23,7 @@ from tuner.exporters.target import Draft, write
 from tuner.options import ExportOptions
 from tuner.report.result_texts import export_sentence
 from tuner.result import EffectiveResult, LostTerm, PoseRmse
-from tuner.vehicle import Written, read_vehicle
+from tuner.vehicle import ExportTag, read_vehicle
 
 TODAY = date(2024, 5, 6)
 
@@ -386,4 +386,4 @@ def test_effective_coefficients_of_other_flights_are_no_fault_of_ours(make_run):
 
 
 def test_what_a_target_holds_is_not_lost_there():
-    assert lost_groups(EFFECTIVE, lambda _: Written("a tag"), ()) == ()
+    assert lost_groups(EFFECTIVE, lambda _: ExportTag("a tag"), ()) == ()

@@ -35,7 +35,7 @@ from tuner.exporters.sdf.spans import (
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.exporters.target import not_carried, target_of, write
 from tuner.exporters.targets.sdf import TARGET, numbers_of, read_values, sdf_draft
-from tuner.vehicle import COEFFICIENTS, Written, values_of
+from tuner.vehicle import COEFFICIENTS, ExportTag, values_of
 
 CLASSIC, GZ, TEMPLATE = (
     MODELS / "quad_x.sdf",
@@ -167,7 +167,7 @@ def test_a_model_that_lacks_a_tag_does_not_read_back(tag, vehicle, tmp_path):
 
 
 def test_a_coefficient_for_which_nothing_is_written_is_no_verified_export(vehicle, monkeypatch):
-    row = replace(COEFFICIENTS["moment_constant"], exported_as={"sdf": Written("x", "joint")})
+    row = replace(COEFFICIENTS["moment_constant"], exported_as={"sdf": ExportTag("x", "joint")})
     monkeypatch.setitem(COEFFICIENTS, "moment_constant", row)
     with pytest.raises(ExportError, match="moment_constant is missing"):
         sdf_draft(CLASSIC, vehicle, "by a test")

@@ -14,7 +14,7 @@ from tuner.objective.criterion import Point
 from tuner.objective.normal_equations import normal_equations
 from tuner.search.progress import Loop, with_loop
 from tuner.vehicle import COEFFICIENTS
-from tuner.vehicle.coefficient import NotCarried
+from tuner.vehicle.coefficient import NoExportTag
 
 TRUTH = {
     "marker_offset_x": 0.012,
@@ -91,5 +91,5 @@ def test_offset_and_tilt_are_estimated(fit):
 def test_no_target_carries_markers():
     for name in TRUTH:
         assert all(
-            isinstance(place, NotCarried) for place in COEFFICIENTS[name].exported_as.values()
+            isinstance(place, NoExportTag) for place in COEFFICIENTS[name].exported_as.values()
         )

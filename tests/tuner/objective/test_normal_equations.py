@@ -15,13 +15,13 @@ from tuner.objective.residuals import Reading, at_stamps, residuals
 from tuner.objective.segments import (
     CLOCK_OF,
     CLOCKS,
-    Measured,
+    MeasuredChannel,
     Segments,
     repeat_counts,
     segments_of,
     white_noise,
 )
-from tuner.objective.simulation import Flown
+from tuner.objective.simulation import SimulatedChannels
 from tuner.recordings.flight import Series
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
@@ -224,11 +224,13 @@ def test_a_jump_that_a_clock_passes_is_seen_and_has_a_slope():
     late, step = 0.1 * HALF, 1e-3 * HALF
     there, here = (commands_at(series, ticks / RATE, late + by, 0.0) for by in (step, -step))
     stamps = (ticks / RATE)[:, None]
-    measured = Measured(
+    measured = MeasuredChannel(
         stamps, np.zeros((*stamps.shape, 1)).swapaxes(1, 2), np.ones((len(ticks), 1, 1))
     )
     segments = Segments(None, None, {"command": measured}, np.zeros(1, int))
-    flown = Flown({"command": series[None, :, None]}, {"command": None}, np.full(1, np.inf))
+    flown = SimulatedChannels(
+        {"command": series[None, :, None]}, {"command": None}, np.full(1, np.inf)
+    )
     (block_of,) = residuals(flown, segments, "command", reading_of(late, coefficients=0))
     block = block_of()
     slope = block.columns[0, :, 0, CLOCK_OF["command"]] / OFFSET_UNIT

@@ -186,7 +186,7 @@ def test_what_is_differentiated_flies_without_derivatives_by_the_same_program(mo
 
 @pytest.mark.usefixtures("optimised")
 def test_what_is_laid_out_once_serves_other_values_but_no_other_model_or_segments(monkeypatch):
-    monkeypatch.setattr(simulation, "_FIXED", fixed := {})
+    monkeypatch.setattr(simulation, "_PREPARED", fixed := {})
     craft = round_airframe(4)
     start = jax.tree.map(lambda leaf: np.asarray(leaf, float)[None], hover(craft, vec(0, 0, 1)))
 

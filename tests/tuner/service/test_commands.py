@@ -196,7 +196,9 @@ def test_a_folder_s_new_recordings_become_one_job_once(client, table, tmp_path, 
     (tmp_path / "c.csv").write_bytes(table.read_bytes() + b"c")
     assert main(arguments) == 0
     assert capsys.readouterr().out.startswith("c.csv: job ")
-    (tmp_path / client_module.Submitted.FILE).unlink()  # as after a crash before it was noted
+    (
+        tmp_path / client_module.SubmissionRecord.FILE
+    ).unlink()  # as after a crash before it was noted
     jobs = len(client.get("/api/v1/jobs").json()["jobs"])
     assert jobs == 2
 
@@ -213,7 +215,7 @@ def test_a_file_that_is_no_recording_keeps_no_folder_from_being_fitted(table, tm
     assert main(arguments) == 0
     assert capsys.readouterr().out == ""
     (tmp_path / "b.csv").unlink()
-    (tmp_path / client_module.Submitted.FILE).unlink()
+    (tmp_path / client_module.SubmissionRecord.FILE).unlink()
     assert main(arguments) == 2
 
 

@@ -30,12 +30,12 @@ from tuner.objective.space import space_of
 from tuner.recordings.flight import InitialState
 from tuner.search.estimation import free_parameters, polished
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 
 BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
 
 
-def job_with(drag: float, **given: Any) -> tuple[Job, Fitted]:
+def job_with(drag: float, **given: Any) -> tuple[Job, Fit]:
     """Return the job of `unfitted_with` and its base fit."""
     job, start = unfitted_with(drag, **given)
     return job, _fit(job, start)
@@ -51,7 +51,7 @@ def unfitted_with(
     effects: Mapping[str, float] | None = None,
     setpoints: bool = False,
     base: tuple[str, ...] = BASE,
-) -> tuple[Job, Fitted]:
+) -> tuple[Job, Fit]:
     """Return a job whose flights were flown with some drag of the body, and its start as a fit.
 
     Its recordings show a hover that is tilted, in rad about x and y; ``around`` is what surrounded
@@ -117,7 +117,7 @@ def hovering(tilt: tuple[float, float], heading: float = 0.4) -> InitialState:
     )
 
 
-def _fit(job: Job, fitted: Fitted) -> Fitted:
+def _fit(job: Job, fitted: Fit) -> Fit:
     free = free_parameters(job)
     end = polished(job, fitted, free=free, title="base", on_progress=lambda _: None)
     return replace(end, outcomes=())

@@ -16,9 +16,9 @@ from tuner.core.numerics import Z95
 from tuner.objective.information import FisherInformation
 from tuner.objective.space import Space, extended, space_of
 from tuner.search.problem import Job
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.terms import refit_with_disturbances
-from tuner.terms.candidates import Selected, neutral_values
+from tuner.terms.candidates import SelectionResult, neutral_values
 from tuner.terms.linearisation import linearised_from
 from tuner.terms.refit_with_disturbances import LinearisedInnovations
 from tuner.vehicle import COEFFICIENTS, term_groups
@@ -92,7 +92,7 @@ def seen(
     said = information(space, truth, alike=alike or {})
     loss = 0.5 * FLIGHTS * STRETCHES * STEPS
     fitted = cast(
-        Fitted,
+        Fit,
         SimpleNamespace(
             objective=SimpleNamespace(space=wide_space(kept), model=MARKERS_UNSEEN),
             held={},
@@ -100,7 +100,7 @@ def seen(
         ),
     )
     base = (NOBODY, NOBODY)
-    selected = Selected(cast(Job, NOBODY), fitted, tuple(rows), selection_shifts or {}, base)
+    selected = SelectionResult(cast(Job, NOBODY), fitted, tuple(rows), selection_shifts or {}, base)
     linear = linearised_from(said, scaled, scaled, loss, names=space.names)
     return LinearisedInnovations(selected, fitted, space, vector, linear)
 
@@ -139,7 +139,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch):
         *,
         first: bool = False,
         lags: bool = False,
-    ) -> tuple[Selected, dict[str, Any]] | None:
+    ) -> tuple[SelectionResult, dict[str, Any]] | None:
         selected = innovation.with_lag_terms() if lags else innovation.selection(had, first=first)
         return None if selected is None else (selected, found)
 
@@ -358,7 +358,7 @@ def test_terms_are_judged_with_model_errors_acting(monkeypatch) -> None:
     there = Problem(plain.space)
     wide = SimpleNamespace(objective=there, point=SimpleNamespace(coefficients=plain.vector))
     monkeypatch.setattr(refit_with_disturbances, "with_free", lambda *_: (NOBODY, wide))
-    fitted = cast(Fitted, SimpleNamespace(**vars(plain.fitted), criterion=NOBODY))
+    fitted = cast(Fit, SimpleNamespace(**vars(plain.fitted), criterion=NOBODY))
     model_errors = SimpleNamespace(applied_to=lambda objective: replace(objective, pushed=True))
     said = LinearisedInnovations.of(plain.selected, fitted, cast(Any, there))
 

@@ -19,9 +19,9 @@ from tuner.findings.findings import Code, Finding
 from tuner.search.findings import unmatched_findings
 from tuner.search.listener import Listener, Reporter
 from tuner.search.problem import Job
-from tuner.search.progress import COLOURED_RATIO, Fitted
+from tuner.search.progress import COLOURED_RATIO, Fit
 from tuner.terms import refit_with_disturbances as disturbances
-from tuner.terms.candidates import Selected
+from tuner.terms.candidates import SelectionResult
 from tuner.terms.refit_with_disturbances import (
     ROUGH_STEPS,
     _findings_with_disturbances,
@@ -33,7 +33,7 @@ from tuner.uncertainty.model_error import ModelErrors
 NOBODY = cast(Any, None)
 
 
-def fitted(scale: float) -> Fitted:
+def fitted(scale: float) -> Fit:
     return ended(
         objective=NOBODY,
         point=NOBODY,
@@ -53,11 +53,14 @@ def fitted(scale: float) -> Fitted:
     ],
     ids=["nothing but noise is left", "the search is not at its end", "not asked for", "no terms"],
 )
-def test_nothing_is_fitted_again_without_need(fit: Fitted, asked: str) -> None:
+def test_nothing_is_fitted_again_without_need(fit: Fit, asked: str) -> None:
     said: list[str] = []
     settings = SimpleNamespace(job=JobFile(disturbances=asked, terms="none"))
     job = cast(Job, SimpleNamespace(settings=settings))
-    assert with_disturbances(Selected(job, fit), Reporter(Listener(on_message=said.append))) is None
+    assert (
+        with_disturbances(SelectionResult(job, fit), Reporter(Listener(on_message=said.append)))
+        is None
+    )
     assert said == []
 
 
@@ -73,7 +76,7 @@ def test_flights_whose_gains_would_not_fit_are_left_to_the_intervals(monkeypatch
     )
     said: list[str] = []
     with nullcontext() if says else pytest.raises(AttributeError):  # goes on with what lacks
-        selected = Selected(job, fitted(2.0 * COLOURED_RATIO))
+        selected = SelectionResult(job, fitted(2.0 * COLOURED_RATIO))
         found = with_disturbances(selected, Reporter(Listener(on_message=said.append)))
         assert found is None
     assert ("Disturbances are not estimated" in said[0]) == says
@@ -117,16 +120,16 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
     monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
-    begin = Selected(job, fitted(2.0 * COLOURED_RATIO))
+    begin = SelectionResult(job, fitted(2.0 * COLOURED_RATIO))
     taken, within, asked = [], [], iter(called_for)
 
-    def descended(selected: Selected, there: Fitted, own: Any, steps: int = MAX_STEPS) -> Any:
+    def descended(selected: SelectionResult, there: Fit, own: Any, steps: int = MAX_STEPS) -> Any:
         taken.append(steps)
         within.append([row.group for row in selected.rows])
         return there, own
 
-    def seen(selected: Selected, *_: Any) -> Any:
-        def selection(had: Any, *, first: bool) -> Selected | None:
+    def seen(selected: SelectionResult, *_: Any) -> Any:
+        def selection(had: Any, *, first: bool) -> SelectionResult | None:
             assert first == (len(taken) == 1)
             assert not had
             group = next(asked)
@@ -152,7 +155,8 @@ def test_no_terms_are_selected_by_innovations_of_a_diverged_filter(monkeypatch):
     job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
     said: list[str] = []
     found = with_disturbances(
-        Selected(job, fitted(2.0 * COLOURED_RATIO)), Reporter(Listener(on_message=said.append))
+        SelectionResult(job, fitted(2.0 * COLOURED_RATIO)),
+        Reporter(Listener(on_message=said.append)),
     )
     assert found is None
     assert said[-1] == disturbances.FILTER_LOST
@@ -167,7 +171,7 @@ def test_a_fit_with_a_lag_whose_filter_loses_a_flight_is_not_taken(monkeypatch):
     monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, own, **__: (there, own))
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
-    begin = Selected(job, fitted(2.0 * COLOURED_RATIO))
+    begin = SelectionResult(job, fitted(2.0 * COLOURED_RATIO))
     seen = SimpleNamespace(selected=begin, selection=lambda *_, **__: None)
     monkeypatch.setattr(disturbances.LinearisedInnovations, "of", lambda *_: seen)
     monkeypatch.setattr(
@@ -200,12 +204,12 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
     space = SimpleNamespace(names=("inertia_xx",))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=space))
     row = SimpleNamespace(group="fuselage_drag", kept=True, names=("fuselage_drag", "wind_x"))
-    begin = Selected(job, fitted(2.0 * COLOURED_RATIO), (cast(Any, row),))
+    begin = SelectionResult(job, fitted(2.0 * COLOURED_RATIO), (cast(Any, row),))
     model_errors = ModelErrors((Law("force_z", "airspeed_across", 0.2),), None)
     polished, examined, read = [], [], []
     chosen = iter([replace(begin, rows=()) if others else None, None])
 
-    def seen(selected: Selected, *_: Any) -> Any:
+    def seen(selected: SelectionResult, *_: Any) -> Any:
         return SimpleNamespace(
             selected=selected,
             selection=lambda *_, **__: next(chosen),
@@ -215,15 +219,15 @@ def test_a_fit_of_other_terms_is_compared_with_one_of_the_same(monkeypatch, othe
             ),
         )
 
-    def with_lag_terms(found: Any, there: Fitted, own: Any, _: Any) -> Any:
+    def with_lag_terms(found: Any, there: Fit, own: Any, _: Any) -> Any:
         return (seen(replace(found.selected)) if lag else found), there, own
 
-    def polish(_: Job, fit: Fitted, *, title: str, left: Any = None, **__: Any) -> Fitted:
+    def polish(_: Job, fit: Fit, *, title: str, left: Any = None, **__: Any) -> Fit:
         polished.append(title)
         assert (left is not None) == (title == "simulated"), "rough where it is not kept"
         return replace(fit, wall_time=float(len(polished)))
 
-    def examine(fit: Fitted, *, selection_shifts: Any, predictor: Any = None, **_: Any) -> Any:
+    def examine(fit: Fit, *, selection_shifts: Any, predictor: Any = None, **_: Any) -> Any:
         examined.append(fit)
         assert predictor is None or selection_shifts == {"acting": model_errors}
         return SimpleNamespace(uncertainty=NOBODY)
@@ -310,8 +314,8 @@ def test_of_several_lags_those_stay_that_innovations_call_for(monkeypatch):
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
     monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, __: (there, beside))
 
-    def seen(selected: Selected, *_: Any) -> Any:
-        def grown(among: Any = None) -> Selected:
+    def seen(selected: SelectionResult, *_: Any) -> Any:
+        def grown(among: Any = None) -> SelectionResult:
             groups = among or ("gyro_filter", "motor_lag")
             more = (SimpleNamespace(group=group, kept=True) for group in groups)
             return replace(selected, rows=(*selected.rows, *more))
@@ -324,7 +328,7 @@ def test_of_several_lags_those_stay_that_innovations_call_for(monkeypatch):
         )
 
     monkeypatch.setattr(disturbances.LinearisedInnovations, "of", seen)
-    begin = Selected(NOBODY, fitted(2.0 * COLOURED_RATIO))
+    begin = SelectionResult(NOBODY, fitted(2.0 * COLOURED_RATIO))
     found, *_ = disturbances._with_lag_terms(
         seen(begin), begin.fitted, cast(Any, beside), lambda _: None
     )
@@ -355,10 +359,10 @@ def test_a_term_without_a_derivative_is_judged_by_a_fit_with_it(
     without.at = lambda *_: "as it was"
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
     monkeypatch.setattr(disturbances, "_fit_innovations", lambda _, there, __: (there, beside))
-    begin = Selected(NOBODY, fitted(2.0 * COLOURED_RATIO))
+    begin = SelectionResult(NOBODY, fitted(2.0 * COLOURED_RATIO))
 
-    def seen(selected: Selected, *_: Any) -> Any:
-        def grown(group: str | None) -> Selected | None:
+    def seen(selected: SelectionResult, *_: Any) -> Any:
+        def grown(group: str | None) -> SelectionResult | None:
             row = SimpleNamespace(group=group, kept=True)
             return replace(selected, rows=(*selected.rows, row)) if group else None
 

@@ -12,12 +12,12 @@ import pytest
 from tests.tuner.terms.making import unfitted_with
 from tuner.objective import residuals
 from tuner.search.listener import Reporter
-from tuner.search.progress import COLOURED_RATIO, Fitted
+from tuner.search.progress import COLOURED_RATIO, Fit
 from tuner.terms import refit_with_disturbances, selection
-from tuner.terms.candidates import Selected
+from tuner.terms.candidates import SelectionResult
 
 
-def ended_with(thrust: float, monkeypatch: pytest.MonkeyPatch) -> tuple[Selected, list[str]]:
+def ended_with(thrust: float, monkeypatch: pytest.MonkeyPatch) -> tuple[SelectionResult, list[str]]:
     """Return what a search comes to that ends with so much of the thrust, and what it tried."""
     job, start = unfitted_with(0.0, seed=0)
     space, tried = job.space, list[str]()
@@ -27,9 +27,9 @@ def ended_with(thrust: float, monkeypatch: pytest.MonkeyPatch) -> tuple[Selected
     scales = {name: {"position": 2.0 * COLOURED_RATIO} for name in start.scales}
     end = replace(start, point=point, scales=scales)
 
-    def selecting(job: Any, fitted: Fitted, *_: Any) -> Selected:
+    def selecting(job: Any, fitted: Fit, *_: Any) -> SelectionResult:
         tried.append("terms")
-        return Selected(job, fitted)
+        return SelectionResult(job, fitted)
 
     monkeypatch.setattr(selection, "search", lambda *_, **__: end)
     monkeypatch.setattr(selection, "point_estimates", lambda *_: ())
@@ -43,7 +43,7 @@ def ended_with(thrust: float, monkeypatch: pytest.MonkeyPatch) -> tuple[Selected
     return found, tried
 
 
-def followed(selected: Selected, monkeypatch: pytest.MonkeyPatch) -> bool:
+def followed(selected: SelectionResult, monkeypatch: pytest.MonkeyPatch) -> bool:
     """Return whether disturbances are estimated of a selection's fit."""
     tried = list[str]()
     held = selected.fitted, SimpleNamespace()

@@ -11,7 +11,7 @@ from tests.tuner.uncertainty import making
 from tests.tuner.uncertainty.test_model_error import flown, problem
 from tuner.config import JobFile
 from tuner.objective.criterion import Point
-from tuner.terms.candidates import Selected, with_terms
+from tuner.terms.candidates import SelectionResult, with_terms
 from tuner.terms.selection import GAIN_AXES, refuted_by_commands, with_refuted
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
@@ -33,6 +33,6 @@ def test_commands_take_back_gains_that_are_the_files(flies, found, refuted):
     point = Point(objective.space.vector_of(numbers), point.offsets)
     fitted = making.fitted_of(objective, point)
     job = cast(Any, SimpleNamespace(fitted=tuple(flights)))
-    selected = Selected(job, fitted, (ROW,))
+    selected = SelectionResult(job, fitted, (ROW,))
     assert refuted_by_commands(selected) == refuted
     assert with_refuted(selected, refuted).kept == (() if refuted else ("rate_gain",))

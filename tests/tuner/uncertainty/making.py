@@ -23,9 +23,9 @@ from tuner.core.shipped import find_config
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.initial_conditions import SPIN_ROWS
 from tuner.objective.normal_equations import Objective
-from tuner.objective.segments import Measured, Segments
+from tuner.objective.segments import MeasuredChannel, Segments
 from tuner.objective.space import space_of
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle
 from tuner.vehicle.model import model_of, schedule_of
 
@@ -90,7 +90,7 @@ def problem(
     return with_data(exact, truth(exact), noise=np.random.default_rng(seed))
 
 
-def _sensors() -> dict[str, Measured]:
+def _sensors() -> dict[str, MeasuredChannel]:
     time = np.arange(SAMPLE_EVERY, round(SECONDS * PHYSICS) - 1, SAMPLE_EVERY) / PHYSICS
     count = len(time)
     measured = {}
@@ -99,7 +99,7 @@ def _sensors() -> dict[str, Measured]:
         compared = 3 if channel == "attitude" else read
         values = np.zeros((count, read, 2))
         values[:, 0] = 1.0 if channel == "attitude" else 0.0
-        measured[channel] = Measured(
+        measured[channel] = MeasuredChannel(
             time=jnp.asarray(np.stack([time, time], axis=-1)),
             values=jnp.asarray(values),
             weight=jnp.full((count, compared, 2), 1.0 / sigma),
@@ -124,7 +124,7 @@ def with_data(
             values = _turned(values, turn)
         elif noise is not None:
             values = values + noise.normal(size=values.shape) * NOISE[channel]
-        measured[channel] = Measured(old.time, jnp.asarray(values), old.weight)
+        measured[channel] = MeasuredChannel(old.time, jnp.asarray(values), old.weight)
     return eqx.tree_at(lambda o: o.segments.measured, objective, measured)
 
 
@@ -153,14 +153,14 @@ def criterion_of(objective: Objective, *, prior: float = 1.0) -> Criterion:
     )
 
 
-def fitted_of(objective: Objective, point: Point) -> Fitted:
+def fitted_of(objective: Objective, point: Point) -> Fit:
     scales = {name: dict.fromkeys(NOISE, 1.0) for name in FLIGHTS}
     criterion = criterion_of(objective)
     return ended(objective=objective, point=point, criterion=criterion, noise=NOISE, scales=scales)
 
 
-def ended(**found: object) -> Fitted:
+def ended(**found: object) -> Fit:
     """Return a fit that has ended, of what it found."""
     usual: dict[str, object] = {"iterations": (), "outcomes": (), "method": "gradient"}
     usual |= {"evaluations": 0, "wall_time": 0.0, "loss_best": 1.0, "converged": True}
-    return Fitted(**(usual | found))  # type: ignore[arg-type]
+    return Fit(**(usual | found))  # type: ignore[arg-type]

@@ -9,7 +9,7 @@ import pytest
 
 from tuner.equation_error.rate_controller import ControllerEstimate
 from tuner.findings.findings import Code, Finding
-from tuner.objective.information import Change, FisherInformation
+from tuner.objective.information import FisherInformation, ResidualChange
 from tuner.uncertainty.agreement import flights_disagree
 from tuner.uncertainty.model_error import ModelErrors
 
@@ -81,7 +81,7 @@ def test_what_a_voltmeter_may_have_misread_is_no_second_value():
     blocks = examination.information.blocks
     across = 0.1 * blocks[..., 1] * np.array([0.0, 1.0, 0.0, 1.0])[:, None, None]
     own = np.zeros(across.shape[:-1])
-    examination.information.changes["readings 0"] = Change(across, own, own)
+    examination.information.changes["readings 0"] = ResidualChange(across, own, own)
     assert not flights_disagree(fitted, examination)
 
 

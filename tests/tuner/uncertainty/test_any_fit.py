@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tuner.core.numerics import scaled_solve
-from tuner.objective.information import Change, FisherInformation
+from tuner.objective.information import FisherInformation, ResidualChange
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.estimates import _shares, left_out, parts_of, total_error
 
@@ -76,7 +76,7 @@ def information_of(fit: Fit) -> FisherInformation:
         scale=np.ones((1, flights)),
         lost=shrink if fit.lost else None,
         changes={
-            "physics step": Change(
+            "physics step": ResidualChange(
                 1e-3 * score[None, :, None], np.zeros((1, flights, 1)), np.zeros((1, flights, 1))
             )
         },

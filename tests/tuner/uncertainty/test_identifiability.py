@@ -7,7 +7,7 @@ import pytest
 
 from tuner.config import JobFile
 from tuner.search.listener import Listener, Reporter
-from tuner.terms.candidates import Selected
+from tuner.terms.candidates import SelectionResult
 from tuner.uncertainty import identifiability
 from tuner.uncertainty.identifiability import hold_undetermined, stand_ins_of
 from tuner.uncertainty.verdict import Reason, ReasonCode
@@ -120,7 +120,7 @@ def test_a_term_at_its_bound_that_flights_do_not_identify_is_removed(
         group=name, names=(name,), kept=True, reason=SelectionCode.PREDICTS_SECTIONS
     )
     asked = chosen.model_copy(update={"reason": SelectionCode.ASKED_FOR})
-    after, *others = Selected(job, rest, (chosen, asked)).rows_after_holding
+    after, *others = SelectionResult(job, rest, (chosen, asked)).rows_after_holding
     assert after.kept is not goes
     assert (after.reason is SelectionCode.NO_INFORMATION) is goes
     assert others == [asked]

@@ -26,11 +26,11 @@ from tuner.findings.findings import Code
 from tuner.objective.criterion import Point
 from tuner.objective.initial_conditions import SPIN_ROWS
 from tuner.objective.normal_equations import Objective
-from tuner.objective.segments import Measured, Segments
+from tuner.objective.segments import MeasuredChannel, Segments
 from tuner.objective.simulation import SETPOINTS
 from tuner.objective.space import space_of
 from tuner.recordings.flight import Flight, InitialState, Series
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.terms.candidates import with_terms
 from tuner.uncertainty.examination import examine
 from tuner.uncertainty.model_error import (
@@ -116,7 +116,7 @@ def problem(
 
 def flown(
     truth: Objective, seed: int, *, loop: bool = False
-) -> tuple[dict[str, Measured], list[Flight]]:
+) -> tuple[dict[str, MeasuredChannel], list[Flight]]:
     """Return what is measured of flights of a truth, at `RATE`, and the recordings.
 
     ``loop``: whether those hold commands and set-points, too.
@@ -124,7 +124,7 @@ def flown(
     random, time = np.random.default_rng(seed), np.arange(round(SECONDS * RATE)) / RATE
     within = ("command", SETPOINTS) if loop else ()
     channels = {
-        name: Measured(jnp.zeros((1, FLIGHTS)), jnp.zeros((1, 3, FLIGHTS)), None)
+        name: MeasuredChannel(jnp.zeros((1, FLIGHTS)), jnp.zeros((1, 3, FLIGHTS)), None)
         for name in (*NOISE, *within)
     }
     segments = replace(truth.segments, measured=channels)
@@ -145,7 +145,7 @@ def flown(
             values = values + noise
         stamps = jnp.asarray(np.repeat(time[:, None], FLIGHTS, axis=1))
         weight = jnp.full((len(values), compared, FLIGHTS), 1.0 / sigma)
-        measured[name] = Measured(stamps, jnp.asarray(values), weight)
+        measured[name] = MeasuredChannel(stamps, jnp.asarray(values), weight)
         for number, series in enumerate(recorded):
             series[name] = Series(time, values[..., number])
     for number, series in enumerate(recorded if loop else ()):
@@ -176,7 +176,7 @@ def fit_of(
     return fitted_at(objective, making.truth(objective), flights), flights
 
 
-def fitted_at(objective: Objective, point: Point, flights: list[Flight]) -> Fitted:
+def fitted_at(objective: Objective, point: Point, flights: list[Flight]) -> Fit:
     """Return a point of flights as a fit to their noise."""
     fitted = making.fitted_of(objective, point)
     criterion = replace(fitted.criterion, scale={name: jnp.ones(FLIGHTS) for name in NOISE})

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tuner.objective.information import Change, FisherInformation
+from tuner.objective.information import FisherInformation, ResidualChange
 from tuner.uncertainty.covariance import overdispersion_factors
 from tuner.uncertainty.estimates import (
     INPUT,
@@ -62,9 +62,9 @@ def regression(
     return information, fit
 
 
-def change(across: np.ndarray) -> Change:
+def change(across: np.ndarray) -> ResidualChange:
     """Return a change of the residuals that changes the slope of the loss so."""
-    return Change(across[None, None, None], np.zeros((1, 1, 1)), np.zeros((1, 1, 1)))
+    return ResidualChange(across[None, None, None], np.zeros((1, 1, 1)), np.zeros((1, 1, 1)))
 
 
 def errors(information: FisherInformation) -> tuple[np.ndarray, np.ndarray]:

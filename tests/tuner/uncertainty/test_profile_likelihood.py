@@ -13,7 +13,7 @@ from tests.tuner.uncertainty import making
 from tuner.core.errors import InputError
 from tuner.job.sensitivity import _uncertainty_with
 from tuner.objective.normal_equations import Objective
-from tuner.search.progress import Fitted
+from tuner.search.progress import Fit
 from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
 from tuner.uncertainty.examination import FullProblem, full_problem_of
 from tuner.uncertainty.identifiability import profile_likelihood
@@ -34,22 +34,22 @@ def objective() -> Objective:
 
 
 @pytest.fixture(scope="module")
-def fitted(objective: Objective) -> Fitted:
+def fitted(objective: Objective) -> Fit:
     return making.fitted_of(objective, making.truth(objective))
 
 
 @pytest.fixture(scope="module")
-def full_problem(fitted: Fitted) -> FullProblem:
+def full_problem(fitted: Fit) -> FullProblem:
     return full_problem_of(fitted.objective, fitted.point)
 
 
 @pytest.fixture(scope="module")
-def uncertainty(fitted: Fitted) -> Uncertainty:
+def uncertainty(fitted: Fit) -> Uncertainty:
     return uncertainty_of(fitted)
 
 
 @pytest.fixture(scope="module")
-def known(full_problem: FullProblem, uncertainty: Uncertainty, fitted: Fitted) -> Profile:
+def known(full_problem: FullProblem, uncertainty: Uncertainty, fitted: Fit) -> Profile:
     return profile_likelihood(full_problem, uncertainty, fitted.criterion, "moment_constant")
 
 
@@ -68,7 +68,7 @@ def test_a_well_known_coefficients_profile_is_its_interval(
 def test_an_unidentifiable_coefficient_has_an_open_profile(
     full_problem: FullProblem,
     uncertainty: Uncertainty,
-    fitted: Fitted,
+    fitted: Fit,
     known: Profile,
     tmp_path: Path,
 ) -> None:

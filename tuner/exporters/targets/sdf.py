@@ -39,7 +39,7 @@ from tuner.exporters.target import (
     xml_comment,
 )
 from tuner.result import Gate
-from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of
+from tuner.vehicle import COEFFICIENTS, ExportTag, VehicleFile, values_of
 
 #: Products of inertia below this share of the trace are zero.
 MAX_ZERO_PRODUCT = 1e-9
@@ -52,12 +52,12 @@ SPEED_LIMIT = "max_rotor_velocity"
 # numbers: of a vehicle, their tags, and those in a model
 
 
-def _entries() -> dict[str, Written]:
+def _entries() -> dict[str, ExportTag]:
     """Return coefficient -> its tag and parent element."""
     return {
         name: entry
         for name, row in COEFFICIENTS.items()
-        if isinstance(entry := row.exported_as.get("sdf"), Written)
+        if isinstance(entry := row.exported_as.get("sdf"), ExportTag)
     }
 
 

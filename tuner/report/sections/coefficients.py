@@ -31,7 +31,7 @@ from tuner.report.section import (
     Cell,
     Chart,
     Line,
-    Look,
+    LineStyle,
     PageSection,
     Panel,
     Table,
@@ -321,13 +321,13 @@ def _change(before: float, after: float) -> str:
     return f"{'+' if share > 0 else '−'}{percent(abs(share))}"
 
 
-USED = Look(PALETTE[2], marks=True)
+USED = LineStyle(PALETTE[2], marks=True)
 
 
-NOT_USED = Look(GREY, marks=True)
+NOT_USED = LineStyle(GREY, marks=True)
 
 
-RESIDUAL = Look(PALETTE[1], marks=True)
+RESIDUAL = LineStyle(PALETTE[1], marks=True)
 
 
 def bench(record: BenchRecord) -> PageSection:

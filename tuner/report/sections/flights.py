@@ -23,7 +23,7 @@ from tuner.report.section import (
     Chart,
     Dash,
     Line,
-    Look,
+    LineStyle,
     PageSection,
     Panel,
     Table,
@@ -282,11 +282,11 @@ def _chart(
     flight: str, quantity: str, unit: str, time: Array, of_term: Mapping[str, Array]
 ) -> Chart:
     clock = rounded(time, 3)
-    looks = {name: _look(number) for number, name in enumerate(of_term)}
+    styles = {name: _style(number) for number, name in enumerate(of_term)}
     panels = [
         Panel(
             [
-                Line(name.replace("_", " "), clock, rounded(values[:, axis], 5), looks[name])
+                Line(name.replace("_", " "), clock, rounded(values[:, axis], 5), styles[name])
                 for name, values in of_term.items()
                 if np.abs(values[:, axis]).max(initial=0.0) > MIN_DRAWN_FORCE
             ],
@@ -300,5 +300,7 @@ def _chart(
     )
 
 
-def _look(number: int) -> Look:
-    return Look(PALETTE[number % len(PALETTE)], dash=DASHES[number // len(PALETTE) % len(DASHES)])
+def _style(number: int) -> LineStyle:
+    return LineStyle(
+        PALETTE[number % len(PALETTE)], dash=DASHES[number // len(PALETTE) % len(DASHES)]
+    )

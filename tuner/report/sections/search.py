@@ -24,7 +24,7 @@ from tuner.report.section import (
     Cell,
     Chart,
     Line,
-    Look,
+    LineStyle,
     PageSection,
     Panel,
     Table,
@@ -64,7 +64,7 @@ def _waterfall(record: SearchRecord) -> list[Chart]:
                 f"start: {origin}",
                 [rank for rank, _ in ranked],
                 [start.loss for _, start in ranked],
-                Look(PALETTE[number % len(PALETTE)], marks=True),
+                LineStyle(PALETTE[number % len(PALETTE)], marks=True),
                 joined=False,
                 text=[f"{origin}: loss {start.loss:.6g}" for _, start in ranked],
             )
@@ -90,15 +90,20 @@ def _trace(record: SearchRecord) -> list[Chart]:
     steps = [float(number) for number in range(1, len(iterations) + 1)]
     texts = [f"{m.stage}, {'better' if m.accepted else 'tried, not kept'}" for m in iterations]
     rows = (
-        ("loss", [m.loss for m in iterations], Look(FITTED.colour, marks=True), "log"),
+        ("loss", [m.loss for m in iterations], LineStyle(FITTED.colour, marks=True), "log"),
         (
             "position RMSE [m]",
             [m.position_rmse for m in iterations],
-            Look(INITIAL.colour, marks=True),
+            LineStyle(INITIAL.colour, marks=True),
             "log",
         ),
-        ("damping λ", [m.damping for m in iterations], Look(PALETTE[3], marks=True), "log"),
-        ("horizon [s]", [m.horizon for m in iterations], Look(PALETTE[2], marks=True), "linear"),
+        ("damping λ", [m.damping for m in iterations], LineStyle(PALETTE[3], marks=True), "log"),
+        (
+            "horizon [s]",
+            [m.horizon for m in iterations],
+            LineStyle(PALETTE[2], marks=True),
+            "linear",
+        ),
     )
     panels = [
         Panel(

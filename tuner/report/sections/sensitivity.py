@@ -15,9 +15,9 @@ from tuner.report.section import (
     Bars,
     Cell,
     Chart,
-    Heat,
+    HeatMap,
     Line,
-    Look,
+    LineStyle,
     PageSection,
     Panel,
     Table,
@@ -71,7 +71,7 @@ def _by_signal(knowledge: Knowledge, names: Sequence[str]) -> Chart:
             )
         rows.append(shares)
         texts.append(sentences)
-    heat = Heat(
+    heat = HeatMap(
         columns=[_name(channel, axis) for channel, axis, _ in signals],
         rows=_labels(knowledge, names),
         values=rows,
@@ -107,7 +107,7 @@ def _over_time(knowledge: Knowledge, names: Sequence[str]) -> list[Chart]:
                     for t, c in zip(over_time.time, change, strict=True)
                 ]
             )
-        heat = Heat(
+        heat = HeatMap(
             columns=over_time.time,
             rows=_labels(knowledge, names),
             values=rows,
@@ -241,7 +241,7 @@ def _correlation(knowledge: Knowledge) -> Chart:
         [f"{a} and {b}: {r:+.2f}" for b, r in zip(names, row, strict=True)]
         for a, row in zip(names, knowledge.correlation, strict=True)
     ]
-    heat = Heat(
+    heat = HeatMap(
         columns=names,
         rows=names,
         values=[[round(r, 4) for r in row] for row in knowledge.correlation],
@@ -270,7 +270,7 @@ def residuals(known: Sequence[Residual]) -> PageSection:
                 channel.replace("_", " "),
                 [round(i * residual.spacing, 4) for i in range(1, len(residual.autocorrelation))],
                 residual.autocorrelation[1:],
-                Look(colour, width=1.2),
+                LineStyle(colour, width=1.2),
                 text=[f"{residual.flight}: {r:+.2f}" for r in residual.autocorrelation[1:]],
             )
             for residual in of_channel
@@ -339,9 +339,9 @@ def _chart(profile: Profile) -> Chart:
             "standard error's parabola",
             profile.values,
             expected,
-            Look(GREY, dash="dash", width=2.0),
+            LineStyle(GREY, dash="dash", width=2.0),
         ),
-        Line("profile", profile.values, rise, Look(FITTED.colour, width=2.0, marks=True)),
+        Line("profile", profile.values, rise, LineStyle(FITTED.colour, width=2.0, marks=True)),
     )
     panel = Panel(lines, y_title="rise of χ²", levels=((CHI_SQUARE_95, "95 %"),))
     return Chart(
@@ -398,7 +398,7 @@ def _each(indices: GlobalSensitivity) -> Chart:
     outputs = list(dict.fromkeys((i.flight, i.channel) for i in indices.indices if i.flight))
     names = list(indices.bounds)
     totals = {(i.coefficient, i.flight, i.channel): i.total for i in indices.indices}
-    heat = Heat(
+    heat = HeatMap(
         columns=[f"{flight} {channel.replace('_', ' ')}" for flight, channel in outputs],
         rows=names,
         values=[[round(totals[name, *output], 4) for output in outputs] for name in names],
@@ -447,7 +447,7 @@ def next_flight(proposals: Proposals) -> PageSection:
             ]
             for flight in proposals.flights
         ]
-        heat = Heat(
+        heat = HeatMap(
             columns=proposals.targets,
             rows=[flight.name for flight in proposals.flights],
             values=shares,

@@ -12,7 +12,7 @@ from tuner.core.content_store import ContentStore
 from tuner.core.files import MAX_BYTES
 from tuner.core.phrases import listed
 from tuner.evaluate.records import RMSE_UNITS
-from tuner.report.section import FITTED, INITIAL, Chart, Line, Look, Panel, figures, short
+from tuner.report.section import FITTED, INITIAL, Chart, Line, LineStyle, Panel, figures, short
 from tuner.result import CoefficientResult, ExportRecord, ExportRecords, RunResult
 from tuner.service.database import JobRow
 from tuner.service.errors import NotKnownError, NotNowError
@@ -137,7 +137,7 @@ def flight_pairs(a: RunResult, b: RunResult) -> list[FlightPair]:
     ]
 
 
-INTERVAL = Look(FITTED.colour, width=3.0)
+INTERVAL = LineStyle(FITTED.colour, width=3.0)
 MAX_POINTS = 600
 """Points of a curve: more would not be seen."""
 
