@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -92,11 +91,12 @@ def _refit(task: tuple[Callable[[], tuple[Job, Fit]], Draw], report: Report) -> 
 def _counted(objective: Objective, counts: NDArray[np.float64]) -> Objective:
     """Return an objective with each flight counted so many times."""
     some = (counts > 0.0)[objective.flight]
-    changed: Objective = eqx.tree_at(
-        lambda o: [measured.weight for measured in o.segments.measured.values()],
-        objective,
-        [measured.weight * some for measured in objective.segments.measured.values()],
-    )
+    segments = objective.segments
+    measured = {
+        name: replace(channel, weight=channel.weight * some)
+        for name, channel in segments.measured.items()
+    }
+    changed = replace(objective, segments=replace(segments, measured=measured))
     return changed if counts.max() <= 1.0 else replace(changed, multiplicity=counts)
 
 

@@ -1,5 +1,6 @@
 """Refits to other flights: what counts how often, and the errors that follow."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -48,6 +49,19 @@ def result_with(**errors):
     ]
     flights = [SimpleNamespace(split=split) for split in ("fit", "fit", "fit", "holdout")]
     return SimpleNamespace(coefficients=dict(zip(errors, found, strict=True)), flights=flights)
+
+
+def test_a_flight_that_is_left_out_takes_each_channel_s_own_weights_along():
+    objective = making.problem(FREE)
+    measured = objective.segments.measured
+    backwards = {name: measured[name] for name in sorted(measured, reverse=True)}
+    other = replace(objective, segments=replace(objective.segments, measured=backwards))
+    counts = np.ones(objective.flights)
+    counts[0] = 0.0
+    for name, channel in _counted(other, counts).segments.measured.items():
+        own = np.array(measured[name].weight)
+        own[..., objective.flight == 0] = 0.0
+        np.testing.assert_array_equal(channel.weight, own)
 
 
 def test_a_coefficient_that_flights_disagree_about_is_named():
