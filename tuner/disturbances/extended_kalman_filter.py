@@ -324,7 +324,9 @@ def _filter(
         def compare(change: list[Array]) -> list[Array]:
             now = observer.outputs(observer.corrected(state, change, number, 0), number)
             # a sample between two ticks is an observation of the second, wherever it lies
-            along = jax.tree.map(lambda at, to: at + to - lax.stop_gradient(to), before, now)
+            along = {
+                name: at + now[name] - lax.stop_gradient(now[name]) for name, at in before.items()
+            }
             return observer.errors(now, along, read)
 
         error, changes = jax.linearize(compare, [jnp.zeros(())] * shown)
@@ -344,7 +346,7 @@ def _filter(
         change = -update.corrections(samples, corrects)
         state = observer.corrected(state, change[:-PROCESSES], number, in_flight)
         pushed = pushed + change[-PROCESSES:]
-        before = observer.outputs(state, number)
+        before = observer.outputs(state)
 
         def advance(change: Array) -> tuple[Array, State]:
             moved = observer.corrected(state, change[:-PROCESSES], number, in_flight)
@@ -372,7 +374,7 @@ def _filter(
         first,
         jnp.zeros(PROCESSES),
         (jnp.where(diagonal, sd**2, 0.0), jnp.zeros((wide, size))),
-        observer.outputs(first, jnp.asarray(0)),
+        observer.outputs(first),
         jnp.zeros(wide, int),
     )
     return lax.scan(tick, begin, jnp.arange(lengths["turns"]))[1]
@@ -428,7 +430,7 @@ def _innovations(
             change = for_each_step(change)
         state = observer.corrected(state, change[:-PROCESSES], number, in_flight * finer)
         pushed = pushed + change[-PROCESSES:]
-        before = observer.outputs(state, number)
+        before = observer.outputs(state)
         after = observer.next(state, pushed, number, row_of(draughts, number))
         carried = after, pushed * observer.processes.retention, before, beyond
         return carried, (white, white.astype(jnp.float32))
@@ -439,7 +441,7 @@ def _innovations(
     begin = (
         first,
         jnp.zeros(PROCESSES) + still,
-        observer.outputs(first, jnp.asarray(0)),
+        observer.outputs(first),
         jnp.zeros(wide, int),
     )
     rows: tuple[Array, Array] = lax.scan(tick, begin, jnp.arange(lengths["turns"]))[1]

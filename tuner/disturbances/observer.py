@@ -193,24 +193,27 @@ class Observer(eqx.Module):
         after: State = plant.sample(state, tick)[0]
         return after
 
-    def outputs(self, state: State, tick: Array) -> dict[str, Array]:
-        """Return channel -> (c, F), the values that a recording would have."""
+    def outputs(self, state: State, tick: Array | None = None) -> dict[str, Array]:
+        """Return channel -> (c, F), the values that a recording would have.
+
+        Commands only at a given tick: they hold until the next, and nothing is read between.
+        """
         position, attitude = markers_of(self.plant.vehicle).recorded(state.motion)
-        command = state.command
-        if "command" in self.channels:
-            command = self.plant.inlet.next_command(self.plant, state, self._step(tick)).command
         rate = self.plant.senses.reading(state.motion.body_rate)
-        signals = {
+        signals: dict[str, Any] = {
             "position": (position.x, position.y, position.z),
             "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
             "body_rate": (rate.x, rate.y, rate.z),
             "rotor_speed": state.rotor_speed if state.read_speed is None else state.read_speed,
-            "command": command,
         }
+        if tick is not None and "command" in self.channels:
+            to_come = self.plant.inlet.next_command(self.plant, state, self._step(tick))
+            signals["command"] = to_come.command
         shape = self.late.shape[1:]
         return {
             name: jnp.stack([jnp.broadcast_to(leaf, shape) for leaf in signals[name]])
             for name in self.channels
+            if name in signals
         }
 
     def sampled(self, samples: dict[str, TickSamples]) -> Array:
@@ -223,14 +226,13 @@ class Observer(eqx.Module):
         """Return outputs minus samples, channel by channel, in standard deviations: m rows."""
         rows = []
         for name in self.channels:
-            sample = samples[name]
-            place = sample.place - self.late[CLOCK_OF[name]] * self.rate
-            there = before[name] + place * (now[name] - before[name])
+            sample, there = samples[name], now[name]
+            if name in before:
+                place = sample.place - self.late[CLOCK_OF[name]] * self.rate
+                there = before[name] + place * (there - before[name])
             if name == "attitude":
                 outputs = Quaternion.of(there).normalized()
                 error = Quaternion.of(sample.values).rotation_vector_to(outputs).stacked()
-            elif name == "command":
-                error = now[name] - sample.values
             elif name == "body_rate":
                 error = there + self.late[len(CLOCKS) :] - sample.values
             else:
