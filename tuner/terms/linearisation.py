@@ -201,7 +201,19 @@ class LinearisedLoss:
         from_
             (P,) change that is given; zero by default.
         """
+        free = np.sort(free)
         change = np.zeros(len(self.scaled)) if from_ is None else from_.copy()
+        key = free.tobytes(), b"" if inside is None else inside.tobytes(), change.tobytes()
+        if key not in self._steps:
+            self._steps[key] = self._stepped(free, inside, change)
+        return self._steps[key].copy()
+
+    @cached_property
+    def _steps(self) -> dict[tuple[bytes, ...], Array]:
+        """What `step` was given, as bytes -> its result: all groups are scored beside one model."""
+        return {}
+
+    def _stepped(self, free: Columns, inside: NDArray[np.bool_] | None, change: Array) -> Array:
         hessian = self.information(inside) + self.prior
         score = (self._scores if inside is None else self._scores[inside]).sum(axis=0)
         slope = score + self.pull + hessian @ change
@@ -211,9 +223,17 @@ class LinearisedLoss:
 
     def change_of_loss(self, change: Array) -> Array:
         """Return by how much each stretch's loss (S,) changes."""
-        local = change[self.columns]
-        quadratic = (local * (self.hessian @ local[..., None])[..., 0]).sum(axis=1)
-        return np.asarray((self.score * local).sum(axis=1) + 0.5 * quadratic)
+        key = change.tobytes()
+        if key not in self._changes:
+            local = change[self.columns]
+            quadratic = (local * (self.hessian @ local[..., None])[..., 0]).sum(axis=1)
+            self._changes[key] = (self.score * local).sum(axis=1) + 0.5 * quadratic
+        return self._changes[key]
+
+    @cached_property
+    def _changes(self) -> dict[bytes, Array]:
+        """A change, as bytes -> what `change_of_loss` makes of it."""
+        return {}
 
     def folds(self, by: NDArray[np.intp]) -> Iterator[NDArray[np.bool_]]:
         """Return which stretches (S,) each fold leaves out."""
