@@ -193,13 +193,13 @@ def minimised(
         for damping in DAMPINGS:
             change = sums.solved(free, slice(None), damping=damping * unit**-2.0)
             there = np.clip(point + change, low, high)
-            in_range = np.abs(change / unit).max() <= MAX_STEP
-            if in_range and (gain is None or gain(there) >= 0.0):
+            step = np.abs(there - point) / unit
+            if step.max() <= MAX_STEP and (gain is None or gain(there) >= 0.0):
                 break
         else:
             break
         point = there
-        if np.abs(change / unit).max() < STEP_TOLERANCE:
+        if step.max() < STEP_TOLERANCE:
             break
     return point
 
@@ -298,7 +298,8 @@ def filtered_sums(
     shapes = (size, size), (size,), (), (size, size)
     information, slope, loss, own = (np.zeros((parts, *shape)) for shape in shapes)
     for axis, (kernel, delay) in enumerate(zip(kernels, delays, strict=True)):
-        table = np.column_stack([one.errors[:, axis], one.columns[:, axis]])
+        acting = np.flatnonzero(np.any(one.columns[:, axis] != 0.0, axis=0))
+        table = np.column_stack([one.errors[:, axis], one.columns[:, axis, acting]])
         rows = convolved(table, known, kernel)
         if len(rows) <= delay:
             continue
@@ -310,13 +311,13 @@ def filtered_sums(
             both = np.hstack([columns, rows[:-delay, 1:]])
             both -= past @ np.linalg.lstsq(past, both, rcond=1e-9)[0]
             columns, instruments = np.hsplit(both, 2)
-        robust = huber_weights(errors, HUBER_LIMIT)
+        robust, inside = huber_weights(errors, HUBER_LIMIT), np.ix_(acting, acting)
         for unit, part in enumerate(np.array_split(np.arange(len(errors)), parts)):
             weighed = robust[part, None] * instruments[part]
             loss[unit] += 0.5 * float(np.sum(robust[part] * errors[part] ** 2))
-            information[unit] += weighed.T @ columns[part]
-            slope[unit] += weighed.T @ errors[part]
-            own[unit] += weighed.T @ instruments[part]
+            information[unit][inside] += weighed.T @ columns[part]
+            slope[unit][acting] += weighed.T @ errors[part]
+            own[unit][inside] += weighed.T @ instruments[part]
     return information, slope, loss, own
 
 

@@ -238,6 +238,29 @@ def test_each_step_of_a_regression_lowers_its_loss():
     assert reached == pytest.approx(0.5, abs=0.2)
 
 
+def test_a_coordinate_at_its_bound_neither_prolongs_a_regression_nor_dampens_others():
+    random, size = np.random.default_rng(0), 600
+    bounded, other = (
+        SimpleNamespace(
+            prior_sd=1e4, prior_mean=0.0, usual=1.0, lower=-9.0, upper=upper, scaled=lambda x: x
+        )
+        for upper in (0.5, 9.0)
+    )
+    noise, columns = 0.1 * random.normal(size=(size, 6)), random.normal(size=(size, 6, 2))
+    steps, seen = SimpleNamespace(step=0.01, known=np.ones(size, bool)), []
+
+    def at(point, *_):
+        seen.append(point.tolist())
+        return (LinearisedAccelerations(steps, noise + columns @ ([2.0, 0.3] - point), columns),)
+
+    made = SimpleNamespace(at=at, parameters=(bounded, other), flights=(None,))
+    where = {"mean": np.zeros(2), "free": np.ones(2, bool)}
+    minimised(made, np.array([0.4, 0.0]), whitening, delays=(1,) * 6, **where)
+    assert [point[0] for point in seen[1:]] == [0.5] * len(seen[1:])
+    assert len(seen) < 5
+    assert [point[1] for point in seen[1:]] == pytest.approx([0.3] * len(seen[1:]), abs=0.1)
+
+
 @pytest.fixture
 def responding():
     """A moment of gain one whose noisy input responds to its disturbance within a step."""
