@@ -18,6 +18,7 @@ from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.unit_detection import (
     Scale,
+    _medians_in,
     scale_of,
     scales_of,
     to_enu_flu,
@@ -198,3 +199,16 @@ def test_real_flights_in_other_units(path: Path) -> None:
     signals = lengths_and_attitude(flown)
     for unit in PER_METRE:
         assert units(in_unit(signals, unit)) == {unit}
+
+
+@pytest.mark.parametrize("burst", [0, 5000], ids=["even", "a burst"])
+def test_medians_in_bins_are_those_of_their_samples(burst: int) -> None:
+    """Whatever the samples' order, and where one bin holds nearly all of them."""
+    random = np.random.default_rng(0)
+    bins = random.permutation([*random.integers(0, 50, 300).tolist(), *[7] * burst])
+    values = random.normal(size=len(bins))
+    held, medians_of = _medians_in(bins)
+    assert held.tolist() == np.unique(bins).tolist()
+    for bin_, median in zip(held, medians_of(values), strict=True):
+        own = np.sort(values[bins == bin_])
+        assert median == own[len(own) // 2]
