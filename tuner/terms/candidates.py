@@ -172,12 +172,11 @@ def with_groups(
     return job, moved
 
 
-def offsets_for(fitted: Fit, objective: Objective, *, reset: Collection[str] = ()) -> Array:
-    """Return a fit's offsets as rows of another problem of the same flights; some reset to zero."""
+def offsets_for(fitted: Fit, objective: Objective) -> Array:
+    """Return a fit's offsets as rows of another problem of the same flights; new ones are zero."""
     rows = np.asarray(fitted.point.offsets)
     by_name = dict(zip(fitted.objective.of_flight, rows, strict=True))
     zeros = np.zeros(rows.shape[1])
-    by_name |= dict.fromkeys(reset, zeros)
     return np.stack([by_name.get(name, zeros) for name in objective.of_flight])
 
 

@@ -86,8 +86,8 @@ GAINS_IN_FIT = (
 class Selection:
     """Selection among candidate groups: rounds of additions, each followed by elimination.
 
-    Every fit computes all candidates, terms and conditions, whichever are in its model: fits with
-    different terms then share their compiled programs.
+    Every fit computes all terms, whichever are in its model: fits with different terms then share
+    their kernels.
     """
 
     job: Job
@@ -238,9 +238,8 @@ class Selection:
         self, state: LinearisedFit, groups: Groups, *, anew: bool = False, roughly: bool = True
     ) -> Fit:
         """Return the fit with exactly these groups, from the last fit's end or from the start."""
-        wanted, around = coefficient_names(groups), condition_names(self.candidates)
-        idle = tuple(name for name in around if name not in condition_names(groups))
-        objective, vector = self._problem(state.fitted, wanted)
+        wanted = coefficient_names(groups)
+        objective, vector = self._problem(state.fitted, wanted, condition_names(groups))
         new = [group for group in groups if group not in state.added]
         new_ones = [name for group in new for name in groups[group] if name in wanted]
         from_here = replace(
@@ -248,15 +247,12 @@ class Selection:
             objective=objective,
             point=Point(
                 with_start_values(objective.space, vector, new_ones),
-                offsets_for(state.fitted, objective, reset=idle),
+                offsets_for(state.fitted, objective),
             ),
         )
         offsets = free_parameters(self.job).offsets
-        moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
-        free_ones = Point(
-            np.ones(len(vector), bool),
-            np.vstack([offsets, np.tile(moves[:, None], offsets.shape[1])]),
-        )
+        added = np.ones((len(objective.of_flight) - len(offsets), offsets.shape[1]), bool)
+        free_ones = Point(np.ones(len(vector), bool), np.vstack([offsets, added]))
         title = f"with {len(new)} terms more" if new else f"with {len(groups)} terms"
 
         def on_progress(progress: Progress) -> None:
@@ -279,7 +275,9 @@ class Selection:
 
     def linearised(self, fitted: Fit, added: Groups) -> LinearisedFit:
         """Return a fit linearised by all candidates."""
-        objective, vector = self._problem(fitted, coefficient_names(self.candidates))
+        objective, vector = self._problem(
+            fitted, coefficient_names(self.candidates), condition_names(self.candidates)
+        )
         at = Point(vector, offsets_for(fitted, objective))
         linear = linearise(
             objective,
@@ -291,17 +289,19 @@ class Selection:
         )
         return LinearisedFit(fitted, added, linear)
 
-    def _problem(self, fitted: Fit, names: Sequence[str]) -> tuple[Objective, Array]:
+    def _problem(
+        self, fitted: Fit, names: Sequence[str], conditions: Sequence[str]
+    ) -> tuple[Objective, Array]:
         """Return the base problem with some coefficients free, and a fit's values in it (K,).
 
-        The model has all candidate terms and conditions, at their neutral values.
+        And with some conditions. The model has all candidate terms, at their neutral values.
         """
         objective = with_loop(self.fitted.objective, loop_of(fitted.objective))
         neutral = neutral_values(coefficient_names(self.candidates))
         values = {name: np.asarray(value) for name, value in neutral.items()}
         objective = replace(objective, model=with_coefficients(objective.model, values))
         objective, point = with_terms(objective, self.fitted.point, names, self.job.settings.job)
-        objective, point = with_conditions(objective, point, condition_names(self.candidates))
+        objective, point = with_conditions(objective, point, conditions)
         own, pairs = fitted.vector, zip(objective.space.names, point.coefficients, strict=True)
         return objective, np.array([own.get(name, neutral) for name, neutral in pairs])
 
