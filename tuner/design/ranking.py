@@ -244,14 +244,33 @@ def rank_next_flights(
     criterion
         Of the fit, with the weights of the recorded residuals.
     """
-    full_problem, found = examination.full_problem, candidates(arena)
-    flights, at_once = [*found.values()], max(full_problem.objective.segments.count, LANES)
+    full_problem, fitted = examination.full_problem, examination.uncertainty
+    count, found = len(fitted.names), candidates(arena)
+    names = tuple(examination.sensitivity.steps)
+    verdicts = {name: fitted.estimates[name].verdict for name in fitted.names}
+    verdicts |= {
+        name: fixed_one.estimates[name].verdict for name, fixed_one in examination.of_fixed.items()
+    }
+    weak = [name for name in names if verdicts[name] is not Verdict.WELL_KNOWN]
+    free = [name for name in weak if name in fitted.names]
+    fixed = [
+        name
+        for name in weak
+        if name in examination.of_fixed and COEFFICIENTS[name].informed_by != "weighing"
+    ]
+    targets = free or fixed or list(fitted.names)
+    recorded, vector = full_problem.objective, full_problem.point.coefficients
+    now = examination.information.data + examination.information.prior / PRIOR_WIDENING**2
+    if free or not fixed:  # nothing is asked of those that were not fitted
+        recorded, vector = replace(recorded, space=full_problem.fit_space), vector[:count]
+        now = now[:count, :count]
+    flights, at_once = [*found.values()], max(recorded.segments.count, LANES)
     kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
     gains, flown = [], []
     for first in range(0, len(flights), at_once):
         some = flights[first : first + at_once]
-        objective = candidate_problem(full_problem.objective, some, seconds=seconds)
-        point = objective.start(full_problem.point.coefficients)
+        objective = candidate_problem(recorded, some, seconds=seconds)
+        point = objective.start(vector)
         scales = {
             name: np.full(len(some), float(np.median(scale)))
             for name, scale in criterion.scale.items()
@@ -268,21 +287,6 @@ def rank_next_flights(
         inside = _stays_inside(objective, jacobian.residuals, arena)
         gains += list(information.blocks.sum(axis=(0, 2)))
         flown += list(~information.crashed & inside)
-    now = examination.information.data + examination.information.prior / PRIOR_WIDENING**2
-    names, fitted = tuple(examination.sensitivity.steps), examination.uncertainty
-    count = len(fitted.names)
-    verdicts = {name: fitted.estimates[name].verdict for name in fitted.names}
-    verdicts |= {
-        name: fixed_one.estimates[name].verdict for name, fixed_one in examination.of_fixed.items()
-    }
-    weak = [name for name in names if verdicts[name] is not Verdict.WELL_KNOWN]
-    free = [name for name in weak if name in fitted.names]
-    fixed = [
-        name
-        for name in weak
-        if name in examination.of_fixed and COEFFICIENTS[name].informed_by != "weighing"
-    ]
-    targets = free or fixed or list(fitted.names)
     rows = [
         Proposal(
             name=flight,
