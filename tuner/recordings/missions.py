@@ -156,13 +156,21 @@ def _split_at_pose_pauses(mission: Mission, pose: Array) -> list[Mission]:
 
 
 def _first_motion(series: Mapping[str, Series], start: float, end: float) -> float:
-    """Return the time at which the reference begins to move; the start if it does not."""
+    """Return the time at which the reference begins to move; the start if it does not.
+
+    That is its first sample with a velocity, or the last one before its position changes.
+    """
     firsts: list[float] = []
-    for name in ("reference_position", "reference_velocity"):
-        if name in series:
-            samples = series[name].between(start, end).complete()
-            away = np.abs(samples.values - samples.values[:1]).max(axis=1)
-            firsts += samples.time[away > MAX_REST_MOTION][:1].tolist()
+    if "reference_velocity" in series:
+        samples = series["reference_velocity"].between(start, end).complete()
+        moves = np.abs(samples.values).max(axis=1, initial=0.0) > MAX_REST_MOTION
+        firsts += samples.time[moves][:1].tolist()
+    if "reference_position" in series:
+        samples = series["reference_position"].between(start, end).complete()
+        away = np.abs(samples.values - samples.values[:1]).max(axis=1)
+        moved = np.flatnonzero(away > MAX_REST_MOTION)[:1]
+        rest, moving = samples.time[moved - 1], samples.time[moved]
+        firsts += np.where(moving - rest < MAX_PAUSE_S, rest, moving).tolist()
     return min(firsts, default=start)
 
 
