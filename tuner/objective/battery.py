@@ -131,7 +131,7 @@ def _lagged(time: Numbers, values: Numbers) -> Numbers:
     return values + _behind(time.tobytes(), values.astype(float).tobytes()).reshape(values.shape)
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=32)
 def _behind(times: bytes, values_there: bytes) -> Numbers:
     """Return the lag's output minus its input, float64, kept for each time a voltage is asked."""
     time = np.frombuffer(times)
