@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
@@ -61,8 +61,16 @@ STRAY_RATIO = 3.0
 """Residuals over those of the median flight from which a flight has a smaller weight."""
 
 
-class Objective(eqx.Module):
+STATIC = {"static": True}
+"""Of what is no leaf of a pytree."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Objective:
     """A fit as a function of a point.
+
+    A pytree, but no module of equinox: the methods of one are modules that each call makes.
 
     Attributes
     ----------
@@ -78,17 +86,17 @@ class Objective(eqx.Module):
 
     model: Model
     segments: Segments
-    space: Space = eqx.field(static=True)
-    schedule: Schedule = eqx.field(static=True)
-    samples: int = eqx.field(static=True)
-    limits: Limits = eqx.field(static=True)
-    memory: int = eqx.field(static=True, default=MEMORY)
+    space: Space = field(metadata=STATIC)
+    schedule: Schedule = field(metadata=STATIC)
+    samples: int = field(metadata=STATIC)
+    limits: Limits = field(metadata=STATIC)
+    memory: int = field(default=MEMORY, metadata=STATIC)
     """Largest size of derivatives, bytes: segments beyond it take turns."""
-    conditions: tuple[str, ...] = eqx.field(static=True, default=())
+    conditions: tuple[str, ...] = field(default=(), metadata=STATIC)
     """Names of the estimated per-flight conditions, of `tuner.vehicle.conditions`."""
     multiplicity: Float[Array, " N"] | None = None
     """Multiplicity of each flight in loss, gradient and Hessian; None is 1."""
-    differentiated: bool = eqx.field(static=True, default=True)
+    differentiated: bool = field(default=True, metadata=STATIC)
     """Whether it is differentiated, too: the same program then computes values alone."""
 
     @property
