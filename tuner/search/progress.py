@@ -22,6 +22,7 @@ from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings.flight import Flight
+from tuner.recordings.notes import NoteCode
 from tuner.search.listener import Iteration, Outcome, PointEstimate
 from tuner.search.problem import Job
 from tuner.search.stages import Stage
@@ -373,20 +374,38 @@ def impossible_inertia(job: Job, fitted: Fit) -> tuple[str, ...]:
     return tuple(name for name in inertia if name in fit)
 
 
+SAME_CLOCK_S = 0.002
+"""Flights whose poses are late by the same, but for this, share a clock."""
+
+
 def offsets_of(job: Job, fitted: Fit) -> dict[str, float]:
     """Return flight -> s by which its pose stamps are late.
 
-    Those of fitted flights were estimated; held-out ones get their median, without spins, which
-    hardly show it.
+    Those of fitted flights were estimated. A held-out one whose stamps were not moved when it was
+    read is as late as most of these were recorded, spins left out, which hardly show it.
     """
     pose = np.asarray(fitted.point.offsets)[CLOCKS.index("pose")] * OFFSET_UNIT
     late = {flight.name: float(of) for flight, of in zip(job.fitted, pose, strict=True)}
-    free = [r.flight for r in job.recordings if r.time_offset is None]
-    shown = [late[f.name] for f in free if f.name in late and f.yaw_rate_setpoint is None]
-    late |= {f.name: float(np.median(shown)) for f in free if shown and f.name not in late}
+    free = {r.flight.name: r.flight for r in job.recordings if r.time_offset is None}
+    recorded = np.array(
+        [
+            late[name] + _moved_by(flight)
+            for name, flight in free.items()
+            if name in late and flight.yaw_rate_setpoint is None
+        ]
+    )
+    usual = float(np.median(recorded)) if len(recorded) else 0.0
+    if 2 * np.sum(np.abs(recorded - usual) < SAME_CLOCK_S) > len(recorded):
+        late |= {name: usual for name, f in free.items() if name not in late and not _moved_by(f)}
     return {
         r.flight.name: (r.time_offset or 0.0) + late.get(r.flight.name, 0.0) for r in job.recordings
     }
+
+
+def _moved_by(flight: Flight) -> float:
+    """Return by how many s its pose's stamps were moved back when it was read."""
+    moved = [note for note in flight.notes if note.code is NoteCode.POSE_MOVED]
+    return sum(note.numbers["seconds"] for note in moved)
 
 
 def conditions_of(job: Job, fitted: Fit) -> dict[str, dict[str, float]]:

@@ -16,6 +16,7 @@ from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import OFFSETS
 from tuner.options import Options
 from tuner.recordings.flight import Series
+from tuner.recordings.notes import NoteCode
 from tuner.search.job_flights import (
     JobFlight,
     read_recordings,
@@ -207,21 +208,38 @@ def test_little_is_not_looked_at(flown):
     )
 
 
-def test_a_held_out_flight_has_the_clock_of_the_fitted_ones(flights):
+@pytest.mark.parametrize(
+    ("late", "moved", "usual"),
+    [
+        ((0.017, 0.018, 0.03), 0.0, 0.018),
+        ((0.0, -0.055), 0.055, 0.0),  # the fit takes back what was moved in vain
+        ((0.0, 0.03), 0.0, 0.0),  # they agree on none
+    ],
+)
+def test_a_held_out_flight_has_the_clock_of_the_fitted_ones(flights, late, moved, usual):
     spin, circle = flights
-    fitted = [spin, *(replace(circle, name=name) for name in "abc")]
-    held_out, given = replace(circle, name="held out"), replace(circle, name="given")
+    note = NoteCode.POSE_MOVED.note(seconds=moved)
+    last = replace(circle, name="last", notes=(note,) if moved else ())
+    fitted = [spin, *(replace(circle, name=str(i)) for i in range(len(late) - 1)), last]
+    others = {
+        "held out": (circle, None, usual),
+        "given": (circle, 0.005, 0.005),
+        "moved": (replace(circle, notes=(NoteCode.POSE_MOVED.note(seconds=0.04),)), None, 0.0),
+    }
     recordings = [
         *(JobFlight(flight, time_offset=None) for flight in fitted),
-        JobFlight(held_out, time_offset=None, holdout=True),
-        JobFlight(given, time_offset=0.005, holdout=True),
+        *(
+            JobFlight(replace(flight, name=name), time_offset=given, holdout=True)
+            for name, (flight, given, _) in others.items()
+        ),
     ]
     offsets = np.zeros((len(OFFSETS), len(fitted)))
-    offsets[OFFSETS.index("pose")] = np.array([0.0, 0.017, 0.018, 0.03]) / OFFSET_UNIT
+    offsets[OFFSETS.index("pose"), 1:] = np.array(late) / OFFSET_UNIT
     found = offsets_of(
         SimpleNamespace(recordings=recordings, fitted=fitted),
         SimpleNamespace(point=SimpleNamespace(offsets=offsets)),
     )
-    assert found == pytest.approx(
-        {SPIN: 0.0, "a": 0.017, "b": 0.018, "c": 0.03, "held out": 0.018, "given": 0.005}
+    assert [found[flight.name] for flight in fitted] == pytest.approx([0.0, *late])
+    assert {name: found[name] for name in others} == pytest.approx(
+        {name: expected for name, (*_, expected) in others.items()}
     )
