@@ -73,8 +73,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Have no search for garbage look through all that the tests have imported."""
+    """Have searches for garbage leave out all that the tests have imported, and be a tenth as many.
+
+    They take a fiftieth of a process's time else, most of it in what stays.
+    """
     gc.freeze()
+    gc.set_threshold(10 * gc.get_threshold()[0], *gc.get_threshold()[1:])
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -79,6 +79,7 @@ class Client:
             base_url=self.url,
             headers={"Authorization": f"Bearer {token}"} if token else {},
             timeout=httpx.Timeout(30.0, read=300.0, write=300.0),
+            verify=address.scheme == "https",  # without, no certificates are read
         )
 
     @taking(FitOptions)

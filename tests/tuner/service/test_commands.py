@@ -313,3 +313,11 @@ def test_a_missing_extra_is_named_in_one_line(package, arguments, said):
     assert done.returncode == 2, done.stderr
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("scheme", ["http", "https"])
+def test_certificates_are_checked_where_there_are_any(scheme, monkeypatch):
+    given = {}
+    monkeypatch.setattr(httpx, "Client", lambda **more: given.update(more))
+    Client(f"{scheme}://somewhere")
+    assert given["verify"] is (scheme == "https")

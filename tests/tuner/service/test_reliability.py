@@ -45,6 +45,11 @@ def free_port() -> int:
     return int(held.getsockname()[1])
 
 
+def asking(port: int) -> httpx.Client:
+    """Return a client of a server here, which reads no certificates."""
+    return httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30, verify=False)
+
+
 @contextmanager
 def server(
     data: Path, port: int, database: str = "", *, real: bool = False
@@ -57,7 +62,7 @@ def server(
         until = time.monotonic() + 60
         while True:
             try:
-                if httpx.get(f"http://127.0.0.1:{port}/healthz").status_code == 200:
+                if httpx.get(f"http://127.0.0.1:{port}/healthz", verify=False).status_code == 200:
                     break
             except httpx.TransportError:
                 assert process.is_alive()
@@ -74,7 +79,7 @@ def killed_again_and_again(data: Path, table: Path, kills: int, database: str = 
     port, chance, ids = free_port(), random.Random(7), []
     for _ in range(kills):
         with server(data, port, database) as process:
-            with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
+            with asking(port) as client:
                 recording = upload(client, table.read_bytes())
                 ids.append(submit(client, recording, namespace="slow"))
                 while (
@@ -86,7 +91,7 @@ def killed_again_and_again(data: Path, table: Path, kills: int, database: str = 
             process.join()
     with (
         server(data, port, database),
-        httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client,
+        asking(port) as client,
     ):
         return [ended(client, job, within=120) for job in ids]
 
@@ -128,7 +133,7 @@ def test_a_server_that_is_killed_at_twenty_random_moments(tmp_path, table):
 
 def test_workers_end_with_their_server_and_a_stopped_server_leaves_its_jobs(tmp_path, table):
     data, port = tmp_path / "data", free_port()
-    with server(data, port) as process, httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
+    with server(data, port) as process, asking(port) as client:
         job = submit(client, upload(client, table.read_bytes()), namespace="slow")
         while not client.get(f"/api/v1/jobs/{job}").json()["iteration"]:
             time.sleep(0.05)
@@ -141,7 +146,7 @@ def test_workers_end_with_their_server_and_a_stopped_server_leaves_its_jobs(tmp_
             ("queued", 0, None)
         ]
     rows.close()
-    with server(data, port), httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
+    with server(data, port), asking(port) as client:
         assert ended(client, job)["state"] == "done"
 
 
