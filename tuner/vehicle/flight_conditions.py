@@ -198,6 +198,7 @@ SURROUNDING_ROWS = (
         neutral=0.0,
         group="tachometer_lag",
         part="tachometer",
+        is_lag=True,
         exported_as=_OUTSIDE,
     ),
     _factor(

@@ -281,6 +281,14 @@ def test_lags_of_some_groups_are_put_in(chosen, among) -> None:
     assert {*selected.kept} == {*(among or ("motor_lag", "gyro_filter"))}
 
 
+def test_a_short_lag_of_tachometers_is_judged_by_a_fit_with_it(chosen) -> None:
+    lag = row("tachometer_lag", SelectionCode.IMMATERIAL)
+    innovation = seen([lag], {"tachometer_lag": 0.06})  # its filter's smoothing is of second order
+    assert chosen(innovation) is None
+    selected, _ = chosen(innovation, lags=True)
+    assert selected.kept == ("tachometer_lag",)
+
+
 def test_an_insignificant_term_is_not_refitted(chosen) -> None:
     assert chosen(seen([row("motor_lag", SelectionCode.IMMATERIAL)], {}), lags=True) is None
 
