@@ -20,7 +20,7 @@ def _installed() -> int:
         return 0
 
 
-MOST_MEMORY = min(max(_installed() // 8, 900 * MIB), 2000 * MIB)
+MOST_MEMORY = min(max(_installed() // 8, 900 * MIB), 3000 * MIB)
 """bytes of a process at the end of a module beyond which its compiled programs are dropped.
 
 An eighth of the machine's memory, for two processes and what they start: what is dropped is traced

@@ -283,7 +283,8 @@ def _judge(signal: str, flown: FlownSignals) -> tuple[SignalReading | None, Sequ
     """Return the right reading of a signal of `PAIRS`, or a doubt."""
     pair = PAIRS[signal]
     change, recorded = pair.compared[-1](flown)
-    slower, faster = sorted((rms(change), rms(recorded)))
+    size = rms(change)
+    slower, faster = sorted((size, rms(recorded)))
     moves = slower >= pair.min_motion
     if not moves:
         ups = np.nansum([change[:, 2], recorded[:, 2]], axis=1)
@@ -303,9 +304,7 @@ def _judge(signal: str, flown: FlownSignals) -> tuple[SignalReading | None, Sequ
         reading: _residual_share(change, values)
         for reading, values in tried.items()
         # noise favours small units: the slope tells sizes apart whatever the noise
-        if rms(change)
-        < MAX_SIZE_RATIO * alike[reading] * rms(values)
-        < MAX_SIZE_RATIO**2 * rms(change)
+        if size < MAX_SIZE_RATIO * alike[reading] * rms(values) < MAX_SIZE_RATIO**2 * size
     }
     best = min(shares, key=lambda reading: shares[reading], default=None)
     if best is not None:
