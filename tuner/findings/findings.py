@@ -404,7 +404,7 @@ class Code(CodeWithText):
         "",
     )
     FLIGHTS_DISAGREE = (
-        "flights_disagree",  # difference, error (shares); names: the coefficient
+        "flights_disagree",  # difference, error (shares, else in a unit); names: coefficient, unit?
         sentences.flights_disagree,
         "Fit them by themselves: their vehicle, payload, propellers, battery or gains may differ.",
     )

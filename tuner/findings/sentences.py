@@ -406,10 +406,11 @@ TERM_SENTENCES: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
 
 def flights_disagree(finding: Finding) -> str:
     """Return by how much another value of a coefficient some flights call for."""
-    difference, (name,) = finding.numbers["difference"], finding.names
+    difference, error = (finding.numbers[of] for of in ("difference", "error"))
+    (name, *unit), size = finding.names, 1.0 if finding.names[1:] else 100.0
     return (
         f"Flights disagree: these call for a {name} that is "
-        f"{with_error(100.0 * abs(difference), 100.0 * finding.numbers['error'])} % "
+        f"{' '.join([with_error(size * abs(difference), size * error), *(unit or '%')]).strip()} "
         f"{'higher' if difference > 0.0 else 'lower'} than the others'."
     )
 

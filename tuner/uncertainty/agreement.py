@@ -81,12 +81,14 @@ def flights_disagree(fitted: Fit, examination: Examination) -> tuple[Finding, ..
     if not sure or abs(split.difference) < MIN_DIFFERENCE * reference:
         return ()
     flights = ", ".join(uncertainty.flights[flight] for flight in split.flights)
+    name, unit = names[split.number], tuple[str, ...]()
+    if COEFFICIENTS[name].neutral == 0.0:  # a share of about nothing says nothing
+        space = fitted.objective.space
+        if not space.is_log[space.names.index(name)]:
+            reference, unit = 1.0, (COEFFICIENTS[name].unit,)
     return (
         Code.FLIGHTS_DISAGREE.warning(
-            flights,
-            names[split.number],
-            difference=split.difference / reference,
-            error=error / reference,
+            flights, name, *unit, difference=split.difference / reference, error=error / reference
         ),
     )
 

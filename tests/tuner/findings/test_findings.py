@@ -278,6 +278,8 @@ def test_numbers_stand_in_the_unit_that_people_use():
     assert "0.2 ms" in remedy(MADE[Code.FINER_THAN_STEPS])
     assert "to the power 1.930 ± 0.004, slower" in sentence(MADE[Code.TERM_SHOWS])
     assert "a motor_constant that is 1.90 ± 0.06 % lower" in sentence(MADE[Code.FLIGHTS_DISAGREE])
+    tilted = Code.FLIGHTS_DISAGREE.warning("a", "marker_tilt_z", "rad", difference=0.19, error=0.01)
+    assert "a marker_tilt_z that is 0.19 ± 0.01 rad higher" in sentence(tilted)
     assert "--fix mass" in remedy(MADE[Code.SINGULAR_DIRECTION])
     assert "CMA-ES then searched more widely and ended lower" in sentence(
         MADE[Code.STARTS_DISAGREE]

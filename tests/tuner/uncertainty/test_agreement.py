@@ -59,6 +59,13 @@ def fit_of(
     return SimpleNamespace(findings=(), held={}, objective=objective), examination
 
 
+def of_names(fitted, examination, names):
+    """Return a fit and its examination with coefficients of other names, none of them in logs."""
+    examination.uncertainty.names = names
+    fitted.objective.space = SimpleNamespace(names=names, is_log=np.zeros(COUNT, bool))
+    return fitted, examination
+
+
 def test_flights_of_another_vehicle_are_named_with_the_coefficient():
     (found,) = flights_disagree(*fit_of(0, 0.1))
     assert (found.subject, found.names) in (("a, c", NAMES[1:2]), ("b, d", NAMES[1:2]))
@@ -67,6 +74,16 @@ def test_flights_of_another_vehicle_are_named_with_the_coefficient():
         0.1, abs=4.0 * found.numbers["error"]
     )
     assert found.numbers["error"] < 0.01
+
+
+def test_what_is_nearly_zero_differs_by_so_much_and_not_by_a_share():
+    fitted, examination = fit_of(0, 0.1)
+    (as_share,) = flights_disagree(fitted, examination)
+    examination.uncertainty.reference = 1e-4 * np.ones(COUNT)
+    names = (NAMES[0], "marker_tilt_z", *NAMES[2:])
+    (found,) = flights_disagree(*of_names(fitted, examination, names))
+    assert found.names == ("marker_tilt_z", "rad")
+    assert found.numbers == pytest.approx(as_share.numbers)
 
 
 @pytest.mark.parametrize(("memory", "shift"), [(1, 0.0), (10, 0.0), (1, 0.02)])
@@ -113,7 +130,7 @@ def test_held_coefficients_and_reported_flights_are_left_out():
 )
 def test_gusts_are_no_second_value_of_what_set_points_hide(name, said):
     fitted, examination = fit_of(0, 0.1)
-    examination.uncertainty.names = ("inertia_xx", name, "moment_constant")
+    fitted, examination = of_names(fitted, examination, ("inertia_xx", name, "moment_constant"))
     assert flights_disagree(fitted, examination)
     fitted.findings = (Finding(Code.DISTURBANCES_FOLLOWED, "info", "flights", {}),)
     assert bool(flights_disagree(fitted, examination)) is said
