@@ -24,7 +24,7 @@ TRUTH = {
     "rate_gain_yaw": 0.93,
     "integral_gain": 1.3,
     "gyro_cutoff_factor": 0.8,
-    "derivative_cutoff_factor": 1.4,
+    "derivative_cutoff_factor": 2.0,
     "attitude_gain": 1.08,
 }
 GROUPS = {
@@ -51,8 +51,11 @@ def selected(monkeypatch, groups=GROUPS, **given):
 @pytest.mark.parametrize("setpoints", [False, True], ids=["reference", "setpoints"])
 def test_they_are_found_where_they_flew_and_their_intervals_hold_the_truth(monkeypatch, setpoints):
     result = selected(monkeypatch, effects=TRUTH, setpoints=setpoints)
-    acting = [group for group in GROUPS if not (setpoints and group == "attitude_gain")]
-    assert sorted(row.group for row in result.rows) == sorted(result.kept) == sorted(acting)
+    # set-points leave the attitude controller out; beside the gyro's filter and without them, the
+    # derivative's is worth less than a percent of the loss
+    unseen = "attitude_gain" if setpoints else "derivative_filter"
+    acting = [group for group in GROUPS if group != unseen]
+    assert sorted(result.kept) == sorted(acting)
     known = examine(result.fitted, selection_shifts=result.selection_shifts).uncertainty.estimates
     base = result.job.space.numbers(result.job.space.initial)
     for name in (*BASE, *(name for group in acting for name in GROUPS[group])):
