@@ -61,7 +61,8 @@ class ControllerEstimate(NamedTuple):
 
     ``part`` is of `PARTS`; ``value`` the gain over the file's, or s by which an axis responds later
     to its gyro than the file's filters and D explain; ``sd`` its standard error; ``differs``
-    whether the difference is significant and large enough; ``flight`` the only one with that gain.
+    whether the difference is significant and large enough; ``flight`` the only one with that gain;
+    ``simulated_p`` the axis' P as simulated signals show it, less than the file's where they clip.
     """
 
     axis: str
@@ -70,6 +71,7 @@ class ControllerEstimate(NamedTuple):
     sd: float
     differs: bool
     flight: str = ""
+    simulated_p: float = float("nan")
 
 
 def estimate_controller(
@@ -90,6 +92,7 @@ def estimate_controller(
             one.sd,
             one.is_significant(FALSE_ALARM_LEVEL / tests)
             and abs(one.value - one.neutral) > MIN_CHANGE[part],
+            simulated_p=one.simulated_p,
         )
         for name, parts in zip(AXES, known, strict=True)
         for part, one in parts.items()
@@ -147,12 +150,16 @@ def _apart(
 
 
 class _Part(NamedTuple):
-    """A part's value, the file's, its standard error, and contributions of stretches (S,)."""
+    """A part's value, the file's, its standard error, and contributions of stretches (S,).
+
+    ``simulated_p`` as of a `ControllerEstimate`.
+    """
 
     value: float
     neutral: float
     sd: float
     moves: Array
+    simulated_p: float = float("nan")
 
     def is_significant(self, level: float) -> bool:
         """Return whether it differs from the file's, by its error and by the stretches' scatter."""
@@ -206,7 +213,8 @@ def _axis_estimates(
     for name, (value, neutral, direction) in along.items():
         weights = inverse.T @ direction
         sd = float(np.sqrt(max(weights @ square @ weights, 0.0)))
-        parts[name] = _Part(float(value), neutral, sd, np.array(scores) @ weights)
+        moves = np.array(scores) @ weights
+        parts[name] = _Part(float(value), neutral, sd, moves, float(of_file[0]))
     return parts
 
 

@@ -380,11 +380,20 @@ def model_error_findings(
 
 
 def gains_far_off(fitted: Fit, flights: Sequence[Flight]) -> Iterator[Finding]:
-    """Return findings on gains far from the file's; arguments are those of `model_errors_of`."""
+    """Return findings on gains far from the file's; arguments are those of `model_errors_of`.
+
+    An axis is left out whose simulated signals show far less than the file's P: motors clip. A fit
+    that is not at its minimum may spin a vehicle that it cannot turn.
+    """
+    rate = fitted.objective.model.controller.rate
+    gains = np.asarray(rate.p.stacked() * rate.k.stacked())
+    of_file = dict(zip(AXES, gains, strict=True))
     return _controller_findings(
         one
         for one in answers_of(fitted, flights)
-        if one.part != "late" and not 1.0 / FAR_OFF_GAIN < one.value < FAR_OFF_GAIN
+        if one.part != "late"
+        and not 1.0 / FAR_OFF_GAIN < one.value < FAR_OFF_GAIN
+        and not one.simulated_p * FAR_OFF_GAIN < of_file[one.axis]
     )
 
 

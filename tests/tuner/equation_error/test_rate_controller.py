@@ -70,6 +70,20 @@ def test_the_file_that_flew_is_not_doubted():
     assert sum(bool(told(seed)) for seed in range(60)) <= 1
 
 
+@pytest.mark.parametrize("limit", [np.inf, 0.05])
+def test_motors_that_clip_in_the_simulation_show_less_p_than_its_file(limit):
+    random = np.random.default_rng(1)
+    simulated = flight(random)
+    clipped = simulated._replace(torque=np.clip(simulated.torque, -limit, limit))
+    found = estimate_controller([flight(random, gusts=0.2, noise=0.01)], [clipped])
+    shown = [one.simulated_p for one in found if one.part == "P"]
+    assert len(shown) == len(AXES)
+    if limit == np.inf:
+        assert shown == pytest.approx([P_GAIN] * 3, rel=0.05)
+    else:
+        assert max(shown) < 0.7 * P_GAIN
+
+
 def four_flights(seed, p):
     """Return four recorded flights, of which the third has another P, and the simulated ones."""
     random = np.random.default_rng(seed)

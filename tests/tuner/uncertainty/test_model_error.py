@@ -36,6 +36,7 @@ from tuner.uncertainty.examination import examine
 from tuner.uncertainty.model_error import (
     ModelErrors,
     alternatives_of,
+    answers_of,
     gains_far_off,
     model_error_findings,
     model_errors_of,
@@ -343,6 +344,17 @@ def test_a_gain_that_is_far_off_is_reported_beside_the_fit(factor):
     (found,) = (one for one in said if one.names[0] == "P")
     assert found.names[1:] == ("roll", "pitch")
     assert found.numbers["roll"] == pytest.approx(factor, abs=0.05)
+
+
+def test_a_gain_is_not_far_off_where_the_simulation_s_motors_clip(monkeypatch):
+    """As of a vehicle that a fit not at its minimum spins faster than its rotors turn it."""
+    fitted, flights = flown_with_p(1.5)
+    answers = [
+        one._replace(simulated_p=0.7 * one.simulated_p) for one in answers_of(fitted, flights)
+    ]
+    monkeypatch.setattr("tuner.uncertainty.model_error.answers_of", lambda *_: answers)
+    assert answers
+    assert not list(gains_far_off(fitted, flights))
 
 
 def test_odd_flights_say_nothing_of_the_controller_or_the_model(monkeypatch):
