@@ -458,9 +458,10 @@ def find_job_file(flights: Iterable[Path]) -> Path | None:
     """
     folders = {flight.parent.resolve(): flight.parent for flight in flights}
     files = [shown / JOB_FILE for shown in folders.values() if os.path.lexists(shown / JOB_FILE)]
-    misnamed = [shown / "tune.yml" for shown in folders.values() if (shown / "tune.yml").exists()]
-    if misnamed and not files:
-        raise ConfigError(misnamed[0], "is not read", f"call it {JOB_FILE}")
+    for shown in folders.values():
+        misnamed = shown / "tune.yml"
+        if os.path.lexists(misnamed) and shown / JOB_FILE not in files:
+            raise ConfigError(misnamed, "is not read", f"call it {JOB_FILE}")
     if len(files) > 1:
         raise ConfigError(
             files[1], f"is a second job file beside {files[0]}", "name one of them with --config"

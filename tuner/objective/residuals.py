@@ -97,6 +97,7 @@ def residuals(
     """
     measured = segments.measured[name]
     time, values, weight = map(np.asarray, (measured.time, measured.values, measured.weight))
+    # column by column: `any` along an axis in the middle takes four times as long
     known = np.logical_or.reduce([*np.moveaxis(weight != 0.0, 1, 0)])
     used = np.ascontiguousarray(((time * reading.rate < reading.horizon - 1) & known).T)
     most = int(used.sum(axis=1).max(initial=0))

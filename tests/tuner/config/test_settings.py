@@ -84,6 +84,10 @@ def test_a_job_file_or_side_car_that_cannot_be_read_is_not_passed_over(lab):
     (lab / "tune.yaml").rename(lab / "tune.yml")
     with pytest.raises(ConfigError, match=r"tune.yml: is not read; call it tune.yaml"):
         find_job_file([lab / "a.bag"])
+    (other := lab.parent / "other").mkdir()
+    (other / "tune.yaml").write_text("mass: 2\n")
+    with pytest.raises(ConfigError, match=r"tune.yml: is not read"):  # beside another folder's
+        find_job_file([other / "b.bag", lab / "a.bag"])
     for name in ("tune.yaml", "a.yaml"):
         (lab / name).symlink_to(lab / "unmounted" / name)
     with pytest.raises(ConfigError, match=r"tune.yaml: is a link to nothing"):
