@@ -385,7 +385,8 @@ REMARKS: Mapping[str, str] = {
     ),
     "not_first_order": (
         "The response is not first order: a second lag of {milliseconds:.1f} ms explains "
-        "{percent} of what remains."
+        "{percent} of what remains; the standard errors hold what it moves. Check whether the "
+        "tachometer filters."
     ),
     "points": "{points:.0f} points.",
     "explained": (

@@ -21,6 +21,7 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array, robust_sd, student_factor
 from tuner.ground.measurement import Curve
 from tuner.recordings.content import Content, ReadOptions, read_content
+from tuner.recordings.defects import is_held
 from tuner.recordings.recording import TABLE_TOPIC, Clock, TabularRecording
 
 OUTLIER_SIGMAS = 3.0
@@ -97,13 +98,24 @@ def _plateau(time: Array, first: int, end: int) -> Plateau | None:
     )
 
 
-def is_inlier(values: Array) -> NDArray[np.bool_]:
-    """Return (n,) flags of values within `OUTLIER_SIGMAS` robust deviations of their median."""
+def resolution(values: Array) -> float:
+    """Return the step of a sensor's values (n,), in their unit; 0 where all are one."""
+    distinct = np.unique(values[np.isfinite(values)])
+    steps = np.diff(distinct)
+    steps = steps[steps > 1e-9 * np.abs(distinct).max(initial=0.0)]
+    return float(steps.min()) if len(steps) else 0.0
+
+
+def is_inlier(values: Array, step: float = 0.0) -> NDArray[np.bool_]:
+    """Return (n,) flags of values within `OUTLIER_SIGMAS` robust deviations of their median.
+
+    Neighbours in a sensor's resolution ``step`` are no outliers.
+    """
     finite = np.isfinite(values)
     if not finite.any():
         return finite
     middle = np.median(values[finite])
-    spread = max(float(robust_sd(values[finite] - middle)), 1e-12 * abs(middle))
+    spread = max(float(robust_sd(values[finite] - middle)), 0.5 * step, 1e-12 * abs(middle))
     return np.asarray(finite & (np.abs(values - middle) <= OUTLIER_SIGMAS * spread))
 
 
@@ -120,9 +132,9 @@ def usable_plateaus(
 
     Also (n,) flags of these samples, and the number of dropped ones; see `find_plateaus`.
     """
-    parts, used, dropped = [], np.zeros(len(time), bool), 0
+    parts, used, dropped, fine = [], np.zeros(len(time), bool), 0, resolution(speed)
     for plateau in find_plateaus(stepped, time, shortest=shortest, step=step):
-        kept = is_inlier(speed[plateau.samples]) & usable[plateau.samples]
+        kept = is_inlier(speed[plateau.samples], fine) & usable[plateau.samples]
         dropped += int((~kept).sum())
         inside = plateau.samples[kept]
         if len(inside) >= 4:
@@ -131,15 +143,22 @@ def usable_plateaus(
     return parts, used, dropped
 
 
-def mean_and_error(values: Array) -> tuple[float, float]:
-    """Return a plateau's mean and standard error, from means of blocks of correlated samples."""
+def mean_and_error(values: Array, step: float) -> tuple[float, float]:
+    """Return a plateau's mean and standard error, from means of blocks of correlated samples.
+
+    A sensor's resolution ``step`` hides the mean where no noise moves the values across it (the
+    bias of a mean of rounded values: Widrow and Kollár, "Quantization noise", 2008).
+    """
     count = len(values)
     blocks = min(8, count // 4)
-    plain = float(values.std(ddof=1)) / np.sqrt(count)
-    if blocks < 4:
-        return float(values.mean()), plain
-    means = np.array([block.mean() for block in np.array_split(values, blocks)])
-    return float(values.mean()), max(plain, float(means.std(ddof=1)) / np.sqrt(blocks))
+    error = float(values.std(ddof=1)) / np.sqrt(count)
+    if blocks >= 4:
+        means = np.array([block.mean() for block in np.array_split(values, blocks)])
+        error = max(error, float(means.std(ddof=1)) / np.sqrt(blocks))
+    if step:
+        noise = max(float(values.var()) / step**2 - 1 / 12, 0.0)
+        error = math.hypot(error, step / math.sqrt(12) * math.exp(-2 * math.pi**2 * noise))
+    return float(values.mean()), error
 
 
 def widen(covariance: Array, chi_square: float, freedom: int) -> Array:
@@ -179,6 +198,10 @@ COLUMNS: Mapping[str, Mapping[str, float]] = {
     **{name: {name: 1.0} for name in ("force", "command", "voltage", *ATTITUDE)},
 }
 """Quantity -> column name -> factor to SI units."""
+MEASURED = ("angle", "rotor_speed", "force")
+"""Quantities of sensors that may be slower than the log: what repeats is not measured."""
+MAX_SINGLE_SHARE = 0.2
+"""A held signal changes less often from one sample to the next."""
 TIME_COLUMNS = ("time", "t")
 """Columns that may hold the time, in s."""
 MIN_STEADY_S = 3.0
@@ -265,8 +288,22 @@ def read_columns(
     for quantity, column in chosen.items():
         samples[quantity] = rows.fields[column] * COLUMNS[quantity][column]
         _check_unit(path, quantity, column, samples[quantity], arm)
+        if quantity in MEASURED:
+            samples[quantity] = np.where(
+                _is_held(time, samples[quantity]), np.nan, samples[quantity]
+            )
     stride = -(-len(time) // MAX_SAMPLES)
     return {quantity: values[::stride] for quantity, values in samples.items()}
+
+
+def _is_held(time: Array, values: Array) -> NDArray[np.bool_]:
+    """Return which samples (n,) repeat a slower sensor's last one; see `is_held`.
+
+    A coarse sensor repeats itself, too, but changes as often from one sample to the next.
+    """
+    held = is_held(time, values[:, None])
+    between = np.diff(np.flatnonzero(np.diff(values)))
+    return np.asarray(held & (np.mean(between == 1) < MAX_SINGLE_SHARE))
 
 
 def _check_unit(path: Path, quantity: str, column: str, values: Array, arm: float) -> None:
@@ -363,7 +400,7 @@ def steady_flight(path: Path) -> tuple[Array, float, Curve]:
     for column in speeds[inside].T:
         if not np.isfinite(column).any():
             raise RecordingError(path, "lacks a rotor's speed", "give the point by its numbers")
-        rotors.append(float(column[is_inlier(column)].mean()))
+        rotors.append(float(column[is_inlier(column, resolution(column))].mean()))
     yaw_rate = np.nan
     if "body_rate" in series:
         rates = series["body_rate"]

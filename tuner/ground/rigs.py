@@ -18,7 +18,7 @@ from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array, scaled_inverse
 from tuner.ground.measurement import Curve, Measurement, Remark, rotor_radius
 from tuner.ground.plan import Bifilar, RpmCurve, ThrustStand, TorqueStand
-from tuner.ground.rig_data import mean_and_error, usable_plateaus, widen
+from tuner.ground.rig_data import mean_and_error, resolution, usable_plateaus, widen
 from tuner.vehicle import VehicleFile
 from tuner.vehicle.vehicle import REFERENCE_ARM, size_of
 
@@ -229,8 +229,9 @@ def measure_stand(
     if len(parts) < MIN_LEVELS:
         what = f"holds {len(parts)} steady levels of rotor speed of {MIN_LEVEL_S:g} s and more"
         raise RecordingError(path, what, f"record {MIN_LEVELS} or more, each for some seconds")
+    fine, coarse = resolution(speed), resolution(force)
     levels, level_error, measured, force_error = np.array(
-        [(*mean_and_error(speed[at]), *mean_and_error(force[at])) for _, at in parts]
+        [(*mean_and_error(speed[at], fine), *mean_and_error(force[at], coarse)) for _, at in parts]
     ).T
     middle = np.array([0.5 * (plateau.begin + plateau.end) for plateau, _ in parts])
     fastest, slowest = levels.max(), levels.min()
@@ -316,6 +317,8 @@ MIN_COMMAND_S = 0.8
 COMMAND_STEP = 0.015
 """A larger change of the command is a step."""
 MIN_COMMANDS = 4
+MAX_SPEED_AT_REST = 0.03
+"""Of the fastest level. A slower motor is stopped: the curve is that of one that turns."""
 MIN_VOLTAGE_RATIO = 1.015
 """With a smaller ratio of highest to lowest voltage its exponent is not fitted."""
 MIN_QUADRATIC_SIGMAS = 3.0
@@ -327,7 +330,8 @@ def measure_rpm_curve(
 ) -> Measurement:
     """Return input scaling, zero position and, if significant, curvature and exponent.
 
-    Ω = (a u + b u² + c) (V/V_ref)^γ (Eq. 4.2, 4.4.1), one point for the middle of every step.
+    Ω = (a u + b u² + c) (V/V_ref)^γ (Eq. 4.2, 4.4.1), one point for the middle of every step with
+    turning rotors.
 
     Parameters
     ----------
@@ -347,16 +351,21 @@ def measure_rpm_curve(
         command, time, speed, steady, shortest=MIN_COMMAND_S, step=COMMAND_STEP
     )
     battery = samples.get("voltage", np.ones(len(time)))
+    fine, coarse = resolution(speed), resolution(battery)
     points = [
-        (float(np.mean(command[at])), *mean_and_error(speed[at]), float(np.mean(battery[at])))
+        (float(np.mean(command[at])), *mean_and_error(speed[at], fine),
+         *mean_and_error(battery[at], coarse))
         for _, at in parts
-    ]
+    ]  # fmt: skip
+    at_rest = MAX_SPEED_AT_REST * max((speed for _, speed, *_ in points), default=0.0)
+    points = [point for point in points if point[1] > at_rest]
     if len({round(point[0] / COMMAND_STEP) for point in points}) < MIN_COMMANDS:
         what = f"holds {len(points)} steady steps of the command of {MIN_COMMAND_S:g} s and more"
         raise RecordingError(
             path, what, f"record {MIN_COMMANDS} or more commands, each for seconds"
         )
-    u, omega, error, volts = (np.array(column) for column in zip(*points, strict=True))
+    u, omega, error, volts, volts_error = np.array(points).T
+    error = np.hypot(error, omega * volts_error / volts)  # an exponent of one, at most
     if not np.ptp(omega) > 0 or np.corrcoef(u, omega)[0, 1] < 0.8:
         raise RecordingError(path, "has a rotor speed that does not follow the command",
                              "check the columns")  # fmt: skip

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array, robust_sd, scaled_solve, student_factor
 from tuner.ground.measurement import Curve, Measurement, Remark
-from tuner.ground.rig_data import OUTLIER_SIGMAS
+from tuner.ground.rig_data import OUTLIER_SIGMAS, resolution
 from tuner.vehicle.vehicle import max_latency
 
 LAG_RANGE_S = (0.001, 1.0)
@@ -25,8 +25,8 @@ MIN_STEPS = 2
 """With fewer steps up, or down, a time constant has no standard error."""
 MIN_TIME_CONSTANTS = 3.0
 """A step must last for so many time constants to show its level."""
-MAX_SECOND_LAG_SHARE = 0.1
-"""A second lag that explains more of the residuals' squares contradicts a first-order motor."""
+MIN_SECOND_LAG_F = 25.0
+"""F statistic, five standard errors, beyond which a second lag contradicts a first-order motor."""
 START_TIME_CONSTANTS_S = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 """The fit starts from the best of these."""
 MAX_LEAD_S = 0.05
@@ -43,10 +43,11 @@ def measure_step_response(name: str, path: str, samples: Mapping[str, Array]) ->
 
     Between two steps of the command the speed approaches its level as exp(-(t - delay)/τ), with
     τ = time_constant_up while it rises and time_constant_down while it falls (Eq. 5.3); every level
-    is fitted. The clocks of two loggers may differ, so that the speed reacts before its command's
-    stamp. Therefore the delay may be negative: the latency is then zero, its interval holds the
-    clocks' offset, and a remark says so. Another remark says if a second lag explains much, so that
-    the response is not first order (thesis 5.4.1).
+    is fitted, and a drift, as that of a battery. The clocks of two loggers may differ, so that the
+    speed reacts before its command's stamp. Therefore the delay may be negative: the latency is
+    then zero, its interval holds the clocks' offset, and a remark says so. Another remark says if a
+    second lag is significant, so that the response is not first order (thesis 5.4.1); the
+    covariance then holds what it moves.
 
     Parameters
     ----------
@@ -73,10 +74,11 @@ def measure_step_response(name: str, path: str, samples: Mapping[str, Array]) ->
             what = f"holds {count} steps {direction} of the command"
             raise RecordingError(path, what, f"record {MIN_STEPS} or more in each direction")
     steps = _Steps(time, np.concatenate([[0], edges, [len(time)]]), rises)
-    kept = _is_no_spike(speed)
+    fine = resolution(speed)
+    kept = _is_no_spike(speed, fine)
     first = _fit_lags(steps, speed, kept, _first_guess(steps, speed, kept), second=False)
     residual = steps.simulated(first, speed, kept) - speed
-    spread = float(robust_sd(residual[kept]))
+    spread = max(float(robust_sd(residual[kept])), 0.5 * fine)
     kept &= np.abs(residual) <= 2 * OUTLIER_SIGMAS * spread
     lags = _fit_lags(steps, speed, kept, first, second=False)
     up, down, delay = np.exp(lags[0]), np.exp(lags[1]), lags[2]
@@ -100,14 +102,12 @@ def measure_step_response(name: str, path: str, samples: Mapping[str, Array]) ->
     remarks = [Remark("steps", numbers)]
     if reported:
         remarks.append(Remark("command_late", {"seconds": early}))
-    richer = _fit_lags(steps, speed, kept, lags, second=True)
-    plain = steps.simulated(lags, speed, kept)
-    misfit = [float(np.sum((fit - speed)[kept] ** 2)) for fit in
-              (plain, steps.simulated(richer, speed, kept))]  # fmt: skip
-    explained = 1.0 - misfit[1] / max(misfit[0], 1e-300)
-    if explained > MAX_SECOND_LAG_SHARE:
+    richer, explained = _second_lag(steps, lags, speed, kept)
+    if richer is not None:
+        covariance += np.outer(richer[:3] - lags, richer[:3] - lags)
         lag = float(np.exp(richer[3]))
         remarks.append(Remark("not_first_order", {"explained": explained, "lag": lag}))
+    plain = steps.simulated(lags, speed, kept)
     titles = ("Step response", "time, s", "rotor speed, rad/s")
     return Measurement(
         name,
@@ -158,7 +158,7 @@ class _Steps:
     rises: NDArray[np.bool_]
 
     def design(self, lags: Array) -> Array:
-        """Return (n, levels): the speed is linear in the levels for given lags."""
+        """Return (n, levels + 1): the speed is linear in levels and drift for given lags."""
         levels = len(self.bounds) - 1
         design = np.zeros((len(self.time), levels))
         state = np.eye(levels)[0]
@@ -175,10 +175,10 @@ class _Steps:
             if number + 1 < levels:
                 end = self.time[self.bounds[number + 1]] - self.time[self.bounds[number]]
                 state = goal + (state - goal) * float(_decay(np.array([end]), constant, lag)[0])
-        return design
+        return np.column_stack([design, self.time - self.time[0]])
 
     def simulated(self, lags: Array, speed: Array, kept: NDArray[np.bool_]) -> Array:
-        """Return the speed (n,) of the best levels for some lags."""
+        """Return the speed (n,) of the best levels and drift for some lags."""
         design = self.design(lags)
         return np.asarray(design @ _levels(design[kept], speed[kept]))
 
@@ -197,10 +197,10 @@ def _decay(time: Array, constant: float, lag: float) -> Array:
     return np.asarray((constant * slow - lag * quick) / (constant - lag))
 
 
-def _is_no_spike(speed: Array) -> NDArray[np.bool_]:
-    """Return (n,) flags of samples that are no spikes of the tachometer."""
+def _is_no_spike(speed: Array, fine: float) -> NDArray[np.bool_]:
+    """Return (n,) flags of samples that are no spikes of a tachometer of some resolution."""
     difference = np.abs(speed - median_filter(speed, size=5, mode="nearest"))
-    spread = max(float(robust_sd(difference)), 1e-9)
+    spread = max(float(robust_sd(difference)), 0.5 * fine, 1e-9)
     return np.asarray(difference <= 6 * OUTLIER_SIGMAS * spread)
 
 
@@ -231,6 +231,20 @@ def _fit_lags(
         ftol=1e-9,
     )
     return np.asarray(solution.x)
+
+
+def _second_lag(
+    steps: _Steps, lags: Array, speed: Array, kept: NDArray[np.bool_]
+) -> tuple[Array | None, float]:
+    """Return the lags with a second one if it is significant, and the share that it explains."""
+    richer = _fit_lags(steps, speed, kept, lags, second=True)
+    plain, better = (
+        float(np.sum((steps.simulated(each, speed, kept) - speed)[kept] ** 2))
+        for each in (lags, richer)
+    )
+    freedom = int(kept.sum()) - len(steps.bounds) - len(richer)
+    is_significant = plain - better > MIN_SECOND_LAG_F * better / freedom
+    return (richer if is_significant else None), 1.0 - better / max(plain, 1e-300)
 
 
 def _first_guess(steps: _Steps, speed: Array, kept: NDArray[np.bool_]) -> Array:

@@ -13,6 +13,7 @@ from tuner.core.shipped import configs_folder
 from tuner.ground.hovers import measure_hover_weights, measure_propeller, measure_yaw_spin
 from tuner.ground.measurement import combine
 from tuner.ground.plan import Experiment
+from tuner.ground.rig_data import read_columns
 from tuner.ground.rigs import measure_bifilar, measure_rpm_curve, measure_stand
 from tuner.ground.step_response import measure_step_response
 from tuner.vehicle import COEFFICIENTS, read_vehicle, with_values
@@ -130,10 +131,55 @@ def test_a_command_without_a_speed_is_left_out():
     assert (np.abs(deviations(found)) < 4).all()
 
 
-def test_a_second_lag_is_named():
-    samples = rigs.motor_steps(np.random.default_rng(0), second=0.02)
-    codes = {remark.code for remark in measure_step_response("steps", "s.csv", samples).remarks}
-    assert "not_first_order" in codes
+@pytest.mark.parametrize("lag", [0.01, 0.02])
+def test_a_second_lag_is_named_and_in_the_interval(lag):
+    samples = rigs.motor_steps(np.random.default_rng(0), second=lag)
+    found = measure_step_response("steps", "s.csv", samples)
+    assert "not_first_order" in {remark.code for remark in found.remarks}
+    assert (np.abs(deviations(found)) < 2).all()
+
+
+def test_steps_on_a_sagging_battery_keep_their_time_constants():
+    samples = rigs.motor_steps(np.random.default_rng(1))
+    speed = samples["rotor_speed"] * (1 - 0.01 * samples["time"])
+    found = measure_step_response("steps", "s.csv", samples | {"rotor_speed": speed})
+    assert (np.abs(deviations(found)) < 2).all()
+
+
+def test_a_coarse_tachometer_keeps_its_samples():
+    samples = rigs.motor_steps(np.random.default_rng(0))
+    coarse = samples | {"rotor_speed": np.round(samples["rotor_speed"] / 20) * 20}
+    found = measure_step_response("steps", "s.csv", coarse)
+    assert (np.abs(deviations(found)) < 3).all()
+    curve_of = rigs.steps_of_command(np.random.default_rng(0))
+    coarse = curve_of | {"rotor_speed": np.round(curve_of["rotor_speed"] / 20) * 20}
+    found = measure_rpm_curve("rpm", "r.csv", coarse, plan("rpm_curve", reference_voltage=16.4))
+    assert (np.abs(deviations(found)) < 3).all()
+
+
+def test_telemetry_slower_than_its_log_is_no_latency(tmp_path):
+    samples = rigs.motor_steps(np.random.default_rng(0))
+    held = samples["rotor_speed"][np.arange(len(samples["time"])) // 10 * 10]
+    path = tmp_path / "steps.csv"
+    rows = np.column_stack([samples["time"], samples["command"], held])
+    np.savetxt(path, rows, delimiter=",", header="time,command,rotor_speed", comments="")
+    read = read_columns(path, ("command", "rotor_speed"))
+    assert np.mean(np.isfinite(read["rotor_speed"])) == pytest.approx(0.1, abs=0.02)
+    assert (np.abs(deviations(measure_step_response("steps", "s.csv", read))) < 3).all()
+
+
+def test_stopped_motors_are_no_part_of_the_curve():
+    samples = rigs.steps_of_command(np.random.default_rng(0))
+    before = {name: np.zeros(200) for name in ("command", "rotor_speed")}
+    begun = {"time": np.arange(200) / 50, **before, "voltage": np.full(200, 16.4)}
+    given = plan("rpm_curve", reference_voltage=16.4)
+    alone = measure_rpm_curve("rpm", "r.csv", samples, given)
+    later = samples | {"time": samples["time"] + 4.0}
+    whole = {name: np.concatenate([begun[name], later[name]]) for name in samples}
+    found = measure_rpm_curve("rpm", "r.csv", whole, given)
+    errors = np.sqrt(np.diag(alone.covariance))
+    assert np.abs(found.value - alone.value) == pytest.approx(0, abs=0.2 * errors.min())
+    assert np.sqrt(np.diag(found.covariance)) == pytest.approx(errors, rel=0.05)
 
 
 @pytest.mark.parametrize("samples_early", [0, 3, 10])
