@@ -525,6 +525,8 @@ def _override(job: JobFile, options: Options, holdout: tuple[str, ...]) -> JobFi
     check_names(options.fix or (), "--fix")
     if options.fit is not None and options.fix is not None:
         raise ConfigError("--fit", "cannot stand beside --fix", "give one of them")
+    if options.fit is not None and not options.fit:
+        raise ConfigError("--fit", "names no coefficient", "name some, or leave it out")
     given = {
         IN_JOB_FILE.get(option, option): value
         for option, value in vars(options).items()

@@ -6,7 +6,7 @@ is slow to import, for `tune --help` shows it at once.
 """
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import wraps
 from pathlib import Path
@@ -265,15 +265,17 @@ def taking(options: type | None = None) -> Callable[[F], F]:
 
             from tuner.core.yaml_section import check_types  # noqa: PLC0415 (pydantic)
 
-            known = signature.bind(*given, **named).arguments
+            bound = signature.bind(*given, **named)
             # without that of the result, whose import takes its time
             types = {p.name: p.annotation for p in own if p.annotation is not p.empty}
             hinted = SimpleNamespace(__annotations__=types)
             hints = get_type_hints(hinted, inspect.unwrap(function).__globals__)
-            check_types({n: plain(known[n]) for n in hints if n in known}, hints, "options")
+            own_given = {n: plain(bound.arguments[n]) for n in hints if n in bound.arguments}
+            check_types(own_given, hints, "options")
+            bound.arguments |= own_given
             usual: dict[str, Any] = dict.fromkeys(("divide", "over", "invalid"), "warn")
             with np.errstate(under="ignore", **usual):  # whatever its caller has set
-                return function(*given, **named)
+                return function(*bound.args, **bound.kwargs)
 
         more = [
             inspect.Parameter(
@@ -292,10 +294,16 @@ def taking(options: type | None = None) -> Callable[[F], F]:
 
 
 def plain(value: Any) -> Any:
-    """Return paths as text, one or a list of them, and NumPy's numbers and lists as Python's."""
+    """Return paths as text, one or several of them, and NumPy's numbers and lists as Python's.
+
+    What can be gone through once is a list, and a set one in its order: what it holds is the same
+    however often it is looked at.
+    """
     if isinstance(value, Path):
         return str(value)
-    if isinstance(value, list | tuple):
+    if isinstance(value, Set):
+        return sorted((plain(item) for item in value), key=str)
+    if isinstance(value, list | tuple | Iterator):
         return [plain(item) for item in value]
     return value.tolist() if hasattr(value, "tolist") else value
 

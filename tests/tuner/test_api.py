@@ -154,6 +154,7 @@ def test_wrong_input_is_the_same_one_line(tmp_path):
             {"path": None},
             "path is None; it should be text, or the name of a file$",
         ),
+        (api.load_flight, {"path": b"x.bag"}, "path is b'x.bag'; it should be text, or the name"),
         (api.load_flight, {"path": "x", "rate": "1"}, "rate is '1'; it should be a number$"),
         (api.load_flight, {"path": "x", "mission": True}, "mission is True; it should be a whole"),
         (
@@ -181,6 +182,15 @@ def test_a_value_of_another_type_is_one_line_too(function, given, words, bag):
     recorded = function in {api.fit, api.sensitivity, api.compare}
     with pytest.raises(InputError, match=words):
         function(**({"flights": str(bag)} if recorded else {}) | given)
+
+
+def test_lists_may_be_what_can_be_gone_through_once(bag, monkeypatch):
+    asked = []
+    monkeypatch.setattr("tuner.job.run.run", lambda given, **_: (asked.append(given), None))
+    monkeypatch.setattr(api, "read_run", lambda _: None)
+    tuner.fit(map(str, [bag]), free=iter(["mass"]), holdout={"b", "a", "c"})
+    (given,) = asked
+    assert (given.flights, given.fit, given.holdout) == ([str(bag)], ["mass"], ["a", "b", "c"])
 
 
 def test_numbers_of_numpy_and_paths_are_taken():

@@ -187,6 +187,8 @@ def _is_regular_file(path: Path) -> bool:
         str(path.absolute()).encode()
     except UnicodeEncodeError:  # it could stand in no report
         raise OSError(errno.EILSEQ, "its name is not UTF-8") from None
+    if len(str(path).splitlines()) > 1:  # it would be two lines in every heading and table
+        raise OSError(errno.EILSEQ, "its path has a line break")
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a null byte
@@ -205,7 +207,7 @@ _REFUSALS = {
     errno.ENAMETOOLONG: ("the path is too long", "give a shorter one"),
     errno.ENOTDIR: ("it lies inside a file", "name a place in a folder"),
     errno.EEXIST: ("it is a file", "name a folder"),
-    errno.EILSEQ: ("its name is not UTF-8", "give another name"),
+    errno.EILSEQ: ("", "give another name"),
     errno.EISDIR: ("it is a folder", "name a file"),
     errno.EINVAL: ("it is a device or a pipe", "name a file"),
     errno.ENOENT: ("its folder does not exist", "make the folder first"),
@@ -219,7 +221,7 @@ def _refusals(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         why, remedy = _REFUSALS.get(error.errno or 0, (str(error), "name another place"))
-        raise OutputError(path, f"cannot be written: {why}", remedy) from None
+        raise OutputError(path, f"cannot be written: {why or error.strerror}", remedy) from None
 
 
 def exists(path: Path) -> bool:
@@ -233,9 +235,9 @@ def exists(path: Path) -> bool:
     try:
         return _is_regular_file(path)
     except OSError as error:
-        raise InputError(
-            path, f"cannot be read ({error.strerror})", "check the path and its rights"
-        ) from None
+        renamed = error.errno == errno.EILSEQ
+        remedy = "rename it" if renamed else "check the path and its rights"
+        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from None
 
 
 @contextmanager
@@ -300,7 +302,7 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
             raise InputError(path, "does not exist", "check the path")
         for match in matches:
             if exists(match) and match.is_dir() and not (match / "metadata.yaml").exists():
-                within = f"{match}/*{_most_common_suffix(match)}"
+                within = match / f"*{_most_common_suffix(match)}"
                 raise InputError(match, "is a folder", f"give the recordings in it: '{within}'")
             recordings.setdefault(match.resolve(), match)
     if not recordings:
@@ -308,10 +310,13 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
     return tuple(recordings.values())
 
 
+SUFFIXES = (".bag", ".csv", ".db3", ".mat", ".mcap", ".parquet", ".tsv", ".ulg")
+"""Of files that may be recordings; a bare log of a Crazyflie has none."""
+
+
 def _most_common_suffix(folder: Path) -> str:
     """Return the suffix of most files of a folder that may be recordings."""
-    others = {".md", ".txt", ".yaml", ".yml", ".json", ".pdf"}
-    suffixes = Counter(path.suffix for path in folder.glob("*.*") if path.suffix not in others)
+    suffixes = Counter(path.suffix for path in folder.glob("*.*") if path.suffix in SUFFIXES)
     return suffixes.most_common(1)[0][0] if suffixes else ""
 
 

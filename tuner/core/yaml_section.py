@@ -451,6 +451,10 @@ def section_of(options: type, *, leaving: Collection[str] = (), text: Any = str)
     return create_model(options.__name__, __base__=Section, **chosen)  # type: ignore[call-overload, no-any-return]
 
 
+Text = Annotated[str, Strict()]
+"""Text that is not made of bytes."""
+
+
 def check_types(values: Mapping[str, object], hints: Mapping[str, Any], where: str) -> None:
     """Refuse a value that is of no type of its hint.
 
@@ -459,7 +463,7 @@ def check_types(values: Mapping[str, object], hints: Mapping[str, Any], where: s
     ConfigError
         In one line: where, the value's name, the value, what it should be.
     """
-    own: dict[str, Any] = {name: (_checked(hints[name], str), ...) for name in values}
+    own: dict[str, Any] = {name: (_checked(hints[name], Text), ...) for name in values}
     build(create_model("values", __base__=Section, **own), values, where)
 
 

@@ -216,11 +216,12 @@ def fly(
         what = f"{plan.duration:g} s hold no two samples at {plan.rate:g} Hz"
         raise InputError("--duration", what, "fly longer, or write samples at a higher --rate")
     check_names(grid or (), "grid")
-    grid = {name: np.atleast_1d(column) for name, column in (grid or {}).items()}
-    kinds = {(column.shape, column.dtype.kind in "iuf") for column in grid.values()}
-    if len(kinds) > 1 or any(len(shape) != 1 or 0 in shape or not real for shape, real in kinds):
+    grid = {name: _numbers(name, column) for name, column in (grid or {}).items()}
+    shapes = {column.shape for column in grid.values()}
+    if len(shapes) > 1 or any(len(shape) != 1 or 0 in shape for shape in shapes):
         sizes = listed([f"{column.size} of {name}" for name, column in grid.items()])
         raise InputError("grid", f"holds {sizes}", "give one number of each for every flight")
+    _check_count(max((column.size for column in grid.values()), default=1), "grid")
     vehicle, controller = options.vehicle, options.controller
     if isinstance(vehicle, str):
         vehicle = read_vehicle(find_config("vehicles", vehicle, Path()))
@@ -241,6 +242,21 @@ def fly(
     )
 
 
+def _numbers(name: str, column: Array) -> Array:
+    try:
+        numbers = np.atleast_1d(column)
+    except ValueError:  # lists of several lengths
+        numbers = np.array([None])
+    if numbers.size and numbers.dtype.kind not in "iuf":
+        raise InputError("grid", f"holds no numbers of {name}", "give a list of numbers")
+    return numbers
+
+
+def _check_count(flights: int, where: str) -> None:
+    if flights > MAX_FLIGHTS:
+        raise InputError(where, f"asks for {flights} flights", f"at most {MAX_FLIGHTS}")
+
+
 def grid_of(sweeps: Sequence[str]) -> dict[str, Array]:
     """Return coefficient -> (B,) values of every combination, the last sweep varying fastest.
 
@@ -258,8 +274,7 @@ def grid_of(sweeps: Sequence[str]) -> dict[str, Array]:
     if len(axes) < len(sweeps):
         raise InputError("--sweep", "names a coefficient twice", "sweep each once")
     count = math.prod(map(len, axes.values())) if axes else 0
-    if count > MAX_FLIGHTS:
-        raise InputError("--sweep", f"asks for {count} flights", f"at most {MAX_FLIGHTS}")
+    _check_count(count, "--sweep")
     mesh = np.meshgrid(*axes.values(), indexing="ij")
     return {name: values.ravel() for name, values in zip(axes, mesh, strict=True)}
 

@@ -41,7 +41,7 @@ from tuner.options import Options
 from tuner.report import render, write_search, write_traces
 from tuner.report.outcome import WRONG_INPUT_CODES
 from tuner.report.result_texts import export_sentence
-from tuner.result import BEST_FIT_FILE, OF_A_RUN, Run, RunResult, forget, place_for
+from tuner.result import BEST_FIT_FILE, CHECKPOINTS, OF_A_RUN, Run, RunResult, forget, place_for
 from tuner.search.findings import reference_voltage_findings, turning_findings
 from tuner.search.job_flights import with_logged_parameters
 from tuner.search.listener import SILENT, Iteration, Listener, Reporter
@@ -113,7 +113,15 @@ def run(
     _check(at_start, reporter, force=options.force)
     with result_folder(out) as folder:
         begun = _Run(options, settings, job, folder, reporter, command)
-        result = begun.fit((*findings, *at_start), resume=resume)
+        try:
+            result = begun.fit((*findings, *at_start), resume=resume)
+        except (KeyboardInterrupt, OutputError, EngineError):
+            if any(folder.glob(CHECKPOINTS)):
+                listener.on_stop(
+                    f"The best coefficients so far are in {folder}. "
+                    f"Continue with --out {folder} --resume."
+                )
+            raise
     return folder, result
 
 
@@ -181,10 +189,6 @@ class _Run:
             )
         except (KeyboardInterrupt, OutputError, EngineError):
             best.rescue()
-            reporter.listener.on_stop(
-                f"The best coefficients so far are in {folder}. "
-                f"Continue the search with --out {folder} --resume."
-            )
             raise
         if searched.refuted:
             reporter.listener.on_doubt(FLIGHTS_REFUTE)

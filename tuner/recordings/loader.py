@@ -231,9 +231,8 @@ def load_flight(
     """
     flights = load_flights(path, topics=topics, namespace=namespace, rate=rate, cache=cache)
     if not 1 <= mission <= len(flights):
-        raise RecordingError(
-            path, f"holds {len(flights)} missions, not {mission}", "name one of those"
-        )
+        what = f"holds no mission {mission}"
+        raise RecordingError(path, what, f"give a number from 1 to {len(flights)}")
     return flights[mission - 1]
 
 

@@ -189,13 +189,18 @@ def test_names_in_a_recording_neither_steer_the_terminal_nor_style_it(tmp_path, 
 
 
 @pytest.mark.skipif(sys.platform == "darwin", reason="its names are all UTF-8")
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [(b"fl\xfcg.bag", "its name is not UTF-8"), (b"a\nb.bag", "its path has a line break")],
+    ids=["letters", "lines"],
+)
 @pytest.mark.parametrize("arguments", [["inspect"], ["new-vehicle", "--like=crazyflie", "--out"]])
-def test_a_name_that_is_not_utf_8_is_refused(arguments, tmp_path, capsys):
-    named = tmp_path / os.fsdecode(b"fl\xfcg.bag")
+def test_a_name_that_no_report_could_hold_is_refused(arguments, name, what, tmp_path, capsys):
+    named = tmp_path / os.fsdecode(name)
     named.write_bytes((making.FLIGHTS / "yaw_spin_3rps.bag").read_bytes())
     assert main([*arguments, str(named)]) == 2
     err = capsys.readouterr().err
-    assert "its name is not UTF-8" in err
+    assert what in err
     assert err.count("\n") == 1
 
 

@@ -154,6 +154,7 @@ def test_vehicle_and_flights_of_the_job_file_count_from_its_folder(lab, monkeypa
         ({"bootstrap": 1}, "bootstrap is 1; it should be at least 2"),
         ({"fit": "mass"}, "fit is 'mass'; it should be a list"),
         ({"fit": ["mass"], "fix": ["mass"]}, "cannot stand beside --fix"),
+        ({"fit": []}, "--fit: names no coefficient; name some"),
         ({"fit": ["mas"]}, "--fit: unknown coefficient 'mas'; did you mean 'mass'?"),
         ({"vehicle": "nosuch"}, "neither a file nor one of the shipped vehicles"),
         ({"vehicle": "nosuch.yaml"}, "does not exist"),
@@ -198,7 +199,7 @@ def test_two_recordings_of_one_name_are_refused(lab):
 
 @pytest.mark.parametrize("name", ["a.bag", "a.csv", "log10"])
 def test_a_folder_of_recordings_is_answered_by_what_finds_them(name, tmp_path):
-    for other in (name, "README.md", "tune.yaml", "truth.yaml"):
+    for other in (name, "README.md", "tune.yaml", "truth.yaml", "plot.py", "read.py"):
         (tmp_path / other).touch()
     with pytest.raises(InputError, match="is a folder") as refused:
         find_flights([str(tmp_path)])

@@ -99,8 +99,10 @@ def test_a_rate_that_is_no_whole_number_is_that_of_the_samples(vehicle, rate):
 @pytest.mark.parametrize(
     ("given", "grid", "expected"),
     [
-        ({}, {"mass": ["a"]}, "one number of each"),
-        ({}, {"mass": [2 + 1j]}, "one number of each"),
+        ({}, {"mass": ["a"]}, "holds no numbers of mass; give a list"),
+        ({}, {"mass": [2 + 1j]}, "holds no numbers of mass"),
+        ({}, {"mass": [[2.0], [2.0, 2.1]]}, "holds no numbers of mass"),
+        ({}, {"mass": np.full(100_001, 2.0)}, "asks for 100001 flights; at most 100000"),
         ({"duration": 0.005}, None, "0.005 s hold no two samples at 100 Hz"),
         ({"rate": 0.1}, None, "4 s hold no two samples at 0.1 Hz"),
         ({}, {"mass": [2.0, 2.1], "inertia_xx": [0.02]}, "holds 2 of mass and 1 of inertia_xx"),

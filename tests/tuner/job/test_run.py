@@ -314,6 +314,21 @@ def test_an_interrupted_run_goes_on_elsewhere_to_the_same_numbers(broken, salvag
     assert resumed.search.evaluations == whole.search.evaluations
 
 
+@pytest.mark.parametrize("begun", [True, False])
+def test_whatever_is_interrupted_says_how_to_go_on(begun, tmp_path, monkeypatch):
+    def stopped(run, *_: object, **__: object) -> None:
+        if begun:
+            (run.folder / "checkpoint.npz").touch()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module._Run, "fit", stopped)
+    said = []
+    with pytest.raises(KeyboardInterrupt):
+        run(short_job(), out=tmp_path / "cut", listener=Listener(on_stop=said.append))
+    go_on = f"Continue with --out {tmp_path / 'cut'} --resume."
+    assert [line.rpartition(". ")[2] for line in said] == [go_on] * begun
+
+
 def test_resume_without_a_checkpoint_is_refused(tmp_path):
     with pytest.raises(InputError, match="--out"):
         run(short_job(), resume=True)

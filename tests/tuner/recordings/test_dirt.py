@@ -218,7 +218,7 @@ def test_several_missions_in_one_bag(short: Path, tmp_path: Path) -> None:
     assert second.duration == pytest.approx(4.99, abs=0.02)
     assert second.series["position"].time[0] == pytest.approx(-2, abs=0.02)
     assert load_flight(path, mission=2).duration == second.duration
-    with pytest.raises(RecordingError, match="holds 2 missions, not 3"):
+    with pytest.raises(RecordingError, match="holds no mission 3; give a number from 1 to 2"):
         load_flight(path, mission=3)
 
 
