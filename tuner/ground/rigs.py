@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import least_squares
 
 from sim_jax.constants import GRAVITY
@@ -49,6 +50,7 @@ def measure_bifilar(
 
     A damped sine with offset and drift is fitted to the angle; its phase runs slower while the
     swing is wide (by amplitude²/16, as a pendulum's), and its frequency is corrected for damping.
+    What was recorded before the release is left out.
 
     Parameters
     ----------
@@ -69,6 +71,8 @@ def measure_bifilar(
     known = np.isfinite(angle)
     time, angle = time[known], angle[known]
     guess = _spectral_guess(time, angle)
+    released = _released(time, angle, guess)
+    time, angle = time[released:] - time[released], angle[released:]
     swings = guess * time[-1]
     if swings < MIN_OSCILLATIONS:
         what = f"shows {swings:.1f} oscillations, fewer than {MIN_OSCILLATIONS:g}"
@@ -143,6 +147,15 @@ def _spectral_guess(time: Array, angle: Array) -> float:
     frequencies = np.fft.rfftfreq(padded, (even[-1] - even[0]) / (count - 1))
     power[frequencies < 0.5 / (even[-1] - even[0])] = 0.0
     return float(frequencies[int(np.argmax(power))])
+
+
+def _released(time: Array, angle: Array, guess: float) -> int:
+    """Return the sample at which a body that was held for a swing or longer turns fast, or 0."""
+    even = np.linspace(time[0], time[-1], len(time))
+    width = 1 / (8 * guess) / (even[1] - even[0])
+    speed = np.abs(gaussian_filter1d(np.interp(even, time, angle), max(width, 1.0), order=1))
+    first = even[int(np.argmax(speed > 0.8 * speed.max()))]
+    return int(np.searchsorted(time, first)) if first - time[0] > 1 / guess else 0
 
 
 def _fit_swing(time: Array, angle: Array, guess: float) -> Any:

@@ -131,6 +131,20 @@ def test_a_command_without_a_speed_is_left_out():
     assert (np.abs(deviations(found)) < 4).all()
 
 
+@pytest.mark.parametrize("held", [0.15, 0.0])
+def test_a_body_held_before_its_release_is_no_beat(held):
+    random = np.random.default_rng(0)
+    samples, ruler = rigs.swing(random)
+    before = held + random.normal(0, 0.02, 800)
+    angle = np.concatenate([before, samples["angle"][100 if held == 0.0 else 0 :]])
+    samples = {"time": np.arange(len(angle)) / 100, "angle": angle}
+    errors = {"mass_error": 0.002 / ruler["mass"]}
+    given = plan("bifilar", axis="x", **ruler, **errors)
+    found = measure_bifilar("bifilar x", "x.csv", samples, given, QUAD)
+    assert "beat" not in {remark.code for remark in found.remarks}
+    assert (np.abs(deviations(found)) < 3).all()
+
+
 @pytest.mark.parametrize("lag", [0.01, 0.02])
 def test_a_second_lag_is_named_and_in_the_interval(lag):
     samples = rigs.motor_steps(np.random.default_rng(0), second=lag)
