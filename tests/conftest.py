@@ -32,6 +32,7 @@ from tuner.core.runtime import keep_memory
 __all__ = ["demo"]
 
 keep_memory()
+memory.share_contexts()
 threadpool_limits(1, user_api="blas")
 KERNELS = cache_folder() / "kernels"
 """The program's own: commands that a test runs, in this process or another, find what it built."""
