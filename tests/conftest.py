@@ -23,7 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from lanes.machine import UNOPTIMISED, keep_code_in
 from lanes.program import _program_of
-from tests import memory
+from tests import lowering, memory
 from tests.demo import demo
 from tests.memory import MOST_IN_A_MODULE, MOST_MEMORY
 from tuner.core.disk import cache_folder
@@ -32,7 +32,8 @@ from tuner.core.runtime import keep_memory
 __all__ = ["demo"]
 
 keep_memory()
-memory.share_contexts()
+lowering.share_contexts()
+lowering.place_arrays()
 threadpool_limits(1, user_api="blas")
 KERNELS = cache_folder() / "kernels"
 """The program's own: commands that a test runs, in this process or another, find what it built."""

@@ -1,19 +1,16 @@
-"""What a test process holds in memory, and how it gives back what compiling has left behind.
-
-For every program that jax lowers it makes a context of MLIR, of 2.6 MB and 8 ms, as long as a small
-program takes to compile; a run of the tests lowers thousands. Here all share one, see
-`share_contexts`.
-"""
+"""What a test process holds in memory, and how it gives back what compiling has left behind."""
 
 from __future__ import annotations
 
 import ctypes
 import gc
 import os
-import sys
 from contextlib import suppress
-from functools import cache
 from pathlib import Path
+
+import jax
+
+from tests import lowering
 
 MIB = 2**20
 
@@ -52,28 +49,16 @@ def resident() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-def share_contexts() -> None:
-    """Have jax lower all programs in one context of MLIR, until memory is given back.
-
-    What it lowers to is the same. A jax that makes its contexts elsewhere makes them as ever.
-    """
-    with suppress(ImportError, AttributeError):
-        from jax._src.interpreters import mlir  # noqa: PLC0415 (what measures memory needs no jax)
-
-        mlir.make_ir_context = cache(mlir.make_ir_context)
-
-
 def give_back(most: int) -> None:
     """Give back what jax has compiled, and what is free, if the process holds more than ``most``.
 
     It takes a second: a process that stays large does not try after every test.
     """
     global grown  # noqa: PLW0603 (of this process)
-    if "jax" not in sys.modules or resident() <= max(most, grown):
+    if resident() <= max(most, grown):
         return
-    sys.modules["jax"].clear_caches()
-    with suppress(KeyError, AttributeError):
-        sys.modules["jax._src.interpreters.mlir"].make_ir_context.cache_clear()
+    jax.clear_caches()
+    lowering.new_context()
     gc.collect()
     with suppress(OSError, AttributeError, TypeError):  # where the C library is not glibc
         ctypes.CDLL(None).malloc_trim(0)
