@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.numerics import Array
+from tuner.core.numerics import Array, scaled_inverse
 from tuner.core.phrases import listed
 from tuner.disturbances.maximum_likelihood import MAX_STEPS, maximise_likelihood
 from tuner.disturbances.predictor import Predictor, hidden_by_setpoints
@@ -19,6 +19,7 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.information import with_start_values
 from tuner.objective.space import Space
+from tuner.search.continuation import RIDGE
 from tuner.search.estimation import LAST_POLISH, ROUGH_TOLERANCE, free_parameters, polished
 from tuner.search.findings import UNMATCHED_CODES, outlying_flights, unmatched_findings
 from tuner.search.listener import Reporter
@@ -338,6 +339,8 @@ REJECTED_BY_LEAST_SQUARES = (
     SelectionCode.WORSE_AFTER_REFIT,
 )
 """Reasons of least squares that innovations may overrule."""
+NEGLIGIBLE_MOVE_SE = 2.0
+"""Standard errors by which a coefficient may move where a negligible term is left out."""
 MAX_CHANCE_OF_LAG = 0.05
 """Chance below which a secant lets a term be tried."""
 CONTRADICTION_SE = 4.0
@@ -449,8 +452,7 @@ class LinearisedInnovations:
         """Return the terms that innovations select and their fit, one linear step on.
 
         Backward elimination starts from all terms but lumped ones, and those already in the fit.
-        The survivors must exceed a negligible size. None if the selection stays the same, or none
-        was tried.
+        Negligible survivors go. None if the selection stays the same, or none was tried.
 
         Least squares may have fitted a lumped term to gusts, and beside it the others seem
         unnecessary: it is dropped at the ``first`` selection, and may come back at later ones if
@@ -480,14 +482,30 @@ class LinearisedInnovations:
             white=True,
             without_refits=True,
         )
-        change = self._change(model, tried, kept)
-        everywhere = np.arange(len(change))
-        size = np.abs(change - self.linear.to_neutral(everywhere)) / self.linear.prior_sd
-        large = [name for name in kept if size[self._columns(tried[name])].max() > NEGLIGIBLE_SIZE]
-        if set(large) == set(within):
+        matter = [name for name in kept if not self._is_negligible(name, model, tried, kept)]
+        if set(matter) == set(within):
             return None
-        moved = vector_after(self.space, self.vector, self._change(model, tried, large))
-        return self._with(base, tried, large, moved)
+        moved = vector_after(self.space, self.vector, self._change(model, tried, matter))
+        return self._with(base, tried, matter, moved)
+
+    def _is_negligible(
+        self, name: str, model: Columns, tried: Groups, kept: Collection[str]
+    ) -> bool:
+        """Return whether a kept group is small, and others hardly move where it is left out.
+
+        A small one that another coefficient would make up for is not: what is usual of large
+        vehicles is not of small ones.
+        """
+        own, others = self._columns(tried[name]), [one for one in kept if one != name]
+        change = self._change(model, tried, kept)
+        size = np.abs(change[own] - self.linear.to_neutral(own)[own]) / self.linear.prior_sd[own]
+        if size.max() > NEGLIGIBLE_SIZE:
+            return False
+        left = np.concatenate([model, *(self._columns(tried[other]) for other in others)])
+        square = (self.linear.information() + self.linear.prior)[np.ix_(left, left)]
+        moves = (self._change(model, tried, others) - change)[left]
+        errors = np.sqrt(np.diag(scaled_inverse(square, RIDGE)))
+        return bool(np.all(np.abs(moves) <= NEGLIGIBLE_MOVE_SE * errors))
 
     def called_for(self, groups: Collection[str]) -> tuple[str, ...]:
         """Return those of some groups in the fit without which innovations would be unlikely.

@@ -174,6 +174,14 @@ def test_a_term_as_good_as_absent_is_not_worth_a_coefficient(chosen) -> None:
     assert chosen(seen([DRAG], {"fuselage_drag": 0.05})) is None
 
 
+def test_a_small_term_that_another_would_make_up_for_is_worth_one(chosen) -> None:
+    """Sizes that are usual of large vehicles are not of small ones."""
+    alike = {"fuselage_drag": "inertia_xx"}
+    _, found = chosen(seen([DRAG, INFLOW], {"fuselage_drag": 0.05}, alike))
+    assert set(found["groups"]) == {"fuselage_drag"}
+    assert chosen(seen([DRAG, INFLOW], {"fuselage_drag": 0.05})) is None
+
+
 def test_a_term_that_replaced_another_is_removed_as_that_one_is_added(chosen) -> None:
     there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
     innovation = seen(
