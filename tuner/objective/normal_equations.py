@@ -10,7 +10,7 @@ flight follows from its residuals.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
@@ -42,7 +42,7 @@ from tuner.objective.criterion import (
 )
 from tuner.objective.initial_conditions import eliminate_states
 from tuner.objective.residuals import Block, Reading, gauss_newton, huber_loss, residuals
-from tuner.objective.segments import OFFSETS, Segments
+from tuner.objective.segments import CLOCKS, OFFSETS, Segments
 from tuner.objective.simulation import EFFECTS, SimulatedChannels, flight_program, fly
 from tuner.objective.space import Space
 from tuner.vehicle.model import Model, with_coefficients
@@ -201,6 +201,44 @@ class Objective:
             for block in residuals(flown, self.segments, name, reading)
         )
         return flown.crash_time, blocks
+
+    def clock_sums(
+        self,
+        flown: SimulatedChannels,
+        criterion: Criterion,
+        offsets: Array,
+        channels: Collection[str],
+    ) -> tuple[Array, Array, Array]:
+        """Return each flight's loss (N,) by some channels alone, read exactly at given offsets.
+
+        Beside it are gradient (N, offsets) and Hessian (N, offsets, offsets) of it by the offsets.
+
+        Parameters
+        ----------
+        flown
+            As of `fly`, without derivatives.
+        criterion
+            Gives horizon, scales and robust limit.
+        offsets
+            (offsets, N) in the units of a `Point`.
+        channels
+            Which count.
+        """
+        late = offsets[: len(OFFSETS), self.flight] * OFFSET_UNIT
+        rate, kinds = float(self.schedule.log_rate), len(OFFSETS)
+        reading = Reading(late, late[: len(CLOCKS)], rate, criterion.horizon, coefficients=0)
+        loss, gradient = np.zeros(self.flights), np.zeros((self.flights, kinds))
+        hessian = np.zeros((self.flights, kinds, kinds))
+        for name in channels:
+            for block in (made() for made in residuals(flown, self.segments, name, reading)):
+                owner = self.flight[block.segments]
+                scale = criterion.scale[name][owner]
+                scaled = block.errors / scale[:, None, None]
+                normal = gauss_newton(block.columns, scaled, scale, criterion.huber)
+                own = 0.5 * huber_loss(scaled, criterion.huber).sum(axis=(1, 2))
+                for total, part in zip((loss, gradient, hessian), (own, *normal), strict=True):
+                    np.add.at(total, owner, part)
+        return loss, gradient, hessian
 
     def sums(
         self, point: Point, criterion: Criterion, *, derivatives: bool = True, still: bool = False

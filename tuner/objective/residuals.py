@@ -93,13 +93,16 @@ def residuals(
 ) -> Iterator[Callable[[], Block]]:
     """Yield functions that return one channel's residuals up to the horizon, of some stamps each.
 
-    They may be called side by side.
+    They may be called side by side. What a clock that is late by a sample of the log or more stamps
+    before the simulation begins is not compared.
     """
     measured = segments.measured[name]
     time, values, weight = map(np.asarray, (measured.time, measured.values, measured.weight))
     # column by column: `any` along an axis in the middle takes four times as long
     known = np.logical_or.reduce([*np.moveaxis(weight != 0.0, 1, 0)])
-    used = np.ascontiguousarray(((time * reading.rate < reading.horizon - 1) & known).T)
+    place, late = time * reading.rate, reading.reference_offset[CLOCK_OF[name]] * reading.rate
+    begun = place >= np.where(late < 1.0, 0.0, late)
+    used = np.ascontiguousarray(((place < reading.horizon - 1) & begun & known).T)
     most = int(used.sum(axis=1).max(initial=0))
     order = np.argsort(~used, axis=1, kind="stable")[:, :most]
     log, moved_log = _Series(flown.channels[name]), flown.columns[name]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import scaled_inverse, scaled_solve
-from tuner.objective.criterion import OFFSET_UNIT, Point, SegmentSums, picked
+from tuner.objective.criterion import OFFSET_SD, OFFSET_UNIT, Point, SegmentSums, picked
 from tuner.objective.normal_equations import (
     Objective,
     downweighting,
@@ -24,7 +24,7 @@ from tuner.objective.normal_equations import (
     root_mean_squares,
     sums_at,
 )
-from tuner.objective.segments import CLOCKS
+from tuner.objective.segments import CLOCK_OF, CLOCKS
 from tuner.search.listener import Iteration
 from tuner.search.optimisers import descend, estimated_states, evolve
 from tuner.search.progress import (
@@ -43,6 +43,21 @@ NEGLIGIBLE_OFFSET = np.array([0.0005, 0.0005, 0.002, 0.002, 0.002])
 share a source or differ by much more, and 0.1 ms of freedom costs a percent of inertia."""
 CLOCK_LOSS_TOLERANCE = 0.01
 """Largest relative rise of the loss by setting clock offsets to zero: simulators differ by more."""
+CLOCK_STEPS = 5
+"""Steps to the clock that signals without jumps show."""
+MAX_OFFSET = 0.1 / OFFSET_UNIT
+"""Furthest that a clock is looked for, in the search's coordinate."""
+EARLY_CLOCKS_S, LATE_CLOCKS_S = (
+    (np.linspace(-5e-3, 5e-3, 9), 2.5e-3),
+    (np.linspace(-2e-3, 2e-3, 17), 0.5e-3),
+)
+"""Distances from there at which all signals are compared, and how far from it a clock is at least
+for that. Before whole flights two steps of the simulation, and one, within which commands do not
+jump; on whole flights less than one."""
+MAX_CLOCK_ROUNDS = 3
+"""How often the last stage is run again because a clock moves at its end."""
+MIN_CLOCK_GAIN = 10.0
+"""Least gain in log-likelihood of such a move, beside `CLOCK_LOSS_TOLERANCE`."""
 RIDGE = 1e-12
 """Added to a Hessian of unit diagonal: undetermined directions stay where they are."""
 SWITCH_GAIN = 1.2
@@ -103,6 +118,12 @@ def run_stages(
             progress = search.run_choices(stage, progress, undecided, start, before, last=last)
         else:
             progress = _finished(*search.run(stage, progress, last=last))
+    for _ in range(MAX_CLOCK_ROUNDS):
+        moved = _with_clocks_found(search, stages[-1], progress)
+        if moved is progress or progress.stage < len(stages):
+            break
+        moved = replace(moved, stage=progress.stage - 1)
+        progress = _finished(*search.run(stages[-1], moved, last=True))
     return progress
 
 
@@ -179,6 +200,7 @@ def _loss_of(
 
 
 def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -> StageProblem:
+    progress = _with_clocks_found(search, stage, progress)
     points, free, best = progress.points, search.free, int(np.argmin(progress.losses))
     kept = np.ones(points.offsets.shape[1:], bool)
     if stage.drops_offsets:  # per-flight conditions follow in later rows
@@ -207,6 +229,45 @@ def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -
     points = Point(points.coefficients, points.offsets * stay)
     criterion = criterion_of(stage, progress.scales, points.offsets[best], progress.states)
     return replace(problem, points=points, criterion=criterion, free=free)
+
+
+def _with_clocks_found(search: _Search, stage: Stage, progress: Progress) -> Progress:
+    """Return the progress with its points moved to flight controllers' clocks that are far off.
+
+    Commands hold between their jumps: compared at a clock that is milliseconds off, they have a
+    false minimum near it. Signals that do not jump show about where the clock is, however far. It
+    moves to where near there all its signals agree best, if they then agree clearly better.
+    """
+    objective, row = with_loop(search.objective, progress.loop), CLOCKS.index("flight_controller")
+    free = (search.free.offsets & stage.offsets)[row]
+    channels = [name for name in objective.channels if CLOCK_OF[name] == row]
+    smooth = [name for name in channels if name != "command"]
+    if not free.any() or not smooth:
+        return progress
+    near, least = LATE_CLOCKS_S if stage.drops_offsets else EARLY_CLOCKS_S
+    offsets = np.array(progress.points.offsets)
+    for here, vector in zip(offsets, progress.points.coefficients, strict=True):
+        criterion = criterion_of(stage, progress.scales, here, progress.states)
+        flown, there = objective.fly(Point(vector, here), criterion), here.copy()
+        for _ in range(CLOCK_STEPS):
+            _, gradient, hessian = objective.clock_sums(flown, criterion, there, smooth)
+            slope = gradient[:, row] + there[row] / OFFSET_SD**2
+            step = free * slope / (hessian[:, row, row] + 1.0 / OFFSET_SD**2)
+            there[row] = np.clip(there[row] - step, -MAX_OFFSET, MAX_OFFSET)
+        apart = np.abs(there[row] - here[row]) * OFFSET_UNIT > least
+        is_late = np.abs(here[row]) * OFFSET_UNIT > NEGLIGIBLE_OFFSET[row]
+        looked_at = free & (apart | (is_late & stage.drops_offsets))
+        if not looked_at.any():
+            continue
+        tried = np.tile(here, (1 + len(near), 1, 1))
+        tried[1:, row, looked_at] = (there[row] + near[:, None] / OFFSET_UNIT)[:, looked_at]
+        losses = np.array([objective.clock_sums(flown, criterion, t, channels)[0] for t in tried])
+        best, gain = np.argmin(losses, axis=0), losses[0] - np.min(losses, axis=0)
+        best[gain <= np.maximum(CLOCK_LOSS_TOLERANCE * losses[0], MIN_CLOCK_GAIN)] = 0
+        here[row] = tried[best, row, np.arange(len(best))]
+    if np.array_equal(offsets, progress.points.offsets):
+        return progress
+    return replace(progress, points=Point(progress.points.coefficients, offsets))
 
 
 def _clocks_that_differ(problem: StageProblem, best: int, sums: SegmentSums) -> NDArray[np.bool_]:

@@ -382,21 +382,22 @@ def offsets_of(job: Job, fitted: Fit) -> dict[str, float]:
     """Return flight -> s by which its pose stamps are late.
 
     Those of fitted flights were estimated. A held-out one whose stamps were not moved when it was
-    read is as late as most of these were recorded, spins left out, which hardly show it.
+    read is as late as most of these were recorded, spins left out, which hardly show it. What was
+    moved of it is taken back where the fit took it back of most that were moved.
     """
     pose = np.asarray(fitted.point.offsets)[CLOCKS.index("pose")] * OFFSET_UNIT
     late = {flight.name: float(of) for flight, of in zip(job.fitted, pose, strict=True)}
     free = {r.flight.name: r.flight for r in job.recordings if r.time_offset is None}
-    recorded = np.array(
-        [
-            late[name] + _moved_by(flight)
-            for name, flight in free.items()
-            if name in late and flight.yaw_rate_setpoint is None
-        ]
-    )
+    moved = {name: _moved_by(flight) for name, flight in free.items()}
+    shown = [n for n, f in free.items() if n in late and f.yaw_rate_setpoint is None]
+    held_out = [name for name in free if name not in late]
+    recorded = np.array([late[name] + moved[name] for name in shown])
     usual = float(np.median(recorded)) if len(recorded) else 0.0
     if 2 * np.sum(np.abs(recorded - usual) < SAME_CLOCK_S) > len(recorded):
-        late |= {name: usual for name, f in free.items() if name not in late and not _moved_by(f)}
+        late |= {name: usual for name in held_out if not moved[name]}
+    back = [abs(late[name] + moved[name]) < SAME_CLOCK_S for name in shown if moved[name]]
+    if 2 * sum(back) > len(back):
+        late |= {name: -moved[name] for name in held_out if moved[name]}
     return {
         r.flight.name: (r.time_offset or 0.0) + late.get(r.flight.name, 0.0) for r in job.recordings
     }

@@ -41,9 +41,10 @@ from tuner.equation_error.recorded_accelerations import MIN_SAMPLES, Mask, Steps
 from tuner.findings.findings import Code, Finding
 from tuner.findings.sentences import CONTROLLER_FILE
 from tuner.objective.battery import log_voltage_of, with_readings_redrawn
-from tuner.objective.criterion import Point
+from tuner.objective.criterion import OFFSET_UNIT, Point
 from tuner.objective.inlets import linear_interpolation, zero_order_hold
 from tuner.objective.normal_equations import Objective
+from tuner.objective.segments import CLOCK_OF, CLOCKS, stamped_earlier
 from tuner.objective.simulation import (
     BODY_ATTITUDE,
     MOTION,
@@ -148,7 +149,7 @@ def model_errors_of(fitted: Fit, flights: Sequence[Flight]) -> ModelErrors | Non
     """
     objective, point = fitted.objective, fitted.point
     segments, schedule = objective.segments, objective.schedule
-    simulated = _flown(fitted)
+    simulated, flights = _flown(fitted), _on_the_simulations_clock(fitted, flights)
     if simulated is None:
         return None
     flown, usable = simulated
@@ -210,9 +211,21 @@ def answers_of(fitted: Fit, flights: Sequence[Flight]) -> tuple[ControllerEstima
     simulated, objective = _flown(fitted), fitted.objective
     if simulated is None:
         return ()
+    flights = _on_the_simulations_clock(fitted, flights)
     mixer, rate = objective.model.controller.mixer, float(objective.schedule.log_rate)
     estimates = _controller_estimates(flights, simulated[0], mixer, rate, simulated[1])
     return tuple(estimate for estimate in estimates if estimate.differs)
+
+
+def _on_the_simulations_clock(fitted: Fit, flights: Sequence[Flight]) -> tuple[Flight, ...]:
+    """Return the fitted flights with each clock's stamps as early as the fit found it late."""
+    late = np.asarray(fitted.point.offsets)[: len(CLOCKS)] * OFFSET_UNIT
+    moved = list(flights)
+    for number, flight in enumerate(flights):
+        for clock, seconds in enumerate(late[:, number].tolist()):
+            stamped = [name for name in flight.series if CLOCK_OF.get(name) == clock]
+            moved[number] = stamped_earlier(moved[number], stamped, seconds)
+    return tuple(moved)
 
 
 def _flown(fitted: Fit) -> tuple[SimulatedChannels, Mask] | None:

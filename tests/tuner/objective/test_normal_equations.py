@@ -116,6 +116,19 @@ def test_a_horizon_cuts_the_compared_samples(fit):
     assert float(part.squares["position"][0]) < float(whole.squares["position"][0])
 
 
+@pytest.mark.parametrize(("late", "missed"), [(0.0, 0), (0.004, 0), (0.03, 1), (-0.03, 0)])
+def test_what_a_late_clock_stamps_before_the_start_is_not_compared(fit, late, missed):
+    """Two flights of three rates each; a clock that is late by less than a sample misses none."""
+    point, criterion = truth(fit), criterion_of(fit)
+    at = np.where(np.arange(2)[:, None] == CLOCK_OF["body_rate"], late, np.zeros((2, 2)))
+    counts = [
+        fit.sums(point, one, derivatives=False).counts
+        for one in (criterion, replace(criterion, reference_offset=at))
+    ]
+    assert np.all(counts[0]["body_rate"] - counts[1]["body_rate"] == 3 * missed)
+    assert np.all(counts[0]["position"] == counts[1]["position"])
+
+
 def test_huber_counts_large_residuals_linearly(fit):
     criterion = criterion_of(fit)
     robust = replace(criterion, huber=2.0)

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import NOISE, PHYSICS, problem, truth, with_data
-from tuner.objective.criterion import Point, picked
+from tuner.objective.criterion import OFFSET_UNIT, Point, picked
 from tuner.objective.initial_conditions import ROWS, start_sd_of_spin
 from tuner.objective.normal_equations import normal_equations, sums_at
-from tuner.objective.segments import CLOCKS, OFFSETS
+from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, MeasuredChannel
 from tuner.search import continuation, optimisers
 from tuner.search.continuation import OPTIMISERS, _clocks_that_differ, run_stages
 from tuner.search.optimisers import MAX_STATE_SD, estimated_states, need_relinearising
@@ -147,7 +147,7 @@ MODULE = '''
 import numpy as np
 
 from tuner.objective.normal_equations import evaluate
-from tuner.objective.criterion import Point, picked
+from tuner.objective.criterion import OFFSET_UNIT, Point, picked
 from tuner.search.continuation import OPTIMISERS
 from tuner.search.progress import Iterate
 
@@ -330,6 +330,38 @@ def test_saturation_feedback_is_decided_by_the_flights_that_clip(flown):
         on_progress=lambda _: None,
     )
     assert progress.loop.saturation_feedback == flown
+
+
+LATE = (0.0137, 0.0062)
+"""s by which a flight controller's clock is late in each of two flights."""
+
+
+def with_a_late_flight_controller(fit):
+    """Return a fit with commands, and what the flight controller stamps later by `LATE`."""
+    stamps = fit.segments.measured["body_rate"].time + 0.3 / PHYSICS
+    read, weight = np.zeros((len(stamps), 4, 2)), np.full((len(stamps), 4, 2), 1.0 / 3e-4)
+    measured = {**fit.segments.measured, "command": MeasuredChannel(stamps, read, weight)}
+    noise = np.random.default_rng(7)
+    fit = eqx.tree_at(lambda o: o.segments.measured, fit, measured)
+    fit = with_data(fit, truth(fit), noise=noise)
+    late = {
+        name: eqx.tree_at(lambda m: m.time, of, of.time + CLOCK_OF[name] * np.array(LATE))
+        for name, of in fit.segments.measured.items()
+    }
+    return eqx.tree_at(lambda o: o.segments.measured, fit, late)
+
+
+def test_a_late_flight_controller_is_found_though_commands_jump():
+    fit = with_a_late_flight_controller(problem(FREE))
+    progress, _ = searched(fit, [np.asarray(fit.space.initial) + 0.1], offsets=True)
+    fitted, true = (
+        fit.space.numbers(of) for of in (progress.points.coefficients[0], fit.space.initial)
+    )
+    for name, value in true.items():
+        assert float(fitted[name]) == pytest.approx(float(value), rel=0.01), name
+    found = np.asarray(progress.points.offsets)[0, CLOCKS.index("flight_controller")] * OFFSET_UNIT
+    np.testing.assert_allclose(found, LATE, atol=3e-4)
+    assert max(progress.scales["command"]) < 1.1
 
 
 # clocks that recordings can do without are right; those that differ from the others stay late

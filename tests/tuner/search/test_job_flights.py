@@ -213,6 +213,7 @@ def test_little_is_not_looked_at(flown):
     [
         ((0.017, 0.018, 0.03), 0.0, 0.018),
         ((0.0, -0.055), 0.055, 0.0),  # the fit takes back what was moved in vain
+        ((0.0, 0.0), 0.055, 0.0),
         ((0.0, 0.03), 0.0, 0.0),  # they agree on none
     ],
 )
@@ -224,7 +225,11 @@ def test_a_held_out_flight_has_the_clock_of_the_fitted_ones(flights, late, moved
     others = {
         "held out": (circle, None, usual),
         "given": (circle, 0.005, 0.005),
-        "moved": (replace(circle, notes=(NoteCode.POSE_MOVED.note(seconds=0.04),)), None, 0.0),
+        "moved": (
+            replace(circle, notes=(NoteCode.POSE_MOVED.note(seconds=0.04),)),
+            None,
+            -0.04 if moved and late[-1] else 0.0,
+        ),
     }
     recordings = [
         *(JobFlight(flight, time_offset=None) for flight in fitted),

@@ -123,7 +123,7 @@ def with_data(
             turn = noise.normal(size=(len(values), 3, 2)) * NOISE[channel] / 2.0
             values = _turned(values, turn)
         elif noise is not None:
-            values = values + noise.normal(size=values.shape) * NOISE[channel]
+            values = values + noise.normal(size=values.shape) * NOISE.get(channel, 0.0)
         measured[channel] = MeasuredChannel(old.time, jnp.asarray(values), old.weight)
     return eqx.tree_at(lambda o: o.segments.measured, objective, measured)
 

@@ -23,7 +23,7 @@ from tuner.config import JobFile
 from tuner.equation_error.omitted_laws import _likeliest
 from tuner.equation_error.rate_controller import ControllerEstimate
 from tuner.findings.findings import Code
-from tuner.objective.criterion import Point
+from tuner.objective.criterion import OFFSET_UNIT, Point
 from tuner.objective.initial_conditions import SPIN_ROWS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import MeasuredChannel, Segments
@@ -322,6 +322,23 @@ def test_commands_that_were_recorded_between_two_ticks_are_those_that_hold():
     objective = problem({})
     objective = replace(objective, segments=replace(objective.segments, measured=measured))
     assert model_errors_of(making.fitted_of(objective, making.truth(objective)), flights) is None
+
+
+def test_clocks_that_a_fit_found_late_are_no_error_of_its_model():
+    measured, flights = flown(problem({}), 0, loop=True)
+    late = {"position": -0.012, "attitude": -0.012, "body_rate": 0.023, "rotor_speed": 0.023}
+    late["command"] = late["body_rate"]
+    for series in (flight.series for flight in flights):
+        for name, seconds in late.items():
+            series[name] = Series(series[name].time + seconds, series[name].values)
+    objective = problem({})
+    objective = replace(objective, segments=replace(objective.segments, measured=measured))
+    point = making.truth(objective)
+    for row, name in enumerate(("position", "body_rate")):
+        point.offsets[row] = late[name] / OFFSET_UNIT
+    fitted = making.fitted_of(objective, point)
+    assert model_errors_of(fitted, flights) is None
+    assert not answers_of(fitted, flights)
 
 
 def flown_with_p(factor):
