@@ -174,11 +174,24 @@ def configure(*, keep_compiled: bool = True) -> None:
     keep_compiled
         Keep compiled code in the user's cache folder, so that the same job starts at once the next
         time, unless ``JAX_COMPILATION_CACHE_DIR`` names another folder.
+
+    Raises
+    ------
+    InputError
+        A variable of the environment, of those that jax reads, is none that it can use here.
     """
     set_environment()
     collect_rarely()
     keep_memory()
-    import jax  # noqa: PLC0415 (must come after the environment, and is slow)
+    try:
+        import jax  # noqa: PLC0415 (must come after the environment, and is slow)
+    except ValueError as error:  # as for JAX_ENABLE_X64=maybe
+        raise InputError("the environment", str(error), "correct or unset the variable") from None
+    try:
+        jax.devices()
+    except (RuntimeError, AssertionError):
+        what = f"is {os.environ['JAX_PLATFORMS']!r}, which jax cannot use here"
+        raise InputError("JAX_PLATFORMS", what, "unset the variable, or set it to cpu") from None
 
     if keep_compiled:
         from lanes import keep_code_in  # noqa: PLC0415 (imports jax)

@@ -53,6 +53,31 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, obj
     return cache, in_fresh_python(cache)
 
 
+@pytest.mark.parametrize(
+    ("variable", "value", "words"),
+    [
+        ("JAX_PLATFORMS", "cuda", "JAX_PLATFORMS: is 'cuda', which jax cannot use here; unset"),
+        ("JAX_PLATFORMS", "tpu", "JAX_PLATFORMS: is 'tpu', which jax cannot use here; unset"),
+        ("JAX_ENABLE_X64", "maybe", "invalid truth value 'maybe' for environment 'JAX_ENABLE_X64'"),
+    ],
+)
+def test_what_jax_cannot_use_is_one_line(
+    variable: str, value: str, words: str, tmp_path: Path
+) -> None:
+    program = "from tuner.cli import program; program()"
+    asked = ["simulate", "--trajectory", "hover", "--out", str(tmp_path / "hover.csv")]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *asked],
+        env=os.environ | {variable: value},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert words in done.stderr
+
+
 def test_one_thread_double_precision_and_a_kept_cache(
     plain: tuple[Path, dict[str, object]],
 ) -> None:
