@@ -30,6 +30,8 @@ FALSE_ALARM_LEVEL = 0.001
 """Probability of a false alarm among all coefficients and splits."""
 MIN_DIFFERENCE = 0.01
 """Least relative difference that is reported."""
+MIN_LAG_STEPS = 0.5
+"""Least difference of latencies and other lags about zero, in physics steps."""
 MIN_OWN_INFORMATION = 0.01
 """Least share of the information on a coefficient that the others do not explain."""
 
@@ -70,16 +72,20 @@ def flights_disagree(fitted: Fit, examination: Examination) -> tuple[Finding, ..
     hidden = hidden_by_setpoints(names, fitted.objective.model) & followed
     searched = [i for i, name in enumerate(names) if name not in fitted.held and not hidden[i]]
     splits = _splits(information, searched, len(uncertainty.flights))
-    if not splits:
+    least = MIN_DIFFERENCE * np.asarray(uncertainty.reference)
+    is_lag = [COEFFICIENTS[n].unit == "s" and COEFFICIENTS[n].neutral == 0.0 for n in names]
+    least[is_lag] = MIN_LAG_STEPS * fitted.objective.schedule.step
+    reported = [one for one in splits if abs(one.difference) >= least[one.number]]
+    if not reported:
         return ()
-    split = max(splits, key=lambda one: abs(one.ratio))
+    split = max(reported, key=lambda one: abs(one.ratio))
     error = float(
         np.hypot(covariance_of(_with_two_values(information, split)).error[-1], split.read)
     )
     sure = abs(split.difference) > float(ndtri(1.0 - 0.5 * FALSE_ALARM_LEVEL / len(splits))) * error
-    reference = float(uncertainty.reference[split.number])
-    if not sure or abs(split.difference) < MIN_DIFFERENCE * reference:
+    if not sure:
         return ()
+    reference = float(uncertainty.reference[split.number])
     flights = ", ".join(uncertainty.flights[flight] for flight in split.flights)
     name, unit = names[split.number], tuple[str, ...]()
     if COEFFICIENTS[name].neutral == 0.0:  # a share of about nothing says nothing

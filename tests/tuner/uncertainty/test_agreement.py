@@ -55,7 +55,9 @@ def fit_of(
         uncertainty=uncertainty, information=information, model_errors=None
     )
     controller = SimpleNamespace(sees_markers=0.0)
-    objective = SimpleNamespace(model=SimpleNamespace(controller=controller))
+    objective = SimpleNamespace(
+        model=SimpleNamespace(controller=controller), schedule=SimpleNamespace(step=0.1)
+    )
     return SimpleNamespace(findings=(), held={}, objective=objective), examination
 
 
@@ -110,6 +112,15 @@ def test_a_negligible_difference_is_not_reported():
     fitted, examination = fit_of(0, 0.1)
     examination.uncertainty.reference[:] = 20.0
     assert not flights_disagree(fitted, examination)
+
+
+@pytest.mark.parametrize(("step", "reported"), [(0.25, False), (0.15, True)])
+def test_latencies_that_differ_by_less_than_half_a_step_agree(step, reported):
+    fitted, examination = of_names(*fit_of(0, 0.1), ("inertia_xx", "estimate_latency", NAMES[2]))
+    fitted.objective.schedule.step = step
+    assert [found.names[0] for found in flights_disagree(fitted, examination)] == (
+        ["estimate_latency"] if reported else []
+    )
 
 
 def test_held_coefficients_and_reported_flights_are_left_out():
