@@ -56,6 +56,7 @@ from tuner.uncertainty.estimates import (
     finer_than_steps,
     flights_refute,
     term_findings,
+    unrefuted,
 )
 from tuner.uncertainty.examination import Examination, knowledge_of
 from tuner.uncertainty.model_error import model_error_findings
@@ -209,7 +210,7 @@ class _Run:
                 *reference_voltage_findings(self.settings.vehicle, vehicle),
             )
         )
-        sources = {} if examination is None else self.sources(selected, examination)
+        selected, sources = self.judged(selected, examination)
         write = partial(self.written, selected, validation, examination, sources=sources)
         physical = Run(folder=folder, result=write(), vehicle=vehicle)
         simulations = {"initial": validation.initial, "best": validation.best}
@@ -235,7 +236,7 @@ class _Run:
                     None,
                 )
         reporter.attempt("exports", self.export, None)
-        findings = (*fitted.findings, *reporter.findings)
+        findings = (*selected.fitted.findings, *reporter.findings)
         if findings != result.findings:
             result = result.model_copy(update={"findings": findings})
             result.write(folder)
@@ -280,9 +281,17 @@ class _Run:
             )
         return result
 
-    def sources(self, selected: SelectionResult, examination: Examination) -> dict[str, Sources]:
-        """Keep the findings of an examination; return coefficients by flights and by ground."""
+    def judged(
+        self, selected: SelectionResult, examination: Examination | None
+    ) -> tuple[SelectionResult, dict[str, Sources]]:
+        """Keep the findings of an examination; return the selection without those it refutes.
+
+        And coefficients by flights and by ground.
+        """
+        if examination is None:
+            return selected, {}
         fitted, uncertainty = selected.fitted, examination.uncertainty
+        fitted = replace(fitted, findings=unrefuted(fitted.findings, uncertainty))
         self.reporter.add(
             (
                 *flights_refute(uncertainty),
@@ -295,7 +304,7 @@ class _Run:
         find = partial(sources_of, fitted, uncertainty, examination.known)
         sources: dict[str, Sources] = self.reporter.attempt("ground measurements", find, {})
         self.reporter.add(ground_conflicts(sources, fitted.objective.space.fixed.get("mass")))
-        return sources
+        return replace(selected, fitted=fitted), sources
 
     def effective(self, physical: Run, selected: SelectionResult) -> Effective | None:
         """Return the effective coefficients in Gazebo, None where it has every term."""

@@ -75,10 +75,10 @@ def flights_disagree(fitted: Fit, examination: Examination) -> tuple[Finding, ..
     least = MIN_DIFFERENCE * np.asarray(uncertainty.reference)
     is_lag = [COEFFICIENTS[n].unit == "s" and COEFFICIENTS[n].neutral == 0.0 for n in names]
     least[is_lag] = MIN_LAG_STEPS * fitted.objective.schedule.step
-    reported = [one for one in splits if abs(one.difference) >= least[one.number]]
-    if not reported:
+    material = [one for one in splits if abs(one.difference) >= least[one.number]]
+    if not material:
         return ()
-    split = max(reported, key=lambda one: abs(one.ratio))
+    split = max(material, key=lambda one: abs(one.ratio))
     error = float(
         np.hypot(covariance_of(_with_two_values(information, split)).error[-1], split.read)
     )

@@ -320,6 +320,20 @@ def flights_refute(uncertainty: Uncertainty) -> Iterator[Finding]:
         yield FLIGHTS_REFUTE
 
 
+def unrefuted(findings: Sequence[Finding], uncertainty: Uncertainty) -> tuple[Finding, ...]:
+    """Return findings without those on the search's start that the fit refutes.
+
+    These call a coefficient undetermined that the fit knows well.
+    """
+
+    def is_refuted(finding: Finding) -> bool:
+        named = {Code.NO_EFFECT: (finding.subject,), Code.SINGULAR_DIRECTION: finding.names}
+        known = [uncertainty.estimates[name].verdict for name in named.get(finding.code, ())]
+        return bool(known) and set(known) == {Verdict.WELL_KNOWN}
+
+    return tuple(finding for finding in findings if not is_refuted(finding))
+
+
 REPORTED_TERMS = (
     "thrust_exponent",
     "motor_lag",

@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.findings.findings import sentence
+from tuner.findings.findings import Code, sentence
 from tuner.objective.criterion import Point
 from tuner.objective.information import information_at
 from tuner.objective.normal_equations import Objective, normal_equations
-from tuner.uncertainty.estimates import Uncertainty, _lags, term_findings, uncertainty_of
+from tuner.uncertainty.estimates import (
+    Uncertainty,
+    _lags,
+    term_findings,
+    uncertainty_of,
+    unrefuted,
+)
 from tuner.uncertainty.verdict import Verdict
 
 FREE = (
@@ -183,3 +189,19 @@ def test_terms_that_flights_do_not_identify_have_no_number_in_findings():
     assert found.numbers == {"gyro_scale_x": 1.02, "gyro_scale_x_error": 0.001}
     assert not list(term_findings(fitted, SimpleNamespace(estimates={"gyro_scale_z": unknown})))
     assert not list(term_findings(fitted, SimpleNamespace(estimates={"tachometer_memory": known})))
+
+
+@pytest.mark.parametrize(
+    ("verdict", "refuted"), [(Verdict.WELL_KNOWN, True), (Verdict.WEAKLY_KNOWN, False)]
+)
+def test_what_the_fit_knows_well_refutes_what_was_said_of_its_start(verdict, refuted):
+    verdicts = {"inertia_xx": Verdict.WELL_KNOWN, "motor_constant": verdict}
+    known = SimpleNamespace(
+        estimates={name: SimpleNamespace(verdict=one) for name, one in verdicts.items()}
+    )
+    said = (
+        Code.SINGULAR_DIRECTION.warning("coefficients", *verdicts),
+        Code.NO_EFFECT.warning("motor_constant"),
+    )
+    other = Code.FINER_THAN_STEPS.warning("inertia_xx", seconds=1e-4)
+    assert unrefuted((*said, other), known) == ((other,) if refuted else (*said, other))
