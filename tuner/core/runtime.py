@@ -18,6 +18,7 @@ import os
 import platform
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -162,6 +163,17 @@ def kernel_folder() -> Path:
     return cache_folder() / "kernels"
 
 
+_forked: list[bool] = []
+"""Whether this process was forked from one that had computed: one entry, or none."""
+
+
+@cache
+def _notice_forks() -> None:
+    """Have each process that is forked from this one know it."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=partial(_forked.append, True))
+
+
 def configure(*, keep_compiled: bool = True) -> None:
     """Set jax up for simulation; call it once, before the first computation.
 
@@ -178,8 +190,13 @@ def configure(*, keep_compiled: bool = True) -> None:
     Raises
     ------
     InputError
-        A variable of the environment, of those that jax reads, is none that it can use here.
+        A variable of the environment, of those that jax reads, is none that it can use here; or the
+        process was forked from one that had computed, whose threads it lacks.
     """
+    if _forked:
+        what = "was forked from one that had computed with jax, and would wait for ever"
+        remedy = 'start it by multiprocessing.get_context("spawn")'
+        raise InputError("this process", what, remedy)
     set_environment()
     collect_rarely()
     keep_memory()
@@ -192,6 +209,7 @@ def configure(*, keep_compiled: bool = True) -> None:
     except (RuntimeError, AssertionError):
         what = f"is {os.environ['JAX_PLATFORMS']!r}, which jax cannot use here"
         raise InputError("JAX_PLATFORMS", what, "unset the variable, or set it to cpu") from None
+    _notice_forks()
 
     if keep_compiled:
         from lanes import keep_code_in  # noqa: PLC0415 (imports jax)

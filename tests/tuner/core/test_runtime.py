@@ -78,6 +78,34 @@ def test_what_jax_cannot_use_is_one_line(
     assert words in done.stderr
 
 
+FORKED = """
+import os
+from tuner.core.errors import InputError
+from tuner.core.runtime import configure
+configure()
+child = os.fork()
+try:
+    configure()
+except InputError as error:
+    print(error, flush=True)
+os._exit(0) if not child else os.waitpid(child, 0)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="nothing forks there")
+def test_a_process_that_would_wait_for_threads_it_lacks_is_refused() -> None:
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", FORKED],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    (line,) = done.stdout.splitlines()
+    assert "this process: was forked from one that had computed with jax" in line
+    assert "spawn" in line
+
+
 def test_one_thread_double_precision_and_a_kept_cache(
     plain: tuple[Path, dict[str, object]],
 ) -> None:
