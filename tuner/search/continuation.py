@@ -7,7 +7,7 @@ inflated at first, since the model is still wrong by more than noise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -61,7 +61,8 @@ MIN_CLOCK_GAIN = 10.0
 RIDGE = 1e-12
 """Added to a Hessian of unit diagonal: undetermined directions stay where they are."""
 SWITCH_GAIN = 1.2
-"""Least factor on the loss of informative flights that overrules the controller file."""
+"""Least factor on the loss of informative flights that overrules the controller file; where an
+earlier search has overruled it already, the smaller loss decides."""
 RESTARTED_CHOICES = ("sees_markers",)
 """Choices whose alternative is searched from the start: during a hover the markers' coefficients
 absorb the wrong choice, and from there the right one has a false minimum."""
@@ -81,6 +82,7 @@ def run_stages(
     seed: int = 0,
     worth_polishing: Callable[[Progress], bool] = lambda _: True,
     start: Progress | None = None,
+    overruled: Collection[str] = (),
 ) -> Progress:
     """Run the remaining stages and return the progress at their end.
 
@@ -104,8 +106,10 @@ def run_stages(
         Whether to go on to the first polish.
     start
         Progress at the search's start, if not ``progress``.
+    overruled
+        The choices in which an earlier search has overruled the controller file.
     """
-    search = _Search(objective, free, on_progress, seed)
+    search = _Search(objective, free, on_progress, seed, overruled)
     start = progress if start is None else start
     while progress.stage < len(stages):
         stage = stages[progress.stage]
@@ -135,6 +139,7 @@ class _Search:
     free: Point
     on_progress: OnProgress
     seed: int
+    overruled: Collection[str] = ()
 
     def run(
         self, stage: Stage, progress: Progress, *, last: bool
@@ -185,7 +190,8 @@ class _Search:
             rival = other.run(stage, switched, last=last)
             evaluations = best[1].evaluations + rival[1].evaluations - begin.evaluations
             own, others = (_loss_of(informative, *end) for end in (best, rival))
-            problem, end, iterate = best if own <= SWITCH_GAIN * others else rival
+            gain = 1.0 if choice in self.overruled else SWITCH_GAIN
+            problem, end, iterate = best if own <= gain * others else rival
             best = problem, replace(end, evaluations=evaluations), iterate
         return _finished(*best)
 

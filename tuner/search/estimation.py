@@ -406,7 +406,8 @@ def polished(
     """Return a fit searched again, by some stages from its point or from a start vector.
 
     A search from a start forgets the bias by missing terms, such as a coefficient at its bound; the
-    loop's choices are tried both ways again.
+    loop's choices are tried both ways again, and neither is preferred where the fit overruled the
+    controller file.
 
     Parameters
     ----------
@@ -429,6 +430,7 @@ def polished(
     """
     objective, point = fitted.objective, fitted.point
     undecided: Undecided = {}
+    overruled: list[str] = []
     if start is None:
         last = fitted.iterations[-1].damping if fitted.iterations else None
         progress = replace(
@@ -443,8 +445,10 @@ def polished(
             damping=np.array([np.clip(last, MIN_DAMPING, 1.0) if last else 1.0]),
         )
     else:
-        undecided = job.undecided(objective)
-        progress = replace(initial_progress(objective, start[None]), loop=loop_of(job.objective))
+        undecided, of_file = job.undecided(objective), loop_of(job.objective)
+        both = zip(Loop._fields, of_file, loop_of(objective), strict=True)
+        overruled = [choice for choice, wanted, found in both if found != wanted]
+        progress = replace(initial_progress(objective, start[None]), loop=of_file)
     progress = replace(progress, iterations=fitted.iterations, evaluations=fitted.evaluations)
     planned = stages_of(job, objective)[stages]
     named = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in planned)
@@ -456,7 +460,13 @@ def polished(
         )
         named = (*named[:exact], *rough)
     progress = run_stages(
-        objective, named, progress, free=free, undecided=undecided, on_progress=on_progress
+        objective,
+        named,
+        progress,
+        free=free,
+        undecided=undecided,
+        on_progress=on_progress,
+        overruled=overruled,
     )
     changed = _end(job, objective, named[-1], progress)
     return with_end_findings(job, replace(fitted, **changed, polished=True))

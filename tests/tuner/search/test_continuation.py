@@ -18,7 +18,12 @@ from tuner.objective.initial_conditions import ROWS, start_sd_of_spin
 from tuner.objective.normal_equations import normal_equations, sums_at
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, MeasuredChannel
 from tuner.search import continuation, optimisers
-from tuner.search.continuation import OPTIMISERS, _clocks_that_differ, run_stages
+from tuner.search.continuation import (
+    OPTIMISERS,
+    SWITCH_GAIN,
+    _clocks_that_differ,
+    run_stages,
+)
 from tuner.search.optimisers import MAX_STATE_SD, estimated_states, need_relinearising
 from tuner.search.progress import Loop, criterion_of, initial_progress, loop_of, with_loop
 from tuner.search.stages import WHOLE_LENGTH, Stage, horizon_stages, plan
@@ -280,6 +285,27 @@ def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, 
     found = fit.space.numbers(progress.points.coefficients[0])
     for name, value in FRAME.items():
         assert float(found[name]) == pytest.approx(value, rel=0.05)
+
+
+@pytest.mark.parametrize(("overruled", "chosen"), [((), 0.0), (("sees_markers",), 1.0)])
+def test_a_file_that_was_overruled_before_needs_the_smaller_loss(monkeypatch, overruled, chosen):
+    def loss(_, problem, *__):
+        return 1.0 if loop_of(problem.objective).sees_markers else 0.5 * (1.0 + SWITCH_GAIN)
+
+    monkeypatch.setattr(continuation, "_loss_of", loss)
+    fit = problem(tuple(FRAME))
+    stages = horizon_stages(fit.samples, fit.schedule.log_rate, robust=True, steps=1)
+    at = next(number for number, stage in enumerate(stages) if stage.tries_choices)
+    progress = run_stages(
+        with_data(fit, fit.start(fit.space.initial)),
+        stages[at : at + 1],
+        initial_progress(fit, np.asarray(fit.space.initial)[None]),
+        free=Point(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
+        undecided={"sees_markers": np.ones(2, bool)},
+        on_progress=lambda _: None,
+        overruled=overruled,
+    )
+    assert progress.loop.sees_markers == chosen
 
 
 def test_who_sees_the_markers_is_tried_from_where_the_search_began():

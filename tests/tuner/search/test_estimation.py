@@ -215,8 +215,8 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
     )
     asked = {}
 
-    def grown(_, __, progress, *, undecided, **___):
-        asked.update(undecided=undecided, loop=progress.loop)
+    def grown(_, __, progress, *, undecided, overruled, **___):
+        asked.update(undecided=undecided, loop=progress.loop, overruled=overruled)
         scales = {name: np.ones(len(FLIGHTS)) for name in NOISE}
         loop = own.switched(choice)
         return replace(progress, loop=loop, scales=scales, losses=np.ones(1))
@@ -227,10 +227,10 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
     again = estimation.polished(
         job, fitted, start=objective.space.initial, stages=estimation.ALL_BUT_LAST, **said
     )
-    assert asked == {"undecided": {choice: tell}, "loop": own}
+    assert asked == {"undecided": {choice: tell}, "loop": own, "overruled": [choice]}
     assert loop_of(again.objective) == own.switched(choice)
     estimation.polished(job, again, **said)
-    assert asked == {"undecided": {}, "loop": own.switched(choice)}
+    assert (asked["undecided"], asked["loop"]) == ({}, own.switched(choice))
 
 
 @pytest.mark.parametrize(("left", "steps"), [(None, 2), (1e-3, 1)])
