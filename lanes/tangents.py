@@ -95,6 +95,8 @@ class Node:
         Whether it is not eliminated.
     finite
         Whether it surely is, if the tangents in memory are.
+    changed
+        The elimination that last changed its terms, its readers or theirs, by number.
     """
 
     of: Any
@@ -103,6 +105,7 @@ class Node:
     readers: dict[Node, None] = field(default_factory=dict)
     kept: bool = False
     finite: bool = False
+    changed: int = 0
 
     @property
     def kind(self) -> ir.Type:
@@ -209,6 +212,7 @@ class Graph:
         self._known: dict[Any, Node] = {}
         self._found: dict[int, Node] = {}
         self._is_finite = _Finite()
+        self._eliminations = 0
         for number in sorted(needed):
             self._found[number] = self._node(needed[number])
         self.outs = [self._of(x) for x in outs]
@@ -343,18 +347,32 @@ class Graph:
                 node.terms = {}
 
     def _eliminate(self) -> None:
-        """Eliminate nodes, alone and together with those that the same nodes read."""
+        """Eliminate nodes, alone and together with those that the same nodes read.
+
+        What was refused is tried again once it, or what reads it, has changed.
+        """
+        refused: dict[tuple[Node, ...], int] = {}
+
+        def is_eliminated(*nodes: Node) -> bool:
+            last = refused.get(nodes, -1)
+            if all(node.changed <= last for node in nodes):
+                return False
+            if self._eliminate_nodes(nodes):
+                return True
+            refused[nodes] = self._eliminations
+            return False
+
         changed = True
         while changed:
             changed = False
             for node in reversed(self.nodes):
-                changed |= self._eliminate_nodes([node])
+                changed |= is_eliminated(node)
             together: dict[frozenset[Node], list[Node]] = {}
             for node in self.nodes:
                 together.setdefault(frozenset(node.readers), []).append(node)
             for nodes in together.values():
                 if len(nodes) > 1:
-                    changed |= self._eliminate_nodes(nodes)
+                    changed |= is_eliminated(*nodes)
         self.nodes = [n for n in self.nodes if n.kept or n.terms is None or n.readers]
         self._order()
 
@@ -397,16 +415,22 @@ class Graph:
             change += _cost(terms) - _cost(reader.sum)
         if change + self._shared_cost * shared > 0:
             return False
+        self._eliminations += 1
+        touched = [*nodes, *readers]
         for node in nodes:
             for operand in node.sum:
                 operand.readers.pop(node)
+            touched += node.sum
             node.terms, node.readers = {}, {}
         for reader, terms in readers.items():
             for operand in reader.sum:
                 operand.readers.pop(reader, None)
+            touched += reader.sum
             reader.terms = terms
             for operand in terms:
                 operand.readers[reader] = None
+        for node in touched:
+            node.changed = self._eliminations
         return True
 
 
