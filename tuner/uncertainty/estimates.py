@@ -349,6 +349,8 @@ REPORTED_TERMS = (
 """Groups of terms with a finding: a lab can act on them."""
 SHAPES = ("tachometer_memory",)
 """Coefficients of these that tell how an effect acts, not whether there is one."""
+MIN_REPORTED_SPEED_LAG_S = 1e-3
+"""Least lag of recorded rotor speeds that is reported."""
 
 
 def term_findings(
@@ -371,6 +373,11 @@ def term_findings(
         }
         neutral = {name: COEFFICIENTS[name].neutral or 0.0 for name in identified}
         instead = substitutes.get(group, {})
+        if all(
+            name == "tachometer_lag" and abs(estimate.value) < MIN_REPORTED_SPEED_LAG_S
+            for name, estimate in identified.items()
+        ):
+            continue
         if any(
             instead or not e.ci95[0] <= neutral[name] <= e.ci95[1] for name, e in identified.items()
         ):

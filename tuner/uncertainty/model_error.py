@@ -63,6 +63,7 @@ from tuner.uncertainty.estimates import (
     INPUT,
     LIMIT,
     LIMIT_STEP,
+    MIN_REPORTED_SPEED_LAG_S,
     READINGS,
     STEP,
     VOLTMETER_DRAWS,
@@ -78,8 +79,6 @@ LOOP_SIGNALS = ("rate_setpoint", "body_rate", "command")
 MIN_REPORTED_LATENCY_S = 1.5e-3
 """Least latency of a rate controller that is reported: stamps show the loop's period of a sample,
 not its time within the period; half a period at 400 Hz is 1.25 ms."""
-MIN_REPORTED_SPEED_LAG_S = 1e-3
-"""Least lag of recorded rotor speeds that is reported."""
 MIN_REPORTED_LAW_SHARE = 0.03
 """Least share of an axis' variation that a reported law explains."""
 FAR_OFF_GAIN = 1.3

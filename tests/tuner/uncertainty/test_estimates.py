@@ -178,6 +178,17 @@ def test_a_term_that_another_may_replace_is_said_with_it_though_its_interval_hol
     assert "Or it does not, and derivative_cutoff_factor = 1.5:" in sentence(found)
 
 
+@pytest.mark.parametrize(("lag", "said"), [(1e-5, False), (-0.8e-3, False), (2e-3, True)])
+def test_tachometers_that_hardly_lag_are_not_warned_of(lag, said):
+    """Stamps of a table without noise had warned of 0.01 ms, which another term might replace."""
+    ends = (lag - 1e-5, lag + 1e-5)
+    known = SimpleNamespace(value=lag, std_error=7e-6, ci95=ends, identifiable=True)
+    uncertainty = SimpleNamespace(estimates={"tachometer_lag": known})
+    other = {"tachometer_lag": {"time_constant_second": 1e-3}}
+    found = [one.subject for one in term_findings(SimpleNamespace(held={}), uncertainty, other)]
+    assert found == ["tachometer_lag"] * said
+
+
 def test_terms_that_flights_do_not_identify_have_no_number_in_findings():
     """Its error may be any: 2e9 was."""
     known = SimpleNamespace(value=1.02, std_error=0.001, ci95=(1.018, 1.022), identifiable=True)
