@@ -264,8 +264,9 @@ def readable(path: Path) -> Iterator[None]:
 
 def cache_folder() -> Path:
     """Return the folder in which this program may keep what it can make again."""
-    if chosen := os.environ.get("XDG_CACHE_HOME"):
-        base = Path(chosen)
+    chosen = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if chosen.is_absolute():  # another would be a folder wherever a command runs
+        base = chosen
     elif sys.platform == "darwin":
         base = Path.home() / "Library" / "Caches"
     elif sys.platform == "win32":

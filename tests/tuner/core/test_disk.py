@@ -126,6 +126,8 @@ def test_looking_for_a_path_may_be_refused(tmp_path):
 def test_cache_folder_follows_the_platform(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder() == tmp_path / "multirotor-tune"
+    monkeypatch.setenv("XDG_CACHE_HOME", "beside/the/flights")
+    assert cache_folder().is_absolute()
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(sys, "platform", "darwin")
