@@ -83,6 +83,7 @@ def run_stages(
     worth_polishing: Callable[[Progress], bool] = lambda _: True,
     start: Progress | None = None,
     overruled: Collection[str] = (),
+    clocks_are_late: bool = False,
 ) -> Progress:
     """Run the remaining stages and return the progress at their end.
 
@@ -108,8 +109,10 @@ def run_stages(
         Progress at the search's start, if not ``progress``.
     overruled
         The choices in which an earlier search has overruled the controller file.
+    clocks_are_late
+        Whether flight controllers' clocks are looked for further off than a search would move them.
     """
-    search = _Search(objective, free, on_progress, seed, overruled)
+    search = _Search(objective, free, on_progress, seed, overruled, clocks_are_late)
     start = progress if start is None else start
     while progress.stage < len(stages):
         stage = stages[progress.stage]
@@ -140,6 +143,7 @@ class _Search:
     on_progress: OnProgress
     seed: int
     overruled: Collection[str] = ()
+    clocks_are_late: bool = False
 
     def run(
         self, stage: Stage, progress: Progress, *, last: bool
@@ -248,7 +252,7 @@ def _with_clocks_found(search: _Search, stage: Stage, progress: Progress) -> Pro
     free = (search.free.offsets & stage.offsets)[row]
     channels = [name for name in objective.channels if CLOCK_OF[name] == row]
     smooth = [name for name in channels if name != "command"]
-    if not free.any() or not smooth:
+    if not (search.clocks_are_late and free.any() and smooth):
         return progress
     near, least = LATE_CLOCKS_S if stage.drops_offsets else EARLY_CLOCKS_S
     offsets = np.array(progress.points.offsets)

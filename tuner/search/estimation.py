@@ -37,6 +37,7 @@ from tuner.search.progress import (
     Loop,
     Progress,
     by_flight,
+    clocks_are_late,
     criterion_of,
     initial_progress,
     loop_of,
@@ -297,6 +298,7 @@ def _attempt(
         seed=job.settings.job.search.seed,
         worth_polishing=lambda progress: not (provisional and _is_far_off(progress)),
         start=start,
+        clocks_are_late=clocks_are_late(job.fitted),
     )
     seconds = time.perf_counter() - began
     save(checkpoint, key, progress, seconds)
@@ -467,6 +469,7 @@ def polished(
         undecided=undecided,
         on_progress=on_progress,
         overruled=overruled,
+        clocks_are_late=clocks_are_late(job.fitted),
     )
     changed = _end(job, objective, named[-1], progress)
     return with_end_findings(job, replace(fitted, **changed, polished=True))

@@ -6,7 +6,7 @@ least one, until the stage ends. `tuner.search.continuation.OPTIMISERS` names it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
 
@@ -21,6 +21,7 @@ from tuner.findings.findings import Finding
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums, picked, units_of
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
+from tuner.recordings.clocks import pose_offset
 from tuner.recordings.flight import Flight
 from tuner.recordings.notes import NoteCode
 from tuner.search.listener import Iteration, Outcome, PointEstimate
@@ -407,6 +408,14 @@ def _moved_by(flight: Flight) -> float:
     """Return by how many s its pose's stamps were moved back when it was read."""
     moved = [note for note in flight.notes if note.code is NoteCode.POSE_MOVED]
     return sum(note.numbers["seconds"] for note in moved)
+
+
+def clocks_are_late(flights: Iterable[Flight]) -> bool:
+    """Return whether a recording shows its gyro's stamps later than its pose's, by itself.
+
+    A fit cannot tell: where its model lacks a term or knows no gust, clocks make up for it.
+    """
+    return any((pose_offset(one.series) or 0.0) < 0.0 or _moved_by(one) < 0.0 for one in flights)
 
 
 def conditions_of(job: Job, fitted: Fit) -> dict[str, dict[str, float]]:

@@ -36,13 +36,13 @@ def fit():
     return problem(FREE, seed=5)
 
 
-def searched(fit, vectors, *, offsets=False):
+def searched(fit, vectors, *, offsets=False, **given):
     stages = horizon_stages(fit.samples, fit.schedule.log_rate, robust=True, steps=30)
     reports = []
     free = Point(np.ones(len(fit.space), bool), np.full((len(OFFSETS), 2), offsets))
     progress = initial_progress(fit, np.asarray(vectors))
     progress = run_stages(
-        fit, stages, progress, free=free, undecided={}, on_progress=reports.append
+        fit, stages, progress, free=free, undecided={}, on_progress=reports.append, **given
     )
     return progress, reports
 
@@ -379,7 +379,8 @@ def with_a_late_flight_controller(fit):
 
 def test_a_late_flight_controller_is_found_though_commands_jump():
     fit = with_a_late_flight_controller(problem(FREE))
-    progress, _ = searched(fit, [np.asarray(fit.space.initial) + 0.1], offsets=True)
+    begin = [np.asarray(fit.space.initial) + 0.1]
+    progress, _ = searched(fit, begin, offsets=True, clocks_are_late=True)
     fitted, true = (
         fit.space.numbers(of) for of in (progress.points.coefficients[0], fit.space.initial)
     )

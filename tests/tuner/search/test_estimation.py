@@ -90,7 +90,7 @@ def test_findings_are_those_of_the_last_polish(fitted, updated, monkeypatch):
     """A flight that a term was missing for is matched with it, and the warning goes."""
     job = job_with(updated)
     job.settings.controller = ControllerFile()
-    job.fitted = [SimpleNamespace(name=name) for name in fitted.scales]
+    job.fitted = [SimpleNamespace(name=name, series={}, notes=()) for name in fitted.scales]
     missed = Finding(Code.FLIGHT_UNMATCHED, "warning", "spin", {"position": 30.0})
     doubt = Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": 3})
     monkeypatch.setattr(module, "run_stages", lambda _, __, progress, **___: progress)
@@ -184,7 +184,9 @@ def test_a_checkpoint_is_of_flights_that_are_read_alike(bag, tmp_path):
 
     def digest(topics=None):
         settings = resolve_settings(Options([str(recording)], topics=topics))
-        flight = SimpleNamespace(name="flight", sha256="0", path=str(recording))
+        flight = SimpleNamespace(
+            name="flight", sha256="0", path=str(recording), series={}, notes=()
+        )
         return fingerprint(SimpleNamespace(settings=settings, flights=[flight]))
 
     own, before = digest(str(tmp_path / "own.yaml")), digest()
@@ -210,7 +212,7 @@ def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch,
     job = SimpleNamespace(
         objective=objective,
         settings=SimpleNamespace(job=JobFile(), controller=ControllerFile()),
-        fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
+        fitted=[SimpleNamespace(name=name, series={}, notes=()) for name in FLIGHTS],
         undecided=lambda _: {choice: tell},
     )
     asked = {}
@@ -242,7 +244,7 @@ def test_a_rough_fit_ends_where_a_linear_step_is_left(left, steps):
     job = SimpleNamespace(
         objective=objective,
         settings=SimpleNamespace(job=JobFile(), controller=ControllerFile()),
-        fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
+        fitted=[SimpleNamespace(name=name, series={}, notes=()) for name in FLIGHTS],
     )
     free = Point(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
     again = estimation.polished(
@@ -265,7 +267,7 @@ def test_what_is_held_keeps_its_value_and_the_others_are_fitted():
         objective=objective,
         space=objective.space,
         settings=SimpleNamespace(job=JobFile(), controller=ControllerFile()),
-        fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
+        fitted=[SimpleNamespace(name=name, series={}, notes=()) for name in FLIGHTS],
         inlets=("reference", "reference"),
         recordings=[SimpleNamespace(time_offset=0.0, holdout=False)] * 2,
     )

@@ -23,7 +23,7 @@ from tuner.search.job_flights import (
     with_known,
 )
 from tuner.search.problem import job_of
-from tuner.search.progress import offsets_of
+from tuner.search.progress import clocks_are_late, offsets_of
 from tuner.search.recorded_rotors import WINDOW_S, cut_at_rotor_changes, rotor_change_of
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
@@ -206,6 +206,27 @@ def test_little_is_not_looked_at(flown):
         rotor_change_of(weakened(flight, settings.vehicle, 0.05, seconds=3.5), settings.vehicle)
         is None
     )
+
+
+@pytest.mark.parametrize(
+    ("gyro", "moved", "late"),
+    [
+        (0.01, 0.0, True),
+        (0.0, -0.02, True),
+        (0.0, 0.0, False),
+        (-0.01, 0.0, False),
+        (0.0, 0.02, False),
+    ],
+)
+def test_a_gyro_stamped_later_than_the_pose_is_a_late_clock(flights, gyro, moved, late):
+    spin, _ = flights
+    rates = spin.series["body_rate"]
+    flight = replace(
+        spin,
+        series={**spin.series, "body_rate": replace(rates, time=rates.time + gyro)},
+        notes=(NoteCode.POSE_MOVED.note(seconds=moved),) if moved else (),
+    )
+    assert clocks_are_late([flight]) is late
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,9 @@ def unfitted_with(
     objective = replace(truth, space=space)
     recordings = tuple(
         SimpleNamespace(
-            flight=SimpleNamespace(name=name, initial=hovering(tilt), has=lambda _: False),
+            flight=SimpleNamespace(
+                name=name, initial=hovering(tilt), has=lambda _: False, series={}, notes=()
+            ),
             holdout=False,
             inlet="body_rate" if setpoints else "reference",
             time_offset=0.0,
