@@ -328,8 +328,9 @@ def unrefuted(findings: Sequence[Finding], uncertainty: Uncertainty) -> tuple[Fi
 
     def is_refuted(finding: Finding) -> bool:
         named = {Code.NO_EFFECT: (finding.subject,), Code.SINGULAR_DIRECTION: finding.names}
-        known = [uncertainty.estimates[name].verdict for name in named.get(finding.code, ())]
-        return bool(known) and set(known) == {Verdict.WELL_KNOWN}
+        estimates = [uncertainty.estimates.get(name) for name in named.get(finding.code, ())]
+        verdicts = {None if one is None else one.verdict for one in estimates}
+        return verdicts == {Verdict.WELL_KNOWN}
 
     return tuple(finding for finding in findings if not is_refuted(finding))
 
