@@ -303,7 +303,7 @@ def _is_held(time: Array, values: Array) -> NDArray[np.bool_]:
     """
     held = is_held(time, values[:, None])
     between = np.diff(np.flatnonzero(np.diff(values)))
-    return np.asarray(held & (np.mean(between == 1) < MAX_SINGLE_SHARE))
+    return np.asarray(held & (np.sum(between == 1) < MAX_SINGLE_SHARE * len(between)))
 
 
 def _check_unit(path: Path, quantity: str, column: str, values: Array, arm: float) -> None:

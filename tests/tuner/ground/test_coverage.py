@@ -1,6 +1,7 @@
 """The truth lies in the 95 % intervals of simulated rigs as often as it should."""
 
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,15 @@ def test_a_stuck_tachometer_is_refused():
     stuck = samples | {"rotor_speed": np.full(len(samples["time"]), 500.0)}
     with pytest.raises(RecordingError, match="does not follow the command; check the columns"):
         measure_rpm_curve("rpm", "r.csv", stuck, plan("rpm_curve"))
+
+
+def test_columns_that_never_change_are_read_as_they_are(tmp_path):
+    path = tmp_path / "still.csv"
+    rows = np.column_stack([np.arange(100) / 50, np.full(100, 5000.0), np.full(100, 1.5)])
+    np.savetxt(path, rows, delimiter=",", header="time,rpm,force", comments="")
+    with warnings.catch_warnings(action="error"):
+        read = read_columns(path, ("rotor_speed", "force"))
+    assert (read["force"] == 1.5).all()
 
 
 def test_a_command_without_a_speed_is_left_out():
