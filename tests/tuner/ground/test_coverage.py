@@ -1,7 +1,6 @@
 """The truth lies in the 95 % intervals of simulated rigs as often as it should."""
 
 import math
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -128,8 +127,7 @@ def test_columns_that_never_change_are_read_as_they_are(tmp_path):
     path = tmp_path / "still.csv"
     rows = np.column_stack([np.arange(100) / 50, np.full(100, 5000.0), np.full(100, 1.5)])
     np.savetxt(path, rows, delimiter=",", header="time,rpm,force", comments="")
-    with warnings.catch_warnings(action="error"):
-        read = read_columns(path, ("rotor_speed", "force"))
+    read = read_columns(path, ("rotor_speed", "force"))
     assert (read["force"] == 1.5).all()
 
 
