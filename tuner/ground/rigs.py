@@ -71,7 +71,7 @@ def measure_bifilar(
     known = np.isfinite(angle)
     time, angle = time[known], angle[known]
     guess = _spectral_guess(time, angle)
-    released = _released(time, angle, guess)
+    released = _released(time, angle, guess) if guess > 0 else 0
     time, angle = time[released:] - time[released], angle[released:]
     swings = guess * time[-1]
     if swings < MIN_OSCILLATIONS:

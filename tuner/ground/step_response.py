@@ -57,7 +57,7 @@ def measure_step_response(name: str, path: str, samples: Mapping[str, Array]) ->
     Raises
     ------
     RecordingError
-        Steps are missing in one direction, or too short.
+        Steps are missing in one direction, or too short, or the speed never changes.
     """
     time, command, speed = samples["time"], samples["command"], samples["rotor_speed"]
     known = np.isfinite(speed) & np.isfinite(command)
@@ -76,6 +76,8 @@ def measure_step_response(name: str, path: str, samples: Mapping[str, Array]) ->
     steps = _Steps(time, np.concatenate([[0], edges, [len(time)]]), rises)
     fine = resolution(speed)
     kept = _is_no_spike(speed, fine)
+    if not np.ptp(speed[kept]) > 0:
+        raise RecordingError(path, "has a rotor speed that never changes", "check the columns")
     first = _fit_lags(steps, speed, kept, _first_guess(steps, speed, kept), second=False)
     residual = steps.simulated(first, speed, kept) - speed
     spread = max(float(robust_sd(residual[kept])), 0.5 * fine)

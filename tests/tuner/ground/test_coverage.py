@@ -123,6 +123,18 @@ def test_a_stuck_tachometer_is_refused():
         measure_rpm_curve("rpm", "r.csv", stuck, plan("rpm_curve"))
 
 
+def test_sensors_that_never_change_are_refused():
+    random = np.random.default_rng(0)
+    steps = rigs.motor_steps(random)
+    still = steps | {"rotor_speed": np.zeros(len(steps["time"]))}
+    with pytest.raises(RecordingError, match="a rotor speed that never changes"):
+        measure_step_response("steps", "s.csv", still)
+    samples, ruler = rigs.swing(random)
+    hanging = samples | {"angle": np.zeros(len(samples["time"]))}
+    with pytest.raises(RecordingError, match=r"shows 0\.0 oscillations"):
+        measure_bifilar("x", "x.csv", hanging, plan("bifilar", axis="x", **ruler), QUAD)
+
+
 def test_columns_that_never_change_are_read_as_they_are(tmp_path):
     path = tmp_path / "still.csv"
     rows = np.column_stack([np.arange(100) / 50, np.full(100, 5000.0), np.full(100, 1.5)])
