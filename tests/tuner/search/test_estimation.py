@@ -14,6 +14,7 @@ from tuner.findings.findings import Code, Finding, sentence
 from tuner.objective.criterion import Point
 from tuner.objective.space import space_of
 from tuner.options import Options
+from tuner.recordings.notes import NoteCode
 from tuner.search import estimation
 from tuner.search import estimation as module
 from tuner.search.estimation import fingerprint, load, polished, save, starting_vectors
@@ -93,11 +94,20 @@ def test_findings_are_those_of_the_last_polish(fitted, updated, monkeypatch):
     job.fitted = [SimpleNamespace(name=name, series={}, notes=()) for name in fitted.scales]
     missed = Finding(Code.FLIGHT_UNMATCHED, "warning", "spin", {"position": 30.0})
     doubt = Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": 3})
-    monkeypatch.setattr(module, "run_stages", lambda _, __, progress, **___: progress)
+    asked = []
+
+    def stages_run(_, __, progress, **given):
+        asked.append(given["clocks_are_late"])
+        return progress
+
+    monkeypatch.setattr(module, "run_stages", stages_run)
     free = Point(np.ones(len(FREE), bool), np.ones(np.shape(fitted.point.offsets), bool))
     matched = replace(fitted, findings=(missed, doubt))
     again = polished(job, matched, free=free, title="again", on_progress=lambda _: None)
     assert again.findings == (doubt,)
+    job.fitted[0].notes = (NoteCode.POSE_MOVED.note(seconds=-0.02),)  # onto a gyro that is late
+    polished(job, matched, free=free, title="again", on_progress=lambda _: None)
+    assert asked == [False, True]
     scales = {**fitted.scales, "spin": dict.fromkeys(fitted.scales["spin"], 30.0)}
     lost = replace(matched, scales=scales)
     again = polished(job, lost, free=free, title="again", on_progress=lambda _: None)
