@@ -26,7 +26,7 @@ from tuner.core.numerics import Array
 from tuner.evaluate.closed_loop import Forces, forces_of_terms
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse, RmseRow, RmseTable
 from tuner.evaluate.simulation_files import roll_pitch_yaw
-from tuner.objective.battery import with_reference_voltage
+from tuner.objective.battery import ROTOR_LAG_S, with_reference_voltage
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.normal_equations import Objective
@@ -168,8 +168,6 @@ def laps_of(flight: Flight) -> Array:
 
 
 POSE = ("position", "attitude")
-ROTOR_LAG_S = 0.03
-"""The lag by which recent commands give the speed of a rotor without tachometer."""
 WINDOW_MARGIN_S = 0.02
 """Windows are simulated so much longer, for late stamps."""
 MISFIT_SCALE = 10.0

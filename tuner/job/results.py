@@ -153,7 +153,7 @@ def _loss_at_start(job: Job, fitted: Fit) -> float:
 
 
 def shifts_of_starts(fitted: Fit) -> dict[str, JsonValue]:
-    """Return the root mean square shifts of free initial states of windows and spins.
+    """Return the root mean square shifts of free initial states.
 
     State -> shift in its unit: the part of the data explained by initial states, not coefficients.
     """

@@ -1,9 +1,9 @@
 """Initial states of segments, their prior, and their elimination from the normal equations.
 
-A flight starts in its recorded state. A window starts in the middle of a flight, in a state
-smoothed from noisy samples, with an integrator that was not recorded: so its initial state is free,
-near the recorded one. It is no part of the search: to first order the best initial state follows
-from the coefficients, segment by segment, and is eliminated from the normal equations.
+A flight starts in hover, in trim. A window, or a flight whose recording begins in motion, starts in
+a state smoothed from noisy samples, with an integrator that was not recorded: so its initial state
+is free, near the recorded one. It is no part of the search: to first order the best initial state
+follows from the coefficients, segment by segment, and is eliminated from the normal equations.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ from tuner.vehicle import of_scope
 REST_SPEED, REST_RATE, REST_TILT = 0.1, 0.1, 0.1
 #: m/s and rad/s at the start above which a recording does not begin gently.
 GENTLE_SPEED, GENTLE_RATE = 0.5, 0.5
+#: s after a start in motion until which filters and delay lines have forgotten what was before it.
+FORGOTTEN_S = 0.1
 #: rad/s of rotors of which none was measured.
 DEFAULT_ROTOR_SPEED = 600.0
 
@@ -98,8 +100,9 @@ def begins_gently(flight: Flight) -> bool:
 def recent_command(flight: Flight, lag: float) -> NDArray[np.float64]:
     """Return the command (4,) that each rotor without tachometer has followed until time 0.
 
-    It is averaged with a weight that falls by a factor e every ``lag`` s into the past; NaN for a
-    rotor whose speed was measured. Thrust set-points stand for commands that were not recorded.
+    It is averaged with a weight that falls by a factor e every ``lag`` s into the past, or where
+    none was recorded until then, over those soon after; NaN for a rotor whose speed was measured.
+    Thrust set-points stand for commands that were not recorded.
     """
     command = np.full(4, np.nan)
     series = flight.series.get("command")
@@ -109,10 +112,12 @@ def recent_command(flight: Flight, lag: float) -> NDArray[np.float64]:
     if series is None:
         return command
     for rotor in np.flatnonzero(~np.isfinite(flight.initial.rotor_speed)):
-        known = np.isfinite(series.values[:, rotor]) & (series.time <= 0)
-        if known.any():
-            weight = np.exp(series.time[known] / lag)
-            command[rotor] = np.average(series.values[known, rotor], weights=weight)
+        known = np.isfinite(series.values[:, rotor])
+        before = known & (series.time <= 0)
+        near = before if before.any() else known & (series.time < FORGOTTEN_S)
+        if near.any():
+            weight = np.exp(-np.abs(series.time[near]) / lag)
+            command[rotor] = np.average(series.values[near, rotor], weights=weight)
     return command
 
 

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sim_jax.environment import Disturbance
 from sim_jax.inlet import Inlet, ReferenceInlet
@@ -20,8 +20,9 @@ from tuner.config import CHANNELS, InletName
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array as Numbers
 from tuner.core.numerics import robust_sd
-from tuner.objective.battery import log_voltage_of
+from tuner.objective.battery import ROTOR_LAG_S, log_voltage_of
 from tuner.objective.initial_conditions import (
+    FORGOTTEN_S,
     SPIN_ROWS,
     is_at_rest,
     recent_command,
@@ -214,7 +215,9 @@ def segments_of(
 ) -> Segments:
     """Lay whole flights side by side for the ``reference`` inlet.
 
-    A spin has a free initial state: see `start_sd_of_spin`.
+    A spin has a free initial state: see `start_sd_of_spin`. So has a flight whose recording begins
+    in motion: what its controllers had in memory then is not recorded, and their position control
+    forgets it over seconds. Its samples count from `FORGOTTEN_S` on.
 
     Parameters
     ----------
@@ -243,21 +246,36 @@ def segments_of(
             )
     inlet = INLETS["reference"].lay_out(flights, schedule)
     assert isinstance(inlet, ReferenceInlet)
-    start_sd = {}
+    start_sd: dict[int, Numbers] = {}
     if bool(np.any(inlet.spins)):
         rate = np.where(inlet.spins, inlet.yaw_rate, 0.0)
         known = noise.get("position", 0.0)  # where no position is compared, none is corrected
         begun = [initial_position_error(flight.series, known) for flight in flights]
         start_sd = start_sd_of_spin(np.asarray(rate), schedule.rate_control_rate, np.array(begun))
+    whole = [Window(flight, 0.0) for flight in flights]
+    resting = np.array([is_at_rest(flight.initial) for flight in flights])
+    free_rows: tuple[int, ...] = SPIN_ROWS
+    turning: Numbers | None = None
+    if not resting.all():
+        sds = start_sd_of(INLETS["reference"].ignores)
+        free_rows = tuple(np.flatnonzero(sds).tolist())
+        start_sd = {
+            row: np.maximum(~resting * sds[row], start_sd.get(row, 0.0)) for row in free_rows
+        }
+        turning = np.where(resting, np.nan, commanded_before(whole, ROTOR_LAG_S))
+    begins = FORGOTTEN_S * ~resting
     return Segments(
         inlet=inlet,
         start=start_of([flight.initial for flight in flights]),
-        measured={name: _measured(flights, name, sd, weights) for name, sd in noise.items()},
+        measured={
+            name: _measured(flights, name, sd, weights, begins) for name, sd in noise.items()
+        },
         flight=np.arange(len(flights)),
-        resting=np.asarray([is_at_rest(flight.initial) for flight in flights]),
-        log_voltage=log_voltage_of(flights, [Window(flight, 0.0) for flight in flights], schedule),
+        turning=turning,
+        resting=resting,
+        log_voltage=log_voltage_of(flights, whole, schedule),
         start_sd=np.stack(list(start_sd.values())) if start_sd else None,
-        free_rows=SPIN_ROWS,
+        free_rows=free_rows,
     )
 
 
@@ -374,13 +392,18 @@ def _measured(
     channel: str,
     sigma: float,
     weights: Mapping[str, Mapping[str, float]],
+    begins: ArrayLike = 0.0,
 ) -> MeasuredChannel:
-    """Return a channel of all flights, padded with zeros, or with a level attitude."""
+    """Return a channel of all flights from ``begins`` s on, padded with zeros or a level attitude.
+
+    ``begins`` is one for all flights, or each one's own.
+    """
     width = 4 if channel in ("attitude", "rotor_speed", "command") else 3
     first = 1 if channel == "attitude" else 0
     nothing = Series(np.zeros(0), np.zeros((0, width)))
     recorded = [
-        flight.series.get(channel, nothing).between(0.0, flight.time[-1]) for flight in flights
+        flight.series.get(channel, nothing).between(begin, flight.time[-1])
+        for flight, begin in zip(flights, np.broadcast_to(begins, len(flights)), strict=True)
     ]
     shape = max(len(series.time) for series in recorded), len(flights)
     time, values = np.zeros(shape), np.zeros((shape[0], width, shape[1]))

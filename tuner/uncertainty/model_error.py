@@ -239,6 +239,7 @@ def _flown(fitted: Fit) -> tuple[SimulatedChannels, Mask] | None:
         samples=objective.samples,
         limits=objective.limits,
         coefficients=objective.space.values(np.asarray(fitted.point.coefficients)),
+        states=fitted.criterion.states,
         conditions=objective.conditions_at(fitted.point),
         channels=(*_CHANNELS, MOTION, BODY_ATTITUDE, SETPOINTS),
     )

@@ -6,25 +6,29 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
 from tests.tuner.recorded import recordings_of
 from tuner.config import CHANNELS, JobFile, resolve_settings
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import Code, sentence
 from tuner.job.prepare import prepare
-from tuner.objective.criterion import OFFSET_UNIT
+from tuner.objective.criterion import OFFSET_UNIT, Point, picked
+from tuner.objective.normal_equations import normal_equations, root_mean_squares, sums_at
 from tuner.objective.segments import OFFSETS
 from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.recordings.notes import NoteCode
+from tuner.recordings.states import initial_state
 from tuner.search.job_flights import (
     JobFlight,
     read_recordings,
     with_known,
 )
 from tuner.search.problem import job_of
-from tuner.search.progress import clocks_are_late, offsets_of
+from tuner.search.progress import clocks_are_late, offsets_of, plain_criterion
 from tuner.search.recorded_rotors import WINDOW_S, cut_at_rotor_changes, rotor_change_of
+from tuner.vehicle import with_values
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 SPIN, CIRCLE = "yaw_spin_3rps", "circle_4mps"
@@ -269,3 +273,50 @@ def test_a_held_out_flight_has_the_clock_of_the_fitted_ones(flights, late, moved
     assert {name: found[name] for name in others} == pytest.approx(
         {name: expected for name, (*_, expected) in others.items()}
     )
+
+
+# a recording that begins in motion, of whose controllers no memory is known
+
+BEGUN, CUT_S = 17.0, 6.0
+
+
+def cut_from(flight, begin, seconds):
+    """Return a stretch of a flight of which nothing before it was recorded."""
+    inside = (flight.time >= begin) & (flight.time <= begin + seconds)
+    first, last = flight.time[inside][[0, -1]]
+    kept = {n: s.between(first, last, origin=first) for n, s in flight.series.items()}
+    series = {name: samples for name, samples in kept.items() if len(samples.time)}
+    return replace(
+        flight,
+        time=flight.time[inside] - first,
+        signals={name: rows[inside] for name, rows in flight.signals.items()},
+        series=series,
+        initial=initial_state(series),
+    )
+
+
+def test_a_flight_that_begins_in_motion_is_met_to_its_noise_by_the_truth(settings, flights):
+    """Its start is free: position control forgets a wrong one over seconds."""
+    vehicle = with_values(settings.vehicle, yaml.safe_load((FLIGHTS / "truth.yaml").read_text()))
+    moving = cut_from(flights[1], BEGUN, CUT_S)
+    assert np.linalg.norm(moving.initial.velocity) > 3.0
+    job_file = JobFile(free=("inertia_xx", "inertia_yy", "estimate_latency"))
+    cut = replace(settings, vehicle=vehicle, job=job_file)
+    job = job_of(cut, [JobFlight(moving, "reference", time_offset=0.0)])
+    objective, point = job.objective, job.objective.start(job.space.initial)
+    points = Point(point.coefficients[None], point.offsets[None])
+    criterion = plain_criterion(objective, objective.samples)
+    for _ in range(4):
+        sums = picked(sums_at(objective, points, criterion), 0)
+        criterion = replace(criterion, states=sums.states)
+    rms = root_mean_squares(objective, sums)
+    assert max(float(of[0]) for of in rms.values()) < 1.1
+    _, gradient, hessian = normal_equations(objective, point, criterion, sums)
+    there = slice(0, len(job.space))
+    step = -np.linalg.solve(hessian[there, there], gradient[there]) * job.space.slope(
+        job.space.initial
+    )
+    error = dict(zip(job.space.names, step, strict=True))
+    assert abs(error["estimate_latency"]) < 2e-5
+    assert abs(error["inertia_xx"]) < 0.002
+    assert abs(error["inertia_yy"]) < 0.002
