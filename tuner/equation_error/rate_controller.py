@@ -239,10 +239,18 @@ def _square_of_sum(instruments: Array, left: Array, memory: int) -> Array:
 def _share_latency(known: list[dict[str, _Part]]) -> None:
     """Give roll and pitch the mean of their latencies, and yaw none: they share their filters.
 
+    Where they differ it is not the filters: one has another ratio of D to P, and keeps its own.
     Yaw has too few steps to estimate its latency.
     """
     late = [parts.pop("late") for parts in known if parts]
     if not all(known[:2]):
+        return
+    roll, pitch = late[:2]
+    apart = _Part(
+        roll.value - pitch.value, 0.0, float(np.hypot(roll.sd, pitch.sd)), roll.moves - pitch.moves
+    )
+    if abs(apart.value) > MIN_CHANGE["late"] and apart.is_significant(FALSE_ALARM_LEVEL):
+        known[0]["late"], known[1]["late"] = roll, pitch
         return
     weights = np.array([1.0 / max(one.sd**2, 1e-300) for one in late[:2]])
     weights /= weights.sum()

@@ -66,6 +66,22 @@ def test_a_slower_filter_is_estimated_of_roll_and_pitch_together():
     assert (found[0].value, found[0].sd) == (found[1].value, found[1].sd)
 
 
+@pytest.mark.parametrize("gain", ["p", "d"])
+def test_another_gain_of_roll_does_not_make_pitch_late(gain):
+    """Roll's ratio of D to P is another; filters would make both late."""
+    roll = np.array([1.3, 1.0, 1.0])
+    gains = {"p": P_GAIN * roll, "d": D_GAIN / roll} if gain == "p" else {"d": D_GAIN * roll}
+    random = np.random.default_rng(1)
+    recorded = flight(random, gusts=0.2, noise=0.01, **gains)
+    found = {(e.axis, e.part): e for e in estimate_controller([recorded], [flight(random)])}
+    of = {"p": {("roll", "P"), ("roll", "late")}, "d": {("roll", "late")}}[gain]
+    assert {key for key, estimate in found.items() if estimate.differs} == of
+    late = found["roll", "late"]
+    true = D_GAIN / P_GAIN * (1.0 - 1.0 / 1.3 if gain == "p" else 1.0 - 1.3)
+    assert late.value == pytest.approx(true, abs=4.0 * late.sd)
+    assert late.sd < 0.2 * abs(true)
+
+
 def test_the_file_that_flew_is_not_doubted():
     assert sum(bool(told(seed)) for seed in range(60)) <= 1
 
