@@ -281,8 +281,9 @@ def _unlisted(result: RunResult, width: int) -> list[str]:
     """Return a line on fixed coefficients and one on the terms."""
     from tuner.report.result_texts import nearly_kept
 
+    go_with = {"mass": " (forces, drag and inertia go with it)"}
     fixed = [
-        f"{name} {row.best:.4g} {row.unit}".rstrip()
+        f"{name} {row.best:.4g} {row.unit}".rstrip() + go_with.get(name, "")
         for name, row in result.coefficients.items()
         if not row.fitted
     ]

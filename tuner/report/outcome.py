@@ -31,7 +31,7 @@ MAX_PRIOR_DEVIATIONS = 3.0
 """A coefficient so many prior standard deviations from a default vehicle's is another vehicle's."""
 MAX_GAIN_RATIO = 1.2
 """Gains of the recorded rate loop further off than this factor are another loop's."""
-ARM_SCALED = ("inertia_xx", "inertia_yy", "inertia_zz", "moment_constant")
+ARM_SCALED: tuple[str, ...] = ("inertia_xx", "inertia_yy", "inertia_zz", "moment_constant")
 """Coefficients of which flights show the ratio to the arms only."""
 Errors = tuple[float | None, float | None, float | None]
 """RMSE before and after a fit, and of the noise."""
@@ -420,12 +420,15 @@ def _uses(result: RunResult, usability: Usability) -> tuple[str, ...]:
         )
     for verdict, names in by_verdict.items():
         sentences.append(f"Not as physical values: {listed(names)}, {verdict_in_words(verdict)}.")
-    scaled = [name for name in known if name in ARM_SCALED]
-    if scaled and result.flights:
-        sentences.append(
-            f"{listed(scaled)} go{'es' if len(scaled) == 1 else ''} with the vehicle file's arms, "
-            "which no flight shows: measure them."
-        )
+    mass = result.coefficients.get("mass")
+    given = [("the vehicle file's arms, which no flight shows: measure them", ARM_SCALED)]
+    if mass is not None and not mass.fitted:
+        weighed = f"the mass, {mass.best:.4g} kg, which no flight shows: weigh it"
+        given.insert(0, (weighed, scale_group()))
+    for what, group in given:
+        scaled = [name for name in known if name in group]
+        if scaled and result.flights:
+            sentences.append(f"{listed(scaled)} go{'es' if len(scaled) == 1 else ''} with {what}.")
     return tuple(sentences)
 
 

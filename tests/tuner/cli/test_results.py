@@ -36,7 +36,8 @@ def test_a_finished_job_says_what_the_issue_lists(folder, capsys):
     assert "→" in held
     assert held.split()[-1] in ("matched", "better", "unchanged")
     assert "Terms: fuselage_drag of 2 kept." in text
-    assert re.search(r"^Fixed: mass [0-9.]+ kg, ", text, re.MULTILINE)
+    mass = r"^Fixed: mass [0-9.]+ kg \(forces, drag and inertia go with it\), "
+    assert re.search(mass, text, re.MULTILINE)
     assert f"Written to {folder} in 42 s" in text
     assert lines[-1].startswith("Next: ")
 

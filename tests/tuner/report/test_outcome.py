@@ -84,6 +84,25 @@ def test_what_goes_with_the_arms_is_said_to(result):
     assert "arms" not in last_use("motor_constant")
 
 
+def test_what_goes_with_the_mass_is_said_to_unless_it_is_fitted(result):
+    mass = result.coefficients["mass"].model_copy(update={"fitted": False})
+    known = {
+        name: mass.model_copy(
+            update={"fitted": True, "identifiable": True, "verdict": Verdict.WELL_KNOWN}
+        )
+        for name in ("motor_constant", "time_constant_up")
+    }
+
+    def last_use(**others):
+        coefficients = {**others, **known}
+        return outcome(result.model_copy(update={"coefficients": coefficients})).uses[-1]
+
+    weighed = f"the mass, {mass.best:.4g} kg, which no flight shows: weigh it."
+    assert last_use(mass=mass) == f"motor_constant goes with {weighed}"
+    assert "the mass" not in last_use(mass=mass.model_copy(update={"fitted": True}))
+    assert "the mass" not in last_use()
+
+
 @pytest.mark.parametrize(
     ("after", "word", "standing"),
     [
