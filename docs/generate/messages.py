@@ -120,6 +120,10 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "or filters are not those of the controller file, the autopilot sits askew, its gyro's scale "
     "is off, or rotor speeds were filtered. The line says by how much, what to compare, and which "
     "other term the flights do not tell from it.",
+    Code.ROTORS_UNEQUAL: "Rotors would differ in thrust at the same speed by 9 % and more, which "
+    "rotors of a kind do not. A vehicle file with the rotors elsewhere than they sit makes them "
+    "seem so, and forces and inertia are wrong with it. Measure where they sit, and look at the "
+    "propellers.",
     Code.ROTOR_CHANGED: "From some time of this flight a rotor gives less, or more, thrust at the "
     "same speed than before: the flight is used up to there. Look at its propeller, motor and "
     "mount before you fly again.",

@@ -377,6 +377,16 @@ class Code(CodeWithText):
         sentences.rotor_changed,
         "Look at its propeller, motor and mount before you fly again.",
     )
+    ROTORS_UNEQUAL = (
+        "rotors_unequal",  # rotor_1 to rotor_4: thrust over their mean
+        (
+            "Rotors would give {rotor_1:.2f}, {rotor_2:.2f}, {rotor_3:.2f} and {rotor_4:.2f} times "
+            "their mean thrust at the same speed, more apart than rotors of a kind are. Where the "
+            "vehicle file has them elsewhere than they sit, thrust, drag and inertia are wrong "
+            "with it."
+        ),
+        "Measure where the rotors sit (rotors in the vehicle file), and look at the propellers.",
+    )
     TERM_SHOWS = (
         "term_shows",  # NAME, NAME_error; OTHER; names: NAMEs; the subject is their group
         sentences.term_shows,

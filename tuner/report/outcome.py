@@ -31,7 +31,12 @@ MAX_PRIOR_DEVIATIONS = 3.0
 """A coefficient so many prior standard deviations from a default vehicle's is another vehicle's."""
 MAX_GAIN_RATIO = 1.2
 """Gains of the recorded rate loop further off than this factor are another loop's."""
-ARM_SCALED: tuple[str, ...] = ("inertia_xx", "inertia_yy", "inertia_zz", "moment_constant")
+ARM_SCALED: tuple[str, ...] = (
+    *("inertia_xx", "inertia_yy", "inertia_zz", "moment_constant", "rotor_inertia"),
+    *("flapping_moment_coefficient", "rolling_moment_coefficient"),
+    *(f"{name}_{axis}" for name in ("center_of_mass", "torque_trim") for axis in "xyz"),
+    *(f"angular_drag_{axis}" for axis in "xyz"),
+)
 """Coefficients of which flights show the ratio to the arms only."""
 Errors = tuple[float | None, float | None, float | None]
 """RMSE before and after a fit, and of the noise."""
@@ -59,6 +64,7 @@ CONFLICT_CODES = WRONG_INPUT_CODES | {
     Code.GROUND_CONFLICT,
     Code.BENCH_CONFLICT,
     Code.CONTROLLER_ANSWERS,
+    Code.ROTORS_UNEQUAL,
 }
 """Warnings of inputs or measurements that contradict the flights, to be resolved next."""
 CAUSE_CODES = WRONG_INPUT_CODES | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS, Code.INLET_CHOSEN}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -350,6 +351,8 @@ REPORTED_TERMS = (
 """Groups of terms with a finding: a lab can act on them."""
 SHAPES = ("tachometer_memory",)
 """Coefficients of these that tell how an effect acts, not whether there is one."""
+MAX_ROTOR_DEVIATIONS = 3.0
+"""Rotors of a kind differ in thrust by at most so many prior standard deviations of their scale."""
 MIN_REPORTED_SPEED_LAG_S = 1e-3
 """Least lag of recorded rotor speeds that is reported."""
 
@@ -388,6 +391,21 @@ def term_findings(
                 f"{name}_error": estimate.std_error for name, estimate in identified.items()
             }
             yield Code.TERM_SHOWS.warning(group, *identified, **numbers)
+    yield from _unequal_rotors(uncertainty)
+
+
+def _unequal_rotors(uncertainty: Uncertainty) -> Iterator[Finding]:
+    """Warn of rotors whose thrust differs by more than that of rotors of a kind."""
+    names = term_groups()["rotor_thrust_scale"]
+    estimates = [one for name in names if (one := uncertainty.estimates.get(name)) is not None]
+    if len(estimates) < len(names):
+        return
+    least = MAX_ROTOR_DEVIATIONS * COEFFICIENTS[names[0]].prior_sd
+    if any(abs(math.log(e.value)) - 2.0 * e.std_error / e.value > least for e in estimates):
+        factors = [one.value for one in estimates]
+        factors.append(1.0 / math.prod(factors))  # their product is 1
+        thrusts = {f"rotor_{number}": factor for number, factor in enumerate(factors, start=1)}
+        yield Code.ROTORS_UNEQUAL.warning("rotors", **thrusts)
 
 
 SIMULATOR_STEP_S = 1.0 / 4000.0

@@ -202,6 +202,12 @@ MADE = {
         {"thrust_exponent": 1.93, "thrust_exponent_error": 0.004},
         ("thrust_exponent",),
     ),
+    Code.ROTORS_UNEQUAL: Finding(
+        Code.ROTORS_UNEQUAL,
+        "warning",
+        "rotors",
+        {"rotor_1": 1.17, "rotor_2": 0.85, "rotor_3": 1.17, "rotor_4": 0.86},
+    ),
     Code.ROTOR_CHANGED: Finding(
         Code.ROTOR_CHANGED,
         "warning",

@@ -216,3 +216,23 @@ def test_what_the_fit_knows_well_refutes_what_was_said_of_its_start(verdict, ref
     )
     other = Code.NO_EFFECT.warning("a term that was dropped")
     assert unrefuted((*said, other), known) == ((other,) if refuted else (*said, other))
+
+
+@pytest.mark.parametrize(
+    ("factors", "said"), [((1.17, 0.85, 1.17), True), ((1.04, 0.97, 0.95), False)]
+)
+def test_rotors_of_a_frame_that_the_file_has_otherwise_are_warned_of(factors, said):
+    """As of a dead-cat frame that the file has square: what they gave was "usable"."""
+    estimates = {
+        f"rotor_thrust_scale_{number}": SimpleNamespace(
+            value=value, std_error=0.007, ci95=(value - 0.014, value + 0.014), identifiable=True
+        )
+        for number, value in enumerate(factors, start=1)
+    }
+    fitted, known = SimpleNamespace(held={}), SimpleNamespace(estimates=estimates)
+    found = [one for one in term_findings(fitted, known) if one.code is Code.ROTORS_UNEQUAL]
+    assert [one.numbers["rotor_4"] for one in found] == [1.0 / np.prod(factors)] * said
+    unsure = {
+        name: SimpleNamespace(**vars(e) | {"std_error": 0.1}) for name, e in estimates.items()
+    }
+    assert not list(term_findings(fitted, SimpleNamespace(estimates=unsure)))
