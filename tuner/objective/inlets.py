@@ -219,7 +219,9 @@ class RecordedInlet(ABC):
         """Return a signal's columns, each (steps, F), at the physics steps or its mean over them.
 
         A signal that acts all through a step has to be fed by its mean: it changes within steps,
-        and what is read where a step begins acts late, by half a step on average.
+        and what is read where a step begins acts late, by half a step on average. Set-points are
+        published after the tick that computes them: they change at the nearest step, not a step
+        later.
         """
         longest = max(flight.duration for flight in flights)
         steps = int(np.ceil(longest * schedule.physics_rate)) + 2
@@ -229,8 +231,8 @@ class RecordedInlet(ABC):
             clock = clock + mean * 0.5 * schedule.step
             tables = [linear_interpolation(series, clock) for series in recorded]
         else:
-            read = mean_of_hold if mean else zero_order_hold
-            clock = np.append(clock, steps / schedule.physics_rate) if mean else clock
+            read, half = mean_of_hold if mean else zero_order_hold, 0.5 * schedule.step
+            clock = np.append(clock, steps / schedule.physics_rate) if mean else clock + half
             tables = [read(at_ticks(series, rate), clock) for series in recorded]
         table = np.stack(tables, axis=-1)
         return [np.asarray(table[:, column]) for column in range(table.shape[1])]

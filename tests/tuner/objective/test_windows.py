@@ -147,6 +147,24 @@ def test_a_log_on_another_clock_tells_when_the_loop_ran(rate):
     assert np.isin(of_another.time, clock).mean() > 0.9
 
 
+def test_set_points_published_after_their_tick_act_at_it(flight):
+    random, schedule = np.random.default_rng(0), Schedule()
+    time = np.arange(round(flight.duration * schedule.position_control_rate))
+    stamps = time / schedule.position_control_rate + random.uniform(1e-5, 7e-4, len(time))
+    sent = {
+        name: Series(stamps, random.normal(size=(len(time), count)))
+        for name, count in (("rate_setpoint", 3), ("thrust_setpoint", 1))
+    }
+    inlet = INLETS["body_rate"].lay_out(
+        [replace(flight, series={**flight.series, **sent})], schedule
+    )
+    at_tick = slice(0, -1, schedule.physics_rate // schedule.position_control_rate)
+    fed = np.column_stack([inlet.rate.x, inlet.rate.y, inlet.rate.z])[at_tick][: len(time)]
+    np.testing.assert_array_equal(fed, sent["rate_setpoint"].values)
+    thrust = np.asarray(inlet.thrust)[at_tick][: len(time)]
+    np.testing.assert_array_equal(thrust, sent["thrust_setpoint"].values)
+
+
 def test_the_actuator_inlet_holds_recorded_commands(flight):
     schedule = Schedule()
     inlet = INLETS["actuator"].lay_out([flight], schedule)
