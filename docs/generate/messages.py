@@ -130,8 +130,8 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.INLET_CHOSEN: "What was logged does not explain how the vehicle turned, so that its "
     "recorded attitude is followed, or it is simulated from its rotor speeds. Log commands as "
     "often as the rate loop runs.",
-    Code.SETPOINTS_SCALED: "The recorded rate set-points are a multiple of the controller file's. "
-    "Check its gains and its attitude.law.",
+    Code.SETPOINTS_SCALED: "The recorded set-points of rates, or of thrust, are a multiple of the "
+    "controller file's. Check its gains, its attitude.law, or its map from acceleration to thrust.",
     Code.SETPOINTS_BIASED: "Recorded rate set-points are off the controller file's by a constant, "
     "as where the recorded attitude is tilted against the one that was controlled. Check how the "
     "motion capture's rigid body is aligned with the vehicle (marker_tilt).",

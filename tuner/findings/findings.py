@@ -193,6 +193,9 @@ class Code(CodeWithText):
         lambda finding: (
             f"Set attitude.law: {finding.names[1]} in the controller file."
             if finding.names[1]
+            else "Check thrust.normalized_constant and the gains of position control in the "
+            "controller file."
+            if finding.names[0] == "thrust"
             else "Check the gains of position and attitude control in the controller file."
         ),
     )

@@ -120,6 +120,9 @@ def setpoints_scaled(finding: Finding) -> str:
     """Return the factor by which set-points differ, and the law that would explain it."""
     axis, law = finding.names
     so = f", as those of the {law} law would be" if law else ""
+    if axis == "thrust":
+        factor = f"{finding.numbers['gain']:.2f}"
+        return f"Thrust set-points follow reference and state {factor} times as the file's would."
     factor = f"{finding.numbers['gain']:.1f}"
     return f"{axis.capitalize()} rate set-points are {factor} times the controller file's{so}."
 

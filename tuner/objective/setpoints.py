@@ -3,16 +3,18 @@
 Position and attitude control are functions of reference and state. Both were recorded, so that the
 controller file's set-points can be computed; the recorded ones differ by a gain, a delay and a
 bias. A wrong law or gain shows as a factor; another controller, or an axis with other commands, has
-no correlation.
+no correlation. Thrust set-points are compared likewise, less what another point and other axes than
+the controlled ones do to them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lanes import Argument, program_of
@@ -21,8 +23,10 @@ from sim_jax.control.geometric import (
     ReferencePoint,
     acceleration_setpoint,
     attitude_from_acceleration,
+    feedback_acceleration,
     heading_of,
     rate_setpoint,
+    thrust_setpoint,
 )
 from sim_jax.geometry import Quaternion, Vec3
 from sim_jax.numeric import Array as JaxArray
@@ -42,10 +46,16 @@ MIN_CORRELATION = 0.5
 """Least correlation of recorded set-points with those of the controller file."""
 MAX_GAIN_RATIO = 1.4
 """Ratio of recorded to computed set-points beyond which a wrong gain or law is reported."""
+MAX_THRUST_RATIO = 1.07
+"""Ratio of recorded to computed thrust set-points beyond which it is reported."""
+MIN_THRUST_CORRELATION = 0.85
+"""Least correlation of thrust set-points that are compared."""
 MIN_REPORTED_DELAY_S = 0.04
 """Least reported delay: twice the usual one of cameras, network and estimator."""
 MIN_REPORTED_BIAS = 0.05
 """Least reported bias, rad/s."""
+RELATIVE_RANK = 1e-6
+"""Least singular value, over the largest, of columns that differ."""
 MIN_SPREAD = 0.05
 """Least standard deviation of a commanded axis, rad/s."""
 AXES = ("roll", "pitch", "yaw")
@@ -83,10 +93,13 @@ class SetpointMatch:
         Roll, pitch, yaw.
     delay
         s, age of the recorded state in the controller, by roll and pitch.
+    thrust
+        Of the thrust set-points; None without recorded ones.
     """
 
     axes: tuple[AxisMatch, ...]
     delay: float
+    thrust: AxisMatch | None = None
 
     @property
     def is_ours(self) -> bool:
@@ -115,13 +128,17 @@ def match_setpoints(flight: Flight, controller: ControllerFile) -> SetpointMatch
         return None
     chosen = np.linspace(0, inside.sum() - 1, COMPARED_SETPOINTS).astype(np.intp)
     time, wanted = recorded.time[inside][chosen], recorded.values[inside][chosen]
-    matches = (
-        SetpointMatch(
-            tuple(_axis(wanted[:, i], computed[:, i]) for i in range(3)), delay=float(latency)
-        )
-        for latency, computed in zip(LATENCIES_S, _computed(flight, controller, time), strict=True)
+    computed = _computed(flight, controller, time)
+    matches = [tuple(_axis(wanted[:, i], of[:, i]) for i in range(3)) for of in computed]
+    best = max(
+        range(len(matches)), key=lambda at: sum(axis.correlation for axis in matches[at][:2])
     )
-    return max(matches, key=lambda match: match.axes[0].correlation + match.axes[1].correlation)
+    thrust, linear = None, computed[best, :, -1] > 0.0
+    if flight.has("thrust_setpoint") and linear.sum() >= 50:
+        told = zero_order_hold(flight.series["thrust_setpoint"], time).ravel()
+        same = _same_but_for_markers(computed[best, linear, 4:-1])
+        thrust = _axis(same(told[linear]), same(computed[best, linear, 3]))
+    return SetpointMatch(matches[best], float(LATENCIES_S[best]), thrust)
 
 
 def setpoint_findings(flight: Flight, controller: ControllerFile) -> Iterator[Finding]:
@@ -151,6 +168,14 @@ def setpoint_findings(flight: Flight, controller: ControllerFile) -> Iterator[Fi
             )
         elif abs(axis.bias) > MIN_REPORTED_BIAS:
             biases[name] = round(axis.bias, 3)
+    if match.thrust is not None and match.thrust.correlation > MIN_THRUST_CORRELATION:
+        # what was sent has no noise, as what is computed from a recorded state has
+        gain = match.thrust.gain / match.thrust.correlation**2
+        if gain < 1.0 / MAX_THRUST_RATIO or match.thrust.gain > MAX_THRUST_RATIO:
+            correlation = round(match.thrust.correlation, 2)
+            yield Code.SETPOINTS_SCALED.warning(
+                flight.name, "thrust", "", gain=round(gain, 2), correlation=correlation
+            )
     if biases:
         yield Code.SETPOINTS_BIASED.info(flight.name, **biases)
     if (
@@ -185,8 +210,22 @@ def _axis(recorded: Array, computed: Array) -> AxisMatch:
     )
 
 
+def _same_but_for_markers(columns: Array) -> Callable[[Array], Array]:
+    """Return what takes from a series (n,) what columns (n, k) and a constant make of it."""
+    every = np.column_stack([np.ones(len(columns)), columns])
+    every /= np.linalg.norm(every, axis=0) + 1e-300
+    base, sizes, _ = np.linalg.svd(every, full_matrices=False)
+    base = base[:, sizes > RELATIVE_RANK * sizes[0]]
+    return lambda series: np.asarray(series - base @ (base.T @ series))
+
+
 def _computed(flight: Flight, controller: ControllerFile, time: Array) -> Array:
-    """Return the set-points (latencies, n, 3) of the controller file at some times in s."""
+    """Return the set-points (latencies, n, 10) of the controller file at some times in s.
+
+    Rates and thrust; what the latter changes by with the place of the controlled point in body
+    axes, and with the tilt of its axes about forward and left; and m/s² that feedback is below its
+    limit.
+    """
     then = (time[None] - LATENCIES_S[:, None]).ravel()
     state = {
         name: linear_interpolation(flight.series[name], then) for name in ("position", "attitude")
@@ -202,13 +241,13 @@ def _computed(flight: Flight, controller: ControllerFile, time: Array) -> Array:
         {name: Argument.of(rows, lanes=True) for name, rows in given[0].items()},
         jax.tree.map(partial(Argument.of, lanes=False), given[1]),
     )
-    name = "rate set-points of a controller file"
-    program = program_of(_rates, arguments, name=name, made_of=(), packages=CODE)
-    rates: Array = program(given, lanes=len(now)).values
-    return rates.reshape(len(LATENCIES_S), len(time), 3)
+    name = "set-points of a controller file"
+    program = program_of(_setpoints, arguments, name=name, made_of=(), packages=CODE)
+    found: Array = program(given, lanes=len(now)).values
+    return found.reshape(len(LATENCIES_S), len(time), -1)
 
 
-def _rates(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int]) -> JaxArray:
+def _setpoints(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int]) -> JaxArray:
     state, controller = given
     position, velocity = Vec3.of(state["position"]), Vec3.of(state["velocity"])
     estimate = Quaternion.of(state["attitude"]).normalized()
@@ -218,7 +257,13 @@ def _rates(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int
     heading = heading_of(controller.position, velocity)
     wanted = acceleration_setpoint(controller.position, point, position, velocity, heading)
     goal = attitude_from_acceleration(wanted, heading)
-    return rate_setpoint(controller.attitude, estimate, goal).stacked()
+    rates = rate_setpoint(controller.attitude, estimate, goal)
+    thrust = thrust_setpoint(controller.attitude, wanted, estimate)
+    moved = estimate.to_body(controller.position.kp.scaled_by(estimate.z_axis()))
+    tilted = estimate.to_body(wanted)
+    free = feedback_acceleration(controller.position, point, position, velocity).norm()
+    free = 0.99 * controller.position.max_feedback_acceleration - free
+    return jnp.stack([*rates.stacked(), thrust, *moved.stacked(), tilted.x, tilted.y, free])
 
 
 def _velocity(flight: Flight) -> Series:

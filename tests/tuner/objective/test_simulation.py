@@ -30,7 +30,7 @@ from tuner.core.errors import RecordingError
 from tuner.findings.findings import Code, one_line
 from tuner.objective import simulation
 from tuner.objective.initial_conditions import STATES
-from tuner.objective.inlets import INLETS
+from tuner.objective.inlets import INLETS, linear_interpolation
 from tuner.objective.segments import Segments
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
 from tuner.objective.simulation import beginning_of, recorded_of
@@ -308,6 +308,33 @@ def test_a_gain_and_a_bias_are_distinguished(flight):
     (finding,) = setpoint_findings(with_setpoints(flight, lambda v: v + np.eye(3)[0] * 0.2), OURS)
     assert finding.code is Code.SETPOINTS_BIASED
     assert finding.numbers == {"roll": pytest.approx(0.2, abs=0.01)}
+
+
+@pytest.mark.parametrize(
+    ("change", "gain"),
+    [
+        ({"thrust": {"normalized_constant": 0.066}}, 1.0 / 1.1),
+        ({"thrust": {"normalized_constant": 0.054}}, 1.0 / 0.9),
+        ({"thrust": {"normalized_offset": 0.12}}, None),  # the altitude makes up for it
+        ({}, None),
+    ],
+)
+def test_another_map_from_acceleration_to_thrust_is_reported(flight, change, gain):
+    """With a tenth more latency ended 6 and marker_offset_z 18 standard errors off, usable."""
+    sections = {key: getattr(OURS, key).replace(**values) for key, values in change.items()}
+    for place in (np.zeros(3), np.array([0.03, -0.02, 0.04])):  # of the markers
+        series = dict(flight.series)
+        turned = Rotation.from_quat(series["attitude"].values, scalar_first=True).apply(place)
+        moved = Series(series["attitude"].time, turned)
+        position = series["position"]
+        values = position.values + linear_interpolation(moved, position.time)
+        seen = replace(flight, series={**series, "position": Series(position.time, values)})
+        every = setpoint_findings(seen, OURS.replace(**sections))
+        found = [one for one in every if one.code is Code.SETPOINTS_SCALED]
+        assert [one.names[0] for one in found] == ["thrust"] * (gain is not None)
+        for one in found:
+            assert one.numbers["gain"] == pytest.approx(gain, rel=0.02)
+            assert "Thrust set-points follow" in one_line(one)
 
 
 def test_a_noisy_attitude_is_no_smaller_gain(flight):
