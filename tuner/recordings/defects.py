@@ -78,6 +78,8 @@ def clean(
             notes.append(code.note(signal, kind=kind, topic=topic, count=int(count), **numbers))
 
     low, high = SIGNALS[signal].range
+    if signal == "command":
+        values = _disarmed_as_zero(values, low)
     beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
     dropped = int(beyond.any(axis=1).sum())
     if dropped > MAX_BEYOND_SHARE * int((values != 0).any(axis=1).sum()):  # 0 is 0 in each unit
@@ -129,6 +131,15 @@ def clean(
     if signal in LIMITS:
         time, values = _without_outliers(signal, time, values, note)
     return time, values, tuple(notes)
+
+
+def _disarmed_as_zero(values: Array, low: float) -> Array:
+    """Return commands (n, k) in which pulses of disarmed motors, below any command, are zero.
+
+    Autopilots send them to all motors alike; one alone is corrupt.
+    """
+    disarmed = ((values < low) & (values >= -1.0)).all(axis=1, keepdims=True)
+    return np.where(disarmed, 0.0, values)
 
 
 def _without_outliers(

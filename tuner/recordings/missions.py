@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array
 from tuner.recordings.flight import Series
@@ -27,6 +28,8 @@ MAX_POSE_PAUSE_S = 10.0
 """A pose that pauses for longer, as where a clock was set, ends a mission."""
 MIN_LANDING_S = 0.2
 """A shorter time on the ground is no landing: a bounce takes longer."""
+MAX_TOUCHDOWN_S = 3.0
+"""Motors that touched down idle within this."""
 MIN_MISSION_S = 2.0
 """A shorter stretch is no mission."""
 MAX_IDLE_COMMAND, MAX_OFF_COMMAND = 0.12, 0.02
@@ -44,6 +47,14 @@ MAX_RESTING_RANGE_M = 0.01
 """A position that stays within this for a second rests."""
 BIN_S = 0.1
 """Positions are averaged over bins."""
+MAX_FALL_S = 2.0
+"""A vehicle falls and bounces for so long at most,"""
+MIN_FALL = 0.5
+"""gains at least this share of gravity, in the mean of any two bins,"""
+MAX_IMPACT_S = 0.3
+"""and bounces off within this."""
+MIN_SPIN_S = 3.0
+"""A yaw rate set-point that stays the same for longer is another experiment."""
 MAX_SETPOINT_DELAY_S = 0.5
 """Set-points that begin so soon after the pose ran all the time."""
 MAX_WHOLE_MISSION_S = 120.0
@@ -60,6 +71,8 @@ HOVER_LEAD_S = 1.0
 """A manoeuvre begins with so much hover, so that its simulation begins at rest."""
 MAX_HOVER_SPEED, MAX_HOVER_TURN_RATE = 0.3, 0.3
 """m/s and rad/s. A vehicle that moves or turns faster does not hover."""
+
+NOTHING, NO_RATES = (Series(np.zeros(0), np.zeros((0, columns))) for columns in (1, 3))
 
 
 @dataclass(frozen=True)
@@ -86,7 +99,7 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
     A mission starts where the attitude set-points begin. Without set-points, or if they run from
     the start, it starts where the reference begins to move or, without one, in the air. Time on the
     ground, the first centimetres of take-off and the last of landing, and all after the last
-    attitude are cut.
+    attitude are cut. A yaw spin between other manoeuvres is a mission of its own.
     """
     pose = series["position"].time
     first, last = float(pose[0]), float(pose[-1])
@@ -111,7 +124,8 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
                 begin = _first_motion(series, flown, min(end, down))
                 begins_with = "the reference's motion" if begin > flown else "flight"
             mission = Mission(begin, min(end, down, last), begins_with)
-            missions += _split_at_pose_pauses(mission, series["position"].time)
+            for part in _split_at_pose_pauses(mission, series["position"].time):
+                missions += _split_at_spins(part, series)
     return tuple(m for m in missions if m.end - m.start >= MIN_MISSION_S)
 
 
@@ -155,6 +169,27 @@ def _split_at_pose_pauses(mission: Mission, pose: Array) -> list[Mission]:
     ]
 
 
+def _split_at_spins(mission: Mission, series: Mapping[str, Series]) -> list[Mission]:
+    """Return the yaw spins in a mission along a reference, and what is before and after them.
+
+    Attitude control sets the yaw rate elsewhere, and no loop is simulated that changes between.
+    """
+    setpoints = series.get("rate_setpoint", NO_RATES).between(mission.start - 1e-3, mission.end)
+    whole, _ = yaw_spin(setpoints, mission.start, mission.end)
+    if whole is not None or "reference_position" not in series:
+        return [mission]
+    time, yaw = setpoints.time, setpoints.values[:, 2]
+    held = np.append(np.abs(np.diff(yaw)) < 1e-3 * np.abs(yaw[1:]), False)
+    pieces, start, begins_with = [], mission.start, mission.begins_with
+    for first, last in runs(held):
+        begin, end = float(time[first]), float(time[last])
+        if end - begin > MIN_SPIN_S and yaw_spin(setpoints, begin, end)[0] is not None:
+            pieces.append(replace(mission, start=start, end=begin, begins_with=begins_with))
+            pieces.append(replace(mission, start=begin, end=end, begins_with="a yaw spin"))
+            start, begins_with = end, "flight"
+    return [*pieces, replace(mission, start=start, begins_with=begins_with)]
+
+
 def _first_motion(series: Mapping[str, Series], start: float, end: float) -> float:
     """Return the time at which the reference begins to move; the start if it does not.
 
@@ -193,7 +228,21 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
     if not stands.any():  # the ground is a guess, and what passes it without a rest flies
         for first, last in runs(low):
             low[first:last] = (grounded | rests)[first:last].any()
-    return stretches(time, ~low)
+    return [(up, _before_fall(time, height, down)) for up, down in stretches(time, ~low)]
+
+
+def _before_fall(time: Array, height: Array, end: float) -> float:
+    """Return the time at which a fall begins that ends with the flight, or else the flight's end.
+
+    As after motors that were stopped, or a collision, where no command or rotor speed shows it.
+    """
+    at = end - 0.1 * BIN_S * np.arange(round(MAX_FALL_S / (0.1 * BIN_S)))
+    before = [np.interp(at - back * BIN_S, time, height) for back in range(3)]
+    falls = (before[0] - 2.0 * before[1] + before[2]) / BIN_S**2 < -MIN_FALL * GRAVITY
+    for first, last in runs(falls):
+        if at[first] > end - MAX_IMPACT_S:  # of the fall, or of what bounced after it
+            end = float(at[last - 1]) - 1.5 * BIN_S
+    return end
 
 
 def _is_still(time: Array, positions: Array) -> NDArray[np.bool_]:
@@ -228,46 +277,58 @@ def _lasting_idle(
 def _idle(
     series: Mapping[str, Series], time: Array, height: Array
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return at which times the motors idle, and at which times they were recorded."""
+    """Return at which times the motors idle, and at which it is known whether they do.
+
+    What is not recorded of commands, as where they are sent to armed motors alone, rotor speeds
+    tell. Thrust set-points are those of no motor before it is armed: they tell of idling alone.
+    """
     clear = height > float(np.quantile(height, 0.02)) + 3 * MIN_FLYING_HEIGHT_M
+    idle, observed = np.zeros((2, len(time)), dtype=np.bool_)
     for name, (limit, off) in IDLE.items():
-        if name in series and len(series[name].time) > 1:
-            samples = series[name]
-            known = np.isfinite(samples.values).any(axis=1)
-            if not known.any():
-                continue
-            at = np.interp(time, samples.time[known], np.nanmean(samples.values[known], axis=1))
-            observed = (time >= samples.time[0] - MIN_LANDING_S) & (
-                time <= samples.time[-1] + MIN_LANDING_S
-            )
-            flown = at[clear & observed]
-            carries = MAX_IDLE_SHARE * float(np.median(flown)) if len(flown) else limit
-            idle: NDArray[np.bool_] = np.asarray(at < max(off, min(limit, carries)))
-            return observed & idle, observed
-    nothing = np.zeros(len(time), dtype=np.bool_)
-    return nothing, nothing
+        samples = series.get(name, NOTHING)
+        samples = samples.where(np.asarray(np.isfinite(samples.values).any(axis=1)))
+        if len(samples.time) < 2:
+            continue
+        at = np.interp(time, samples.time, np.nanmean(samples.values, axis=1))
+        told = (time >= samples.time[0] - MIN_LANDING_S) & (
+            time <= samples.time[-1] + MIN_LANDING_S
+        )
+        flown = at[clear & told]
+        carries = MAX_IDLE_SHARE * float(np.median(flown)) if len(flown) else limit
+        idle |= told & ~observed & (at < max(off, min(limit, carries)))
+        observed |= told & (name != "thrust_setpoint")
+    return idle, observed
 
 
 def _is_on_ground(time: Array, height: Array) -> NDArray[np.bool_]:
-    """Return when the vehicle is on the ground at the start or the end of the recording."""
+    """Return when the vehicle is on the ground at the start or the end of the recording.
+
+    There it rests, and seen from there it climbs before it comes any lower.
+    """
     resting = np.zeros(len(time), dtype=np.bool_)
-    for near in (time < time[0] + 1.0, time > time[-1] - 1.0):
-        level = float(np.median(height[near]))
-        still = float(np.ptp(height[near])) < 0.01
-        lowest = level < float(np.quantile(height, 0.02)) + 0.03
-        if still and lowest and float(np.quantile(height, 0.9)) - level > 3 * MIN_FLYING_HEIGHT_M:
+    for onward in (slice(None), slice(None, None, -1)):
+        seen = height[onward]
+        near = seen[np.abs(time - time[onward][0])[onward] < 1.0]
+        level = float(np.median(near))
+        left = np.flatnonzero((seen < level - 0.03) | (seen > level + 3 * MIN_FLYING_HEIGHT_M))
+        if np.ptp(near) < 0.01 and len(left) and seen[left[0]] > level:
             resting |= np.abs(height - level) < 0.03
     return resting
 
 
-def _ground_height(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
-    """Return the ground's height at each time, from the last, or else the next, time on it."""
-    where = np.flatnonzero(idle)
-    before = np.clip(np.searchsorted(where, np.arange(len(time)), side="right") - 1, 0, None)
-    gaps = np.diff(where) > 1
-    levels = [np.median(run) for run in np.split(height[where], np.flatnonzero(gaps) + 1)]
-    run_of = np.cumsum(np.concatenate([[0], gaps]))
-    return np.asarray(np.array(levels)[run_of[before]])
+def _ground_height(time: Array, height: Array, grounded: NDArray[np.bool_]) -> Array:
+    """Return the ground's height at each time: of where it landed, shortly before, or took off.
+
+    That is the median over the last second there, or the first: it may be carried in between.
+    """
+    level, until = np.zeros(len(time)), [first for first, _ in runs(grounded)][1:]
+    for (first, last), behind in zip(runs(grounded), [*until, len(time)], strict=True):
+        on = slice(first, last)
+        leaves = np.median(height[on][time[on] > time[last - 1] - MAX_PAUSE_S])
+        lands = np.median(height[on][time[on] < time[first] + MAX_PAUSE_S])
+        begins = np.searchsorted(time, time[first] - MAX_TOUCHDOWN_S) if level.any() else 0
+        level[begins:first], level[first:behind] = lands, leaves
+    return level
 
 
 def stretches(

@@ -20,6 +20,7 @@ from tuner.recordings.inspection import inspect_recordings
 from tuner.recordings.loader import load_flight
 from tuner.recordings.missions import find_missions
 from tuner.recordings.notes import NoteCode
+from tuner.recordings.unit_detection import to_si
 
 
 def _cleaned(signal: str, time: np.ndarray, values: np.ndarray):
@@ -44,6 +45,18 @@ def test_tachometer_artefacts_go_and_steps_stay() -> None:
     assert set(np.flatnonzero(~np.isin(time, kept))) == set(artefacts)
     assert notes[0].count == len(artefacts)
     assert np.isnan(left[:, 0]).all()
+
+
+def test_disarmed_motors_are_no_reason_to_doubt_the_unit_of_commands() -> None:
+    """PX4 sends 900 µs to disarmed motors, or nothing, half a minute on the ground."""
+    pulses = np.full((3000, 4), 1550.0)
+    pulses[:1500], pulses[2700:], pulses[2000, 2] = 900.0, 0.0, 900.0
+    time, kept, notes = _cleaned("command", np.arange(3000) * 0.01, to_si(pulses, "pwm_us"))
+    assert len(time) == 2999  # one of four motors alone is not disarmed
+    assert not kept[:1500].any()
+    assert not kept[-300:].any()
+    assert kept[1500:2000] == pytest.approx(0.55)
+    assert [note.code for note in notes[:1]] == [NoteCode.OUT_OF_RANGE]
 
 
 def test_fast_honest_flight_loses_no_sample() -> None:

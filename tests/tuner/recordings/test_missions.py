@@ -59,6 +59,73 @@ def test_motors_that_report_only_when_armed() -> None:
     assert mission.end == pytest.approx(35.88, abs=0.05)
 
 
+def test_motors_that_are_carried_by_hand_do_not_fly() -> None:
+    """Commands are recorded of armed motors alone, and rotor speeds throughout."""
+    signals = flight(climb=15.0, land=30.0)
+    carried = np.clip(TIME - 1, 0, 1) - np.clip(TIME - 8, 0, 1)
+    carried += np.clip(TIME - 34, 0, 1) - np.clip(TIME - 38, 0, 1)
+    signals["position"].values[:, 2] += carried
+    armed, flies = (TIME > 13) & (TIME < 32), (TIME > 15) & (TIME < 31)
+    command = np.where(flies, 0.5, 0.05)[armed, None]
+    signals["command"] = series(np.tile(command, 4), TIME[armed])
+    signals["rotor_speed"] = series(np.tile(600.0 * flies[:, None], 4))
+    (mission,) = find_missions(signals)
+    assert (mission.start, mission.end) == pytest.approx((15.12, 30.88), abs=0.05)
+
+
+def test_thrust_set_points_do_not_lift_disarmed_motors() -> None:
+    """An autopilot is sent them before it takes over; they ask for the climb."""
+    during = flight() | {"thrust_setpoint": series(np.full(len(TIME), 0.9))}
+    (mission,) = find_missions(during)
+    assert (mission.start, mission.end) == pytest.approx((5.12, 35.88), abs=0.05)
+
+
+@pytest.mark.parametrize(("floor", "end"), [(-0.1, 35.9), (0.4, 35.48)], ids=["lower", "table"])
+def test_a_flight_that_lands_at_another_height(floor: float, end: float) -> None:
+    signals = flight()
+    height = signals["position"].values[:, 2]
+    height += np.clip(TIME - 15, 0, 1) - np.clip(TIME - 30, 0, 1)
+    height[TIME > 30] = np.maximum(height[TIME > 30], 0.05 + floor)
+    if floor < 0:
+        height += floor * np.clip(TIME - 35, 0, 1)
+    (mission,) = find_missions(signals)
+    assert (mission.start, mission.end) == pytest.approx((5.12, end), abs=0.05)
+
+
+@pytest.mark.parametrize("bounces", [False, True])
+@pytest.mark.parametrize("rests", [False, True])
+def test_a_fall_is_not_flown(*, bounces: bool, rests: bool) -> None:
+    """Motors stop in the air, which no command and no rotor speed shows."""
+    signals = flight(land=100.0)
+    height, since = signals["position"].values[:, 2], TIME - 30.0
+    since_impact = since - np.sqrt(2 * 1.0 / 9.81)
+    fallen = 1.05 - 0.5 * 9.81 * since**2
+    bounced = np.maximum(2.5 * since_impact - 0.5 * 9.81 * since_impact**2, 0.0) * bounces + 0.05
+    falls = since > 0
+    height[falls] = np.where(since_impact > 0, bounced, fallen)[falls]
+    recorded = since < (10.0 if rests else 0.4)
+    signals = {name: samples.where(recorded) for name, samples in signals.items()}
+    (mission,) = find_missions(signals)
+    assert mission.start == pytest.approx(5.12, abs=0.05)
+    assert mission.end == pytest.approx(30.0, abs=0.06)
+
+
+def test_a_spin_between_other_manoeuvres_is_a_mission_of_its_own() -> None:
+    """Its yaw rate set-point is constant; elsewhere attitude control sets one."""
+    random = np.random.default_rng(0)
+    rates = random.normal(0, 0.1, (len(TIME), 3))
+    rates[(TIME > 12) & (TIME < 22), 2] = 3.0
+    rates[(TIME > 26) & (TIME < 28), 2] = 2.0  # a moment at the limit
+    signals = flight(climb=-10, land=100) | {"rate_setpoint": series(rates)}
+    assert len(find_missions(signals)) == 1  # without a reference nothing simulates its heading
+    signals["reference_position"] = series(np.tile([0.0, 0.0, 1.0], (len(TIME), 1)))
+    before, spin, after = find_missions(signals)
+    assert (spin.start, spin.end) == pytest.approx((12.0, 22.0), abs=0.02)
+    assert (before.end, after.start) == (spin.start, spin.end)
+    assert [m.begins_with for m in (spin, after)] == ["a yaw spin", "flight"]
+    assert yaw_spin(signals["rate_setpoint"], spin.start, spin.end) == (3.0, True)
+
+
 def test_a_hover_is_no_ground() -> None:
     signals = flight(climb=-10, land=100)
     assert airborne(signals) == [(TIME[0], TIME[-1])]
