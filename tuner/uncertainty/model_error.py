@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from itertools import permutations
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -83,6 +84,9 @@ MIN_REPORTED_LAW_SHARE = 0.03
 """Least share of an axis' variation that a reported law explains."""
 FAR_OFF_GAIN = 1.3
 """Factor on a gain from which the file is another controller's: a battery changes it by less."""
+MIN_CORRELATION, MIN_LEAD = 0.4, 0.3
+"""Least correlation of recorded with simulated torques of roll and pitch for an order of motors,
+and least lead over any other order's."""
 GAIN_AXES = {"rate_gain_roll_pitch": ("roll", "pitch"), "rate_gain_yaw": ("yaw",)}
 """Coefficient -> axes of the rate controller whose gains it scales."""
 
@@ -105,6 +109,8 @@ class ModelErrors:
     gains
         Fitted coefficient of `GAIN_AXES` -> relative deviation of its estimate from recorded
         commands, its standard error subtracted.
+    order
+        Recorded column of motors, from 1, of each rotor, where they are in another order.
     """
 
     laws: tuple[Law, ...]
@@ -112,11 +118,13 @@ class ModelErrors:
     controller: tuple[ControllerEstimate, ...] = ()
     speed_lag: float = 0.0
     gains: Mapping[str, float] = field(default_factory=dict)
+    order: tuple[str, ...] = ()
 
     @property
     def or_none(self) -> ModelErrors | None:
         """None if there are no errors."""
-        return self if self.laws or self.controller or self.speed_lag or self.gains else None
+        every = (self.laws, self.controller, self.speed_lag, self.gains, self.order)
+        return self if any(every) else None
 
     def applied_to(self, objective: Objective) -> Objective:
         """Return a problem with these disturbances, gains, and stamps of rotor speeds."""
@@ -172,7 +180,10 @@ def model_errors_of(fitted: Fit, flights: Sequence[Flight]) -> ModelErrors | Non
             series["rotor_speed"] = Series(lagging.time - tachometer_lag, lagging.values)
         read.append(_recorded(replace(flight, series=series), model, conditions, number))
     rate = float(schedule.log_rate)
-    estimates = _controller_estimates(flights, flown, model.controller.mixer, rate, usable)
+    loops = _loops_of(flights, flown, model.controller.mixer, rate, usable)
+    if order := _order_of_motors(loops, model.controller.mixer):
+        return ModelErrors((), None, order=order)
+    estimates = _controller_estimates(loops)
     differing = tuple(estimate for estimate in estimates if estimate.differs)
     gain_shifts = {}
     for name in set(GAIN_AXES) & set(objective.space.names):
@@ -207,13 +218,18 @@ def model_errors_of(fitted: Fit, flights: Sequence[Flight]) -> ModelErrors | Non
 
 def answers_of(fitted: Fit, flights: Sequence[Flight]) -> tuple[ControllerEstimate, ...]:
     """Return the estimates of the rate controller that differ; arguments of `model_errors_of`."""
+    estimates = _controller_estimates(_loops_in(fitted, flights))
+    return tuple(estimate for estimate in estimates if estimate.differs)
+
+
+def _loops_in(fitted: Fit, flights: Sequence[Flight]) -> list[_Loop]:
+    """Return the rate loops of a fit's flights; none where they are not flown whole."""
     simulated, objective = _flown(fitted), fitted.objective
     if simulated is None:
-        return ()
+        return []
     flights = _on_the_simulations_clock(fitted, flights)
     mixer, rate = objective.model.controller.mixer, float(objective.schedule.log_rate)
-    estimates = _controller_estimates(flights, simulated[0], mixer, rate, simulated[1])
-    return tuple(estimate for estimate in estimates if estimate.differs)
+    return _loops_of(flights, simulated[0], mixer, rate, simulated[1])
 
 
 def _on_the_simulations_clock(fitted: Fit, flights: Sequence[Flight]) -> tuple[Flight, ...]:
@@ -374,6 +390,8 @@ def model_error_findings(
     """Return the findings on model errors; on omitted laws only if these may move coefficients."""
     if model_errors is None:
         return
+    if model_errors.order:
+        yield Code.MOTOR_ORDER.warning("motors", *model_errors.order)
     yield from _controller_findings(
         one
         for one in model_errors.controller
@@ -393,18 +411,25 @@ def model_error_findings(
 
 
 def gains_far_off(fitted: Fit, flights: Sequence[Flight]) -> Iterator[Finding]:
-    """Return findings on gains far from the file's; arguments are those of `model_errors_of`.
+    """Yield findings on motors in another order, or gains far from the file's.
+
+    Arguments are those of `model_errors_of`.
 
     An axis is left out whose simulated signals show far less than the file's P: motors clip. A fit
     that is not at its minimum may spin a vehicle that it cannot turn.
     """
-    rate = fitted.objective.model.controller.rate
-    gains = np.asarray(rate.p.stacked() * rate.k.stacked())
+    controller = fitted.objective.model.controller
+    loops = _loops_in(fitted, flights)
+    if order := _order_of_motors(loops, controller.mixer):
+        yield Code.MOTOR_ORDER.warning("motors", *order)
+        return
+    gains = np.asarray(controller.rate.p.stacked() * controller.rate.k.stacked())
     of_file = dict(zip(AXES, gains, strict=True))
-    return _controller_findings(
+    yield from _controller_findings(
         one
-        for one in answers_of(fitted, flights)
-        if one.part != "late"
+        for one in _controller_estimates(loops)
+        if one.differs
+        and one.part != "late"
         and not 1.0 / FAR_OFF_GAIN < one.value < FAR_OFF_GAIN
         and not one.simulated_p * FAR_OFF_GAIN < of_file[one.axis]
     )
@@ -438,19 +463,24 @@ def _with_gain(gains: RateGains, estimate: ControllerEstimate) -> RateGains:
     return replace(gains, d=replace(gains.d, **{axis: less_d}))
 
 
-def _controller_estimates(
+class _Loop(NamedTuple):
+    """A flight's rate loop as recorded and as simulated: signals, and commands (N, 4)."""
+
+    flight: str
+    recorded: Signals
+    simulated: Signals
+    commands: tuple[Array, Array]
+
+
+def _loops_of(
     flights: Sequence[Flight],
     flown: SimulatedChannels,
     mixer: MixerSettings,
     rate: float,
     usable: Mask,
-) -> tuple[ControllerEstimate, ...]:
-    """Return the estimates of recorded rate controllers relative to those of the fit.
-
-    ``usable`` (F,) are the flights to use. A flight with another P than the others' is estimated
-    by itself.
-    """
-    names, recorded, simulated = [], [], []
+) -> list[_Loop]:
+    """Return the rate loops of the flights that recorded them; ``usable`` (F,) are those to use."""
+    loops = []
     for number, flight in enumerate(flights):
         series = flight.series
         known = set(LOOP_SIGNALS) <= set(series)
@@ -464,8 +494,7 @@ def _controller_estimates(
         ):
             continue
         even = np.linspace(time[0], time[-1], len(time))
-        names.append(flight.name)
-        recorded.append(_signals([series[name] for name in LOOP_SIGNALS], mixer, even))
+        told = [series[name] for name in LOOP_SIGNALS]
         made = []
         for name, channel in zip(LOOP_SIGNALS, (SETPOINTS, "body_rate", "command"), strict=True):
             stamps = series[name].time  # sampled as the recording
@@ -474,9 +503,52 @@ def _controller_estimates(
             # outputs of a loop hold until it runs again; a body rate is continuous
             read = linear_interpolation if name == "body_rate" else zero_order_hold
             made.append(Series(stamps, read(there, stamps)))
-        simulated.append(_signals(made, mixer, even))
-    if not recorded:
+        commands = [linear_interpolation(parts[-1], even) for parts in (told, made)]
+        recorded, simulated = (_signals(parts, mixer, even) for parts in (told, made))
+        loops.append(_Loop(flight.name, recorded, simulated, (commands[0], commands[1])))
+    return loops
+
+
+def _order_of_motors(loops: Sequence[_Loop], mixer: MixerSettings) -> tuple[str, ...]:
+    """Return the recorded column, from 1, of each rotor; empty for its own order or no clear one.
+
+    Simulated rotors are in the vehicle's order, and answer the same manoeuvres: columns in another
+    order make torques of roll and pitch that are not those.
+    """
+    if not loops:
         return ()
+
+    def torques(all_commands: Iterable[Array], columns: Sequence[int]) -> Array:
+        parts = []
+        for commands in all_commands:
+            torque = torque_of(mixer, tuple(commands[:, columns].T))
+            both = np.column_stack([torque.x, torque.y])
+            parts.append(both - both.mean(axis=0))
+        return np.concatenate(parts)
+
+    own = tuple(range(loops[0].commands[0].shape[1]))
+    made = torques((loop.commands[1] for loop in loops), own)
+
+    def alike(columns: Sequence[int]) -> float:
+        told = torques((loop.commands[0] for loop in loops), columns)
+        sizes = np.sqrt((told * told).sum(axis=0) * (made * made).sum(axis=0))
+        return float(((told * made).sum(axis=0) / np.maximum(sizes, 1e-300)).min())
+
+    correlation = {columns: alike(columns) for columns in permutations(own)}
+    best, second = sorted(correlation, key=correlation.__getitem__, reverse=True)[:2]
+    clear = correlation[best] > max(MIN_CORRELATION, correlation[second] + MIN_LEAD)
+    return tuple(str(1 + column) for column in best) if clear and best != own else ()
+
+
+def _controller_estimates(loops: Sequence[_Loop]) -> tuple[ControllerEstimate, ...]:
+    """Return the estimates of recorded rate controllers relative to those of the fit.
+
+    A flight with another P than the others' is estimated by itself.
+    """
+    if not loops:
+        return ()
+    names = [loop.flight for loop in loops]
+    recorded, simulated = [loop.recorded for loop in loops], [loop.simulated for loop in loops]
     odd = others_gains(recorded, simulated)
     rest = [number for number in range(len(recorded)) if number not in odd]
     alike = estimate_controller(
