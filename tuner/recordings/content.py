@@ -47,7 +47,12 @@ from tuner.recordings.unit_detection import (
     unit_of_angles,
     units_of_references,
 )
-from tuner.vehicle.motor_orders import columns_of, motor_order_of, order_in_words
+from tuner.vehicle.motor_orders import (
+    columns_of,
+    motor_order_of,
+    order_in_words,
+    rotor_count_of,
+)
 
 PX4_REFERENCES = ("trajectory_setpoint", "vehicle_local_position_setpoint")
 """References of PX4's own position control."""
@@ -173,6 +178,14 @@ def read_signals(options: ReadOptions) -> RecordedSignals:
             f"is read as '{recording.format}', the topic map '{given.name}' is for "
             f"'{given.format}'",
             "give a map for this format",
+        )
+    rotors = rotor_count_of(recording.parameters)
+    if rotors is not None and rotors[0] != 4:
+        raise RecordingError(
+            path,
+            f"is of a vehicle of {rotors[0]} rotors, by its {rotors[1]}, and only four are "
+            "simulated and read",
+            "leave it out, and fit flights of a quadrotor",
         )
     chosen = choose_map(recording, candidates)
     taken: tuple[Note, ...] = ()

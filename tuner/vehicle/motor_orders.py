@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
@@ -11,6 +12,8 @@ from tuner.core.yaml_section import refuse
 
 #: Stack -> the motor, from 1, that drives each rotor in PX4's order: front right, rear left, front
 #: left, rear right. Source: the motor maps in the documentation of each.
+ROTORS_OF_TYPE: Mapping[float, int] = {2: 4, 13: 6, 14: 8, 15: 3}
+"""Type of vehicle, by MAVLink, of multirotors -> their rotors."""
 MOTOR_ORDERS: Mapping[str, tuple[int, int, int, int]] = {
     "px4": (1, 2, 3, 4),
     "ardupilot": (1, 2, 3, 4),
@@ -51,8 +54,7 @@ def motor_order_of(parameters: Mapping[str, float]) -> tuple[int, ...] | None:
 
     ``CA_ROTORi_PX`` is forward and ``CA_ROTORi_PY`` right of the centre.
     """
-    allocated = parameters.get("SYS_CTRL_ALLOC", 1.0) > 0  # from 1.14 on always
-    if not allocated or round(parameters.get("CA_ROTOR_COUNT", 0)) != 4:
+    if not _allocates(parameters) or parameters.get("CA_ROTOR_COUNT") != 4:
         return None
     sits = {}
     for motor in range(4):
@@ -64,3 +66,18 @@ def motor_order_of(parameters: Mapping[str, float]) -> tuple[int, ...] | None:
         return None
     order = tuple(sits[rotor] for rotor in rotors)
     return None if order == (1, 2, 3, 4) else order
+
+
+def rotor_count_of(parameters: Mapping[str, float]) -> tuple[int, str] | None:
+    """Return how many rotors a log's vehicle has, and which parameter says so; None if none does.
+
+    Without ``CA_ROTOR_COUNT`` it is that of MAVLink's type of vehicle.
+    """
+    count, kind = (parameters.get(name, 0.0) for name in ("CA_ROTOR_COUNT", "MAV_TYPE"))
+    if _allocates(parameters) and 0 < count < math.inf:
+        return round(count), "CA_ROTOR_COUNT"
+    return (ROTORS_OF_TYPE[kind], "MAV_TYPE") if kind in ROTORS_OF_TYPE else None
+
+
+def _allocates(parameters: Mapping[str, float]) -> bool:
+    return parameters.get("SYS_CTRL_ALLOC", 1.0) > 0  # from 1.14 on always

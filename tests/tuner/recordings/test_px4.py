@@ -129,6 +129,28 @@ def test_flights_of_px4s_own_loops_enter_below_them(messages, tmp_path: Path) ->
     assert recording.inlet == "reference"
 
 
+@pytest.mark.parametrize(
+    ("parameters", "rotors"),
+    [
+        ({"CA_ROTOR_COUNT": 6}, "6 rotors, by its CA_ROTOR_COUNT"),
+        ({"MAV_TYPE": 14, "SYS_CTRL_ALLOC": 0, "CA_ROTOR_COUNT": 4}, "8 rotors, by its MAV_TYPE"),
+        ({"MAV_TYPE": 13, "CA_ROTOR_COUNT": 4}, None),
+        ({"MAV_TYPE": 2, "CA_ROTOR_COUNT": 0}, None),
+        ({"MAV_TYPE": np.nan, "CA_ROTOR_COUNT": np.nan}, None),
+    ],
+)
+def test_logs_of_other_than_four_rotors_are_refused(
+    messages, tmp_path: Path, parameters: dict[str, float], rotors: str | None
+) -> None:
+    """Four of six motors were read, and fitted as a quadrotor's."""
+    path = log(messages, tmp_path / "log.ulg", parameters)
+    if rotors is None:
+        load_flight(path)
+        return
+    with pytest.raises(RecordingError, match=f"is of a vehicle of {rotors}"):
+        load_flight(path)
+
+
 def test_motors_are_in_the_order_of_the_logs_geometry(messages, tmp_path: Path) -> None:
     assert motor_order_of(AS_BETAFLIGHT) == (2, 3, 4, 1)
     assert motor_order_of(AS_BETAFLIGHT | {"SYS_CTRL_ALLOC": 0.0}) is None
