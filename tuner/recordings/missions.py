@@ -173,6 +173,7 @@ def _split_at_spins(mission: Mission, series: Mapping[str, Series]) -> list[Miss
     """Return the yaw spins in a mission along a reference, and what is before and after them.
 
     Attitude control sets the yaw rate elsewhere, and no loop is simulated that changes between.
+    What follows a spin begins where it no longer turns back: rotors clip while it does.
     """
     setpoints = series.get("rate_setpoint", NO_RATES).between(mission.start - 1e-3, mission.end)
     whole, _ = yaw_spin(setpoints, mission.start, mission.end)
@@ -186,7 +187,8 @@ def _split_at_spins(mission: Mission, series: Mapping[str, Series]) -> list[Miss
         if end - begin > MIN_SPIN_S and yaw_spin(setpoints, begin, end)[0] is not None:
             pieces.append(replace(mission, start=start, end=begin, begins_with=begins_with))
             pieces.append(replace(mission, start=begin, end=end, begins_with="a yaw spin"))
-            start, begins_with = end, "flight"
+            settled = time[(time > end) & (np.abs(yaw) < MAX_HOVER_TURN_RATE)]
+            start, begins_with = float(settled.min(initial=mission.end)), "flight"
     return [*pieces, replace(mission, start=start, begins_with=begins_with)]
 
 

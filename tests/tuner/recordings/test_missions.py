@@ -113,15 +113,17 @@ def test_a_fall_is_not_flown(*, bounces: bool, rests: bool) -> None:
 def test_a_spin_between_other_manoeuvres_is_a_mission_of_its_own() -> None:
     """Its yaw rate set-point is constant; elsewhere attitude control sets one."""
     random = np.random.default_rng(0)
-    rates = random.normal(0, 0.1, (len(TIME), 3))
-    rates[(TIME > 12) & (TIME < 22), 2] = 3.0
+    rates = random.normal(0, 0.05, (len(TIME), 3))
+    rates[(TIME > 12) & (TIME < 21.99), 2] = 3.0
+    rates[(TIME > 21.99) & (TIME < 24), 2] = -6.0  # it turns back
     rates[(TIME > 26) & (TIME < 28), 2] = 2.0  # a moment at the limit
     signals = flight(climb=-10, land=100) | {"rate_setpoint": series(rates)}
     assert len(find_missions(signals)) == 1  # without a reference nothing simulates its heading
     signals["reference_position"] = series(np.tile([0.0, 0.0, 1.0], (len(TIME), 1)))
     before, spin, after = find_missions(signals)
     assert (spin.start, spin.end) == pytest.approx((12.0, 22.0), abs=0.02)
-    assert (before.end, after.start) == (spin.start, spin.end)
+    assert before.end == spin.start
+    assert after.start == pytest.approx(24.0, abs=0.02)
     assert [m.begins_with for m in (spin, after)] == ["a yaw spin", "flight"]
     assert yaw_spin(signals["rate_setpoint"], spin.start, spin.end) == (3.0, True)
 
