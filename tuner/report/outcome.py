@@ -204,7 +204,8 @@ def next_step(
     Parameters
     ----------
     exports
-        The requested ones; if all were refused, the reason comes first.
+        The requested ones; if all were refused, or the one that would be next, the reason comes
+        first.
     """
     name = shlex.quote(str(folder))
     unusable = found.usability is Usability.UNUSABLE
@@ -224,7 +225,8 @@ def next_step(
         return words, f"tune ... --holdout {shlex.quote(flight)}"
     if not found.flights:
         return "Fit flights from it.", f"tune --flights FLIGHT... --bench {name}"
-    if why := _refusal(exports):
+    next_ones = [one for one in exports if one.format == "sdf"]
+    if why := _refusal(exports) or _refusal(next_ones):
         return as_sentence(why), f"tune report {name} --open"
     return "Put it into your model.", f"tune export {name} --format sdf --into model.sdf"
 

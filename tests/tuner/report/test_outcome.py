@@ -216,16 +216,19 @@ def test_what_nothing_checks_or_something_doubts_is_used_with_care(result, tmp_p
     assert outcome(gap).usability is Usability.USABLE
 
 
-def test_where_every_export_was_refused_the_next_step_is_why(result, tmp_path):
+def test_where_the_export_that_is_next_was_refused_the_next_step_is_why(result, tmp_path):
+    """The command would be refused again."""
     why = f"{tmp_path}: its numbers are not fit to export: mass 2 is its lower bound; fit again"
     refused, written = (
         ExportRecord(format="sdf", refused=why),
         ExportRecord(format="yaml", file="a"),
     )
-    words, command = next_step(result, outcome(result), tmp_path, (refused,))
-    assert words == "Its numbers are not fit to export: mass 2 is its lower bound."
-    assert command.startswith("tune report")
-    assert next_step(result, outcome(result), tmp_path, (refused, written))[0].startswith("Put")
+    for exports in ((refused,), (refused, written)):
+        words, command = next_step(result, outcome(result), tmp_path, exports)
+        assert words == "Its numbers are not fit to export: mass 2 is its lower bound."
+        assert command.startswith("tune report")
+    other = refused.model_copy(update={"format": "px4"})
+    assert next_step(result, outcome(result), tmp_path, (other, written))[0].startswith("Put")
     assert outcome(result, exports=(refused,)).usability is Usability.WITH_CARE
     assert outcome(result, exports=(refused, written)).usability is Usability.USABLE
 
