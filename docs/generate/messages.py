@@ -61,7 +61,14 @@ STAGES: Mapping[str, tuple[str, ...]] = {
         *("attitude_followed", "spins_reversed", "rotor_changed"),
     ),
     "Before the search": (
-        *("same_recording", "vehicle_not", "mass_not", "wrong_vehicle", "cannot_hover"),
+        *(
+            "same_recording",
+            "vehicle_not",
+            "mass_not",
+            "wrong_vehicle",
+            "cannot_hover",
+            "rotors_stop",
+        ),
         "lifts_otherwise",
         *("still_axes", "no_yaw", "implausible", "start_on_bound"),
         *("not_finite", "nothing_has", "no_effect", "singular", "setpoints", "heading_flown"),
@@ -120,6 +127,8 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "or filters are not those of the controller file, the autopilot sits askew, its gyro's scale "
     "is off, or rotor speeds were filtered. The line says by how much, what to compare, and which "
     "other term the flights do not tell from it.",
+    Code.ROTORS_STOP: "Recorded rotors stop at some speed whatever more is commanded, and the "
+    "vehicle file has them stop at another. Set motor.max_rotor_velocity there.",
     Code.ROTORS_UNEQUAL: "Rotors would differ in thrust at the same speed by 9 % and more, which "
     "rotors of a kind do not. A vehicle file with the rotors elsewhere than they sit makes them "
     "seem so, and forces and inertia are wrong with it. Measure where they sit, and look at the "

@@ -106,6 +106,14 @@ class Code(CodeWithText):
         ),
         GIVE_VEHICLE,
     )
+    ROTORS_STOP = (
+        "rotors_stop",  # limit, allowed (rad/s)
+        (
+            "Rotors stop at {limit:.0f} rad/s whatever more is commanded, and the vehicle file "
+            "has them stop at {allowed:.0f} rad/s: lags and torques make up for it."
+        ),
+        "Set motor.max_rotor_velocity to {limit:.0f} in the vehicle file.",
+    )
     DSHOT_OR_PULSES = (
         "dshot_or_pulses",  # pulses, dshot (times the weight)
         (

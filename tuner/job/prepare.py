@@ -36,7 +36,13 @@ from tuner.equation_error.recorded_accelerations import (
 from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import VOLTAGE
 from tuner.objective.inlets import INLETS, bypassed_by, is_sparse
-from tuner.objective.rotor_signals import Source, dshot_lift, order_findings, squared_speed
+from tuner.objective.rotor_signals import (
+    Source,
+    dshot_lift,
+    order_findings,
+    rotor_limit,
+    squared_speed,
+)
 from tuner.objective.setpoints import setpoint_findings
 from tuner.objective.space import extended
 from tuner.objective.trajectory import build_publishers
@@ -68,6 +74,8 @@ YAWING_WINDOW_S = 0.1
 """Over which the yaw rate is averaged that an attitude shows."""
 MAX_NAMED_FLIGHTS = 3
 """Largest number of flights that a finding names one by one."""
+MAX_LIMIT_DEVIATION = 0.05
+"""Of the rotors' limit from the vehicle file's."""
 MAX_LIFT_RATIO = 3.0
 """Largest ratio of lift and weight, either way: commands lift more on a full battery, and scaling
 laws give thrust to a few tens of percent."""
@@ -140,6 +148,7 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
         *_default_mass(job),
         *_no_tachometer(job),
         *_wrong_vehicle(job),
+        *_rotor_limit(job),
         *_commands_as_dshot(job),
         *_lift_changes(job),
         *_excitation(job),
@@ -250,6 +259,14 @@ def _wrong_vehicle(job: Job) -> Iterator[Finding]:
             yield Code.CANNOT_HOVER.warning(
                 vehicle.name, idle=idle, full=full, weight=weight, mass=vehicle.mass
             )
+
+
+def _rotor_limit(job: Job) -> Iterator[Finding]:
+    """Warn of rotors that stop at another speed than the vehicle file's limit."""
+    allowed = job.settings.vehicle.motor.max_rotor_velocity
+    limit = rotor_limit(job.fitted)
+    if limit is not None and abs(limit / allowed - 1.0) > MAX_LIMIT_DEVIATION:
+        yield Code.ROTORS_STOP.warning("motors", limit=limit, allowed=allowed)
 
 
 def _commands_as_dshot(job: Job) -> Iterator[Finding]:

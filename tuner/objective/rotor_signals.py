@@ -147,6 +147,10 @@ HIGH_PASS_HZ = 2.0
 """Frequency below which turning is filtered out: drag has a part in it."""
 MIN_CORRELATION = 0.4
 """Least correlation about roll and pitch of an accepted order."""
+SETTLED_S = 0.1
+"""A command that has held for so many s is followed."""
+BEYOND_LIMIT, MIN_AT_LIMIT = 1.1, 20
+"""Least speed asked for over the rotors' limit, and samples of that."""
 LEAST_SHARE = 1e-12
 """Share of two signals' squares, multiplied, below which a part of them is rounding errors."""
 RESPONSE_LAGS = 40.0
@@ -307,6 +311,41 @@ def order_findings(
     if order.fields != tuple(sorted(order.fields)):
         return (Code.MOTOR_ORDER.warning(name, *order.fields),)
     return (Code.SPINS_REVERSED.warning(name),)
+
+
+def rotor_limit(flights: Sequence[Flight]) -> float | None:
+    """Return the speed, rad/s, at which rotors stop whatever more is commanded; None if unseen.
+
+    Commands that have held for `SETTLED_S` ask, by the line through the others, for more than
+    `BEYOND_LIMIT` of it.
+    """
+    least, means, speeds = [], [], []
+    for flight in flights:
+        if not set(PER_MOTOR) <= set(flight.series):
+            continue
+        rotors = flight.series["rotor_speed"]
+        inside = (rotors.time >= 0.0) & (rotors.time <= flight.duration)
+        asked = linear_interpolation(flight.series["command"], rotors.time[inside])
+        length = max(1, round(SETTLED_S * rotors.rate))
+        if inside.sum() < length + MIN_SAMPLES:
+            continue
+        before = sliding_window_view(asked, length, axis=0)
+        least.append(before.min(axis=-1).ravel())
+        means.append(before.mean(axis=-1).ravel())
+        speeds.append(rotors.values[inside][length - 1 :].ravel())
+    if not speeds:
+        return None
+    held, mean, speed = (np.concatenate(parts) for parts in (least, means, speeds))
+    known = np.isfinite(held) & np.isfinite(speed)
+    held, mean, speed = held[known], mean[known], speed[known]
+    top = float(np.quantile(speed, 0.999)) if len(speed) else 0.0
+    below = speed < top / BEYOND_LIMIT
+    if below.sum() < MIN_SAMPLES or np.ptp(mean[below]) == 0.0:
+        return None
+    slope, offset = np.polyfit(mean[below], speed[below], 1)
+    beyond = offset + slope * held > BEYOND_LIMIT * top
+    stopped = beyond.sum() >= MIN_AT_LIMIT and np.mean(speed[beyond] > 0.95 * top) > 0.9
+    return float(np.median(speed[beyond])) if stopped else None
 
 
 def columns_of_rotors(vehicle: VehicleFile, notes: Sequence[Note]) -> list[int] | None:

@@ -58,6 +58,7 @@ WRONG_INPUT_CODES = WRONG_VEHICLE_CODES | {
     Code.LIFTS_OTHERWISE,
     Code.DSHOT_OR_PULSES,
     Code.STAMPED_LATE,
+    Code.ROTORS_STOP,
 }
 """Warnings of inputs other than the flown ones: all numbers depend on them."""
 CONFLICT_CODES = WRONG_INPUT_CODES | {

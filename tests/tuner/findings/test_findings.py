@@ -202,6 +202,9 @@ MADE = {
         {"thrust_exponent": 1.93, "thrust_exponent_error": 0.004},
         ("thrust_exponent",),
     ),
+    Code.ROTORS_STOP: Finding(
+        Code.ROTORS_STOP, "warning", "motors", {"limit": 720.0, "allowed": 1100.0}
+    ),
     Code.ROTORS_UNEQUAL: Finding(
         Code.ROTORS_UNEQUAL,
         "warning",

@@ -8,7 +8,13 @@ import pytest
 from lanes.program import _program_of
 from tuner.core.shipped import configs_folder
 from tuner.objective.rotor_response import MotorLags, rotor_speeds
-from tuner.objective.rotor_signals import commands_of, levers, squared_speed, with_commands
+from tuner.objective.rotor_signals import (
+    commands_of,
+    levers,
+    rotor_limit,
+    squared_speed,
+    with_commands,
+)
 from tuner.recordings.flight import Series
 from tuner.recordings.notes import NoteCode
 from tuner.vehicle import ControllerFile, read_vehicle
@@ -86,3 +92,34 @@ def test_only_a_flight_without_commands_gets_them(flight, updated):
     assert made.notes[-1].code is NoteCode.COMMAND_DERIVED
     assert np.ptp(command[np.isfinite(command)]) < 1e-9
     assert command[10, 0] == pytest.approx((np.sqrt(9.81 * 2.243 / 4 / 1.45e-5) - 100) / 950)
+
+
+# rotors that stop at a limit
+
+
+@pytest.mark.parametrize(
+    ("limit", "lag", "highest", "found"),
+    [
+        (720.0, 0.02, 1.0, 720.0),
+        (1100.0, 0.02, 1.0, None),  # at full command they are there
+        (720.0, 0.02, 0.6, None),  # nothing asks for more
+        (2000.0, 0.15, 1.0, None),  # slow rotors are on their way
+    ],
+)
+def test_rotors_that_stop_whatever_more_is_commanded_show_their_limit(
+    flight, limit, lag, highest, found
+):
+    random, rate = np.random.default_rng(0), 100.0
+    time = np.arange(0.0, flight.duration, 1.0 / rate)
+    levels = np.clip(0.55 + 0.15 * random.normal(size=(len(time) // 30 + 1, 4)), 0.3, highest)
+    levels[::8] = highest
+    command = levels.repeat(30, axis=0)[: len(time)]
+    share, speed = 1.0 - np.exp(-1.0 / rate / lag), 100.0 + 1000.0 * command
+    speed = np.minimum(speed, limit)
+    for row in range(1, len(speed)):
+        speed[row] = speed[row - 1] + share * (speed[row] - speed[row - 1])
+    speed = speed + 2.0 * random.normal(size=speed.shape)
+    series = {"command": Series(time, command), "rotor_speed": Series(time, speed)}
+    seen = rotor_limit([replace(flight, series=series)])
+    assert seen == (None if found is None else pytest.approx(found, rel=0.01))
+    assert rotor_limit([replace(flight, series={"command": series["command"]})]) is None
