@@ -16,6 +16,7 @@ from typing import NoReturn
 
 from cyclopts import App, CycloptsError
 
+from tuner.cli.ending import end_with, ended_in_words, interruption_behind, listen_for_signals
 from tuner.cli.tune import MANY_WORDS, TYPED_WORDS, tune
 from tuner.core.errors import InputError, ServerFaultError, did_you_mean
 from tuner.core.phrases import printable
@@ -144,13 +145,13 @@ app.default(tune)
 DONE = 0
 INTERNAL_ERROR = 1
 WRONG_INPUT = 2
-INTERRUPTED = 130
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def program() -> NoReturn:
     """Be the process `tune`: run it, and end with its exit status."""
-    sys.exit(main())
+    listen_for_signals()
+    end_with(main())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -183,16 +184,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _print_error(str(error), WRONG_INPUT)
     except CycloptsError as error:
         return _print_error(f"{' '.join(str(error).split())} See {_help(given)}.", WRONG_INPUT)
-    except KeyboardInterrupt:
-        return _print_error("interrupted", INTERRUPTED)
     except BrokenPipeError:
         sys.stderr.close()  # whoever read our output has gone; nothing is left to say
-    except Exception as error:
+    except (KeyboardInterrupt, Exception) as error:
+        interruption = interruption_behind(error)
+        if interruption is not None:
+            return _print_error(*ended_in_words(interruption))
         return _report_internal_error(error)
     return status
 
 
-def _report_internal_error(error: Exception) -> int:
+def _report_internal_error(error: BaseException) -> int:
     """Report what no part of the program answers for, the full disk of a redirected output too."""
     if isinstance(error, OSError) and error.errno in DISK_FULL:
         return _print_error("the disk is full; free some space and try again", WRONG_INPUT)
