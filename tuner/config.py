@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
-from annotated_types import Ge, Interval, Le, Len
+from annotated_types import Interval, Le, Len
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from tuner.core.disk import exists, find_flights
@@ -23,14 +23,14 @@ from tuner.core.yaml_section import (
     Positive,
     Section,
     Whole,
-    build,
+    build_options,
     config_error,
     read_model,
     refuse,
     section_of,
 )
 from tuner.ground.measurement import joint_prior
-from tuner.options import FILES, IN_JOB_FILE, FlightOptions, Method, Options
+from tuner.options import FILES, IN_JOB_FILE, MAX_SEED, FlightOptions, Method, Options
 from tuner.vehicle import COEFFICIENTS, condition_rows, term_groups
 from tuner.vehicle.controller import ControllerFile, read_controller
 from tuner.vehicle.joint_prior import JointPrior
@@ -145,7 +145,7 @@ class Search(Section):
 
     method: Method = "auto"
     criterion: ErrorKind = "auto"
-    seed: Annotated[Whole, Ge(0)] = 0
+    seed: Annotated[Whole, Interval(ge=0, le=MAX_SEED)] = 0
     starts: Annotated[Whole, Interval(ge=1, le=1024)] = 1
     spread: Annotated[Number, Interval(gt=1, le=10)] = 2.0
     robust: Literal["huber", "none"] = "huber"
@@ -162,6 +162,9 @@ def _known_shape(name: str) -> str:
 
 
 TrajectoryName = Annotated[str, AfterValidator(_known_shape)]
+
+
+MAX_SPEED_SCALE = 1e4
 
 
 class TrajectorySettings(Section):
@@ -182,10 +185,10 @@ class TrajectorySettings(Section):
     """
 
     name: TrajectoryName
-    radius: Positive = 2.0
-    omega: Positive = 0.7
-    speed_scale: Positive = 2.1
-    yaw_rate: Number = 2.0
+    radius: Annotated[Number, Interval(gt=0, le=1e4)] = 2.0
+    omega: Annotated[Number, Interval(gt=0, le=1e3)] = 0.7
+    speed_scale: Annotated[Number, Interval(gt=0, le=MAX_SPEED_SCALE)] = 2.1
+    yaw_rate: Annotated[Number, Interval(ge=-1e3, le=1e3)] = 2.0
 
 
 class FlightSettings(Section):
@@ -399,7 +402,7 @@ def resolve_settings(asked: FlightOptions, *, fits: bool = True) -> Settings:
         A path, name or value cannot be used.
     """
     given = {name: value for name, value in vars(asked).items() if name not in FILES}
-    build(section_of(type(asked), leaving=FILES), given, "command line")
+    build_options(section_of(type(asked), leaving=FILES), given)
     known: dict[str, Any] = {f.name: getattr(asked, f.name, f.default) for f in fields(Options)}
     options = asked if isinstance(asked, Options) else Options(**known)
     flights = find_flights(options.flights)

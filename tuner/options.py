@@ -22,7 +22,7 @@ from typing import (
     get_type_hints,
 )
 
-from annotated_types import Ge, Gt, Interval, Le
+from annotated_types import Gt, Interval, Le
 
 from tuner.core.errors import ConfigError, did_you_mean
 
@@ -44,6 +44,8 @@ MODELS = ("vehicle", "controller")
 """Options that name a file or, from Python, may be what such a file holds."""
 PATHS = ("into", "out")
 """Options that name what is written."""
+MAX_SEED = 2**31 - 1
+"""The libraries that draw random numbers take 32 bits, and searches add a little to a seed."""
 IN_JOB_FILE: Mapping[str, str] = {"fit": "free", "fix": "fixed", "global_": "global_method"}
 """Option -> what the job file, and Python, call it where that differs."""
 
@@ -131,7 +133,7 @@ class FitOptions(VehicleOptions):
     """Evaluate these flights without fitting them."""
     method: Method | None = None
     """Search with this method. Default: the job file's, else auto."""
-    seed: Annotated[int, Ge(0)] | None = None
+    seed: Annotated[int, Interval(ge=0, le=MAX_SEED)] | None = None
     """Start the random numbers from this seed. Default: the job file's, else 0."""
     force: bool = False
     """Search even where the check before the search reports a failure."""
@@ -165,7 +167,7 @@ class ExaminationOptions(RunOptions, VehicleOptions):
 
     global_: Literal["morris", "sobol"] | None = None
     """Also compute the indices of Morris or Sobol over the range of the coefficients."""
-    samples: Annotated[int, Ge(2)] | None = None
+    samples: Annotated[int, Interval(ge=2, le=100_000)] | None = None
     """Compute them from this many trajectories (Morris, default 16) or base points (Sobol, 64)."""
     span: Annotated[float, Interval(gt=0, le=1000)] = 30.0
     """Vary coefficients without bounds in the job file by this many percent for them."""

@@ -115,7 +115,7 @@ def test_an_option_is_one_field_for_the_command_line_python_the_job_file_and_htt
     assert typed == MoreOptions.of(flights=[bag], starts=3)
     settled = resolve_settings(typed).job.search
     assert (settled.starts, settled.seed) == (3, 7)
-    with pytest.raises(ConfigError, match="command line: starts is 9; it should be at most 8"):
+    with pytest.raises(ConfigError, match="--starts: is 9; it should be at most 8"):
         resolve_settings(MoreOptions([str(bag)], starts=9))
     with pytest.raises(ConfigError, match="options: starts is 9; it should be at most 8"):
         MoreOptions.of(flights=[bag], starts=9)

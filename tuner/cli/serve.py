@@ -94,9 +94,14 @@ def _serve(
 
     if not 0 <= port < 2**16:
         raise InputError("--port", f"{port} is no port", "name one from 1 to 65535")
-    for option, value in (("workers", workers), ("max-upload", max_upload), ("memory", memory)):
-        if not value > 0:
-            raise InputError(f"--{option}", f"is {value}", "give a number above zero")
+    for option, value, most in (
+        ("workers", workers, 1000),
+        ("max-upload", max_upload, 1e6),
+        ("memory", memory, 1e6),
+    ):
+        if not 0 < value <= most:
+            remedy = f"give a number above zero, up to {most:.0f}"
+            raise InputError(f"--{option}", f"is {value}", remedy)
     for name in allow_host:
         if not re.fullmatch(r"[A-Za-z0-9.-]+", name):
             raise InputError("--allow-host", f"'{name}' is no host name", "write tune.lab.example")

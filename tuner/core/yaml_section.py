@@ -431,6 +431,26 @@ def build(kind: type[M], values: Mapping[str, object], where: str) -> M:
         raise config_error(error, Path(where)) from None
 
 
+def build_options(kind: type[M], values: Mapping[str, object]) -> M:
+    """Make a model of options, as `build` does.
+
+    Raises
+    ------
+    ConfigError
+        In one line: the option, its value, what it should be.
+    """
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        details = error.errors(include_url=False)
+        what, remedy = first_complaint(details)
+        place = tuple(str(key) for key in _keys(details[0]["loc"]))
+        option = place[0] if place[-1] == "name" else place[-1]
+        words = what.removeprefix(f"{dotted(place)} ")
+        where = f"--{option.rstrip('_').replace('_', '-')}"
+        raise ConfigError(where, words, remedy) from None
+
+
 def section_of(options: type, *, leaving: Collection[str] = (), text: Any = str) -> type[Section]:
     """Return a model that checks the fields of a dataclass.
 

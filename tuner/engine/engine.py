@@ -25,7 +25,7 @@ from pydantic import StringConstraints, model_validator
 
 from tuner.core.errors import ConfigError
 from tuner.core.runtime import extra
-from tuner.core.yaml_section import Section, Whole, build, read_model, refuse
+from tuner.core.yaml_section import Section, Whole, build, build_options, read_model, refuse
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -297,7 +297,7 @@ def cluster_for(workers: int | None, cluster: str | None) -> ClusterFile | None:
         They contradict each other, or the cluster file cannot be used.
     """
     if cluster is None:
-        return None if workers is None else build(ClusterFile, {"workers": workers}, "--workers")
+        return None if workers is None else build_options(ClusterFile, {"workers": workers})
     if workers is not None:
         raise ConfigError("--workers", "cannot stand beside --cluster", "give one of them")
     return read_cluster(cluster)

@@ -38,7 +38,7 @@ from tuner.core.errors import InputError, did_you_mean
 from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.core.shipped import find_config
-from tuner.core.yaml_section import Number, Section, build
+from tuner.core.yaml_section import Number, Section, build_options
 from tuner.engine import InProcessEngine, Report, current
 from tuner.objective.simulation import (
     BODY_ATTITUDE,
@@ -206,11 +206,10 @@ def fly(
     """
     entries = vars(options)
     shape = {name: entries[name] for name in TrajectorySettings.model_fields if name != "name"}
-    plan = build(
+    plan = build_options(
         Plan,
         {name: entries[name] for name in Plan.model_fields}
         | {"trajectory": {"name": options.trajectory, **shape}},
-        "command line",
     )
     if plan.duration * plan.rate < 1.0:
         what = f"{plan.duration:g} s hold no two samples at {plan.rate:g} Hz"

@@ -17,7 +17,7 @@ from sim_jax.geometry import Vec3
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.numeric import Array, Scalar
 from sim_jax.trajectory import TICK_RATE, Shape, publish, shapes
-from tuner.config import TrajectorySettings
+from tuner.config import MAX_SPEED_SCALE, TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.objective.criterion import picked
 from tuner.objective.simulation import CODE
@@ -138,7 +138,8 @@ def at_speed(settings: TrajectorySettings, speed: float) -> TrajectorySettings:
     peak = shapes()[settings.name].peak_speed
     if not peak:
         raise InputError("--speed", f"{settings.name} stays in one place", "leave it out")
-    scale = speed / (peak * settings.radius * settings.omega)
-    if not 0 < scale < math.inf:
-        raise InputError("--speed", f"{speed:g} m/s is no speed", "give m/s above zero")
-    return settings.replace(speed_scale=scale)
+    per_scale = peak * settings.radius * settings.omega
+    if not 0 < speed <= MAX_SPEED_SCALE * per_scale:
+        remedy = f"give m/s above zero, up to {MAX_SPEED_SCALE * per_scale:g}"
+        raise InputError("--speed", f"{speed:g} m/s is no speed", remedy)
+    return settings.replace(speed_scale=speed / per_scale)

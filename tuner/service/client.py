@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -37,6 +38,7 @@ from tuner.vehicle.controller import read_controller
 Named = str | Path
 Event = tuple[str, dict[str, Any]]
 API = "/api/v1"
+UNNAMED = "the server"
 DEFAULT_SERVER = "http://127.0.0.1:8000"
 EVENT_STREAM = "text/event-stream"
 MAX_SILENCE_S = 60.0
@@ -62,9 +64,9 @@ class Client:
     def __init__(self, url: str | None = None, token: str | None = None) -> None:
         with extra("service", "--server"):
             import httpx  # noqa: PLC0415 (an extra)
-        url = url or os.environ.get("TUNE_SERVER") or DEFAULT_SERVER
+        self._named_by, url = _first(("--server", url), "TUNE_SERVER", UNNAMED, DEFAULT_SERVER)
         self.url = url.rstrip("/")
-        token = token or os.environ.get("TUNE_TOKEN") or ""
+        self._token_by, token = _first(("--token", token), "TUNE_TOKEN", "", "")
         if not (token.isascii() and token.isprintable()):
             raise self._no_token()
         try:
@@ -73,7 +75,7 @@ class Client:
                 raise ValueError(url)
         except (ValueError, httpx.InvalidURL):
             what = f"{url!r} is no address"
-            raise InputError("--server", what, f"write {DEFAULT_SERVER}") from None
+            raise InputError(self._named_by, what, f"write {DEFAULT_SERVER}") from None
         self._errors = httpx.RequestError
         self._http = httpx.Client(
             base_url=self.url,
@@ -316,21 +318,44 @@ class Client:
             raise self._no_token()
         if answer.status_code == 500:
             raise ServerFaultError(f"{self.url}: {what}; {remedy}")
-        raise InputError(where, what, remedy)
+        passes = answer.status_code in PASSING
+        raise (PassingError if passes else InputError)(where, what, remedy)
 
-    def _unreachable(self, error: Exception) -> InputError:
-        return InputError(
-            "--server",
-            f"{self.url} cannot be reached ({error})",
-            "check the address, or start a server with: tune serve",
-        )
+    def _unreachable(self, error: Exception) -> PassingError:
+        why = _OF_LIBRARIES.sub("", str(error)).strip() or "no answer"
+        remedy = "check the address, and that tune serve runs there"
+        if self._named_by == UNNAMED:
+            remedy = "start it with tune serve, or name another with --server or TUNE_SERVER"
+        return PassingError(self._named_by, f"{self.url} cannot be reached ({why})", remedy)
 
     def _no_token(self) -> InputError:
+        if not self._token_by:
+            remedy = "ask who runs it for one, and set TUNE_TOKEN"
+            return InputError(self._named_by, f"{self.url} demands a token", remedy)
         remedy = "ask who runs it, and set TUNE_TOKEN"
-        return InputError("--token", f"is not known to {self.url}", remedy)
+        return InputError(self._token_by, f"is not known to {self.url}", remedy)
 
     def _not_a_service(self) -> InputError:
-        return InputError("--server", f"{self.url} is no tuning service", "check the address")
+        return InputError(self._named_by, f"{self.url} is no tuning service", "check the address")
+
+
+class PassingError(InputError):
+    """A refusal that may pass by itself: the server is away, ending, busy or full."""
+
+
+PASSING = (429, 503, 507)
+"""Statuses of such refusals."""
+_OF_LIBRARIES = re.compile(r"\[[^]]*\]|\(_ssl\.c:\d+\)")
+"""Numbers and places in what a system's or a library's error says."""
+
+
+def _first(option: tuple[str, str | None], variable: str, *usual: str) -> tuple[str, str]:
+    """Return where a value comes from, and the value: an option, the environment, or as usual."""
+    named, value = option
+    if value:
+        return named, value
+    value = os.environ.get(variable)
+    return (variable, value) if value else (usual[0], usual[1])
 
 
 class _AnswerFields(dict[str, Any]):
@@ -472,6 +497,7 @@ PARAMETER_FILES: Mapping[str, Callable[[Path], Section]] = {
 
 SUFFIXES = {suffix for reader in READERS for suffix in reader.suffixes}
 """Of recordings in a folder that is watched."""
+MAX_SETTLE_S = 86400.0
 LOOK_INTERVAL_S = 2.0
 """Between two looks into the folder."""
 Marks = tuple[int, int]
@@ -509,11 +535,14 @@ def watch(
     InputError
         The folder is none or, with ``once``, the job is refused.
     """
+    if not 0 <= settle <= MAX_SETTLE_S:
+        raise InputError("--settle", f"is {settle:g}", f"give 0 to {MAX_SETTLE_S:g} s")
     if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "name the folder that recordings arrive in")
     seen: Mapping[Path, Marks] = {}
     still_since = time.monotonic()
     refused: Mapping[Path, Marks] = {}
+    told = ""
     while True:
         new = _new_recordings(folder)
         if new != seen:
@@ -522,12 +551,15 @@ def watch(
         if new and settled and new != refused:
             try:
                 say(_submit(client, folder, new, say))
-                refused = {}
+                refused, told = {}, ""
             except InputError as error:
                 if once:
                     raise
-                say(f"tune: {error}")
-                refused = {} if error.where == "--server" else new
+                line = f"tune: {error}"
+                if line != told:  # of a server that is away all night, once
+                    say(line)
+                told = line
+                refused = {} if isinstance(error, PassingError) else new
         if once and (not new or settled):
             return
         time.sleep(min(LOOK_INTERVAL_S, settle) if new else LOOK_INTERVAL_S)

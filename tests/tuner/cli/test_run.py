@@ -33,6 +33,10 @@ def test_the_version_is_printed(capsys):
     assert capsys.readouterr().out.strip()
 
 
+WORKERS = "tune: --workers: is 0; it should be at least 1\n"
+RADIUS = "tune: --radius: is 1000000000.0; it should be at most 10000.0\n"
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -42,6 +46,9 @@ def test_the_version_is_printed(capsys):
         (["lab/a.bag"], "for a fit write: tune --flights lab/a.bag"),
         (["simulate", "--trajectory", "square", "--out", "x.csv"], "no trajectory 'square'"),
         (["simulate", "--trajectory", "circle", "--rate", "fast", "--out", "x.csv"], "--rate"),
+        (["simulate", "--trajectory", "circle", "--workers", "0", "--out", "x.csv"], WORKERS),
+        (["simulate", "--trajectory", "circle", "--radius", "1e9", "--out", "x.csv"], RADIUS),
+        (["simulate", "--trajectory", "circle", "--speed", "1e9", "--out", "x.csv"], "--speed: 1"),
         (["simulate", "--trajectory", "circle", "--workers", "1.7", "--out", "x.csv"], '"1.7"'),
         (["simulate", "--trajectory", "circle", "--oot", "x.csv"], "--out"),
         (["simulate", "--trajectory", "circle", "--out", "x.csv", "extra"], "extra"),

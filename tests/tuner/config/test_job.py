@@ -63,6 +63,7 @@ def test_paths_count_from_the_job_file_and_bare_names_are_shipped_files(tmp_path
         ("priors: {mass: 2}", "unknown key 'priors'; known are channels, "),
         ("vehicle: hovergame", "did you mean 'hovergames'?"),
         ("free: [motor_constan]", "unknown coefficient 'motor_constan'; did you mean"),
+        ("search: {seed: 12345678901}", "search.seed is 12345678901; it should be at most"),
         ("mass: 2243", "mass is 2243; it should be at most 500"),
         ("free: [mass]\nfixed: [mass]", "both 'free' and 'fixed' are given"),
         ("terms: [linear_drag]\nfixed: [linear_drag_y]", "'linear_drag_y' is both among terms and"),

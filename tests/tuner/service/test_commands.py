@@ -18,7 +18,7 @@ from tuner.core.errors import InputError, ServerFaultError
 from tuner.options import Options
 from tuner.result import Run
 from tuner.service import client as client_module
-from tuner.service.client import Client, job_request_of
+from tuner.service.client import Client, PassingError, job_request_of, watch
 
 
 @pytest.fixture
@@ -95,17 +95,24 @@ def test_a_job_that_fails_ends_the_command_as_it_would_here(table, capsys, wish,
     ("arguments", "expected"),
     [
         (["jobs", "--server", "nowhere"], "--server: 'nowhere' is no address; write http://"),
-        (["jobs", "--server", "http://127.0.0.1:1"], "cannot be reached"),
+        (
+            ["jobs", "--server", "http://127.0.0.1:1"],
+            "--server: http://127.0.0.1:1 cannot be reached (Connection refused); check",
+        ),
         (["jobs", "--server", "http://lab:x"], "--server: 'http://lab:x' is no address; write"),
         (["jobs", "--server", "http://[::1"], "--server: 'http://[::1' is no address; write"),
         (["jobs", "--server", f"http://{'a' * 64}"], "is no address; write http://"),
         (["jobs", "--token", "tüne"], "--token: is not known to http://"),
+        (["watch-folder", ".", "--settle", "nan"], "--settle: is nan; give 0 to 86400 s"),
         (["watch", "nobody"], "job nobody: is not known here; list the jobs with tune jobs"),
         (["jobs", "--after", "nobody"], "job nobody: is not known here"),
         (["submit", "--flights", "no.bag"], "no.bag: does not exist; check the path"),
         (["watch-folder", "nowhere"], "nowhere: is no folder"),
         (["serve", "--port", "99999"], "--port: 99999 is no port"),
-        (["serve", "--workers", "0"], "--workers: is 0; give a number above zero"),
+        (["serve", "--workers", "0"], "--workers: is 0; give a number above zero, up to 1000"),
+        (["serve", "--workers", f"{10**23}"], "give a number above zero, up to 1000"),
+        (["serve", "--max-upload", "inf"], "--max-upload: is inf; give a number above zero"),
+        (["serve", "--memory", "1e300"], "--memory: is 1e+300; give a number above zero"),
         (["serve", "token", "remove", "bob"], "'bob' has none"),
     ],
 )
@@ -116,6 +123,66 @@ def test_wrong_input_is_one_line_and_status_2(arguments, expected, capsys, monke
     assert out == ""
     assert err.count("\n") == 1
     assert expected in err
+
+
+AWAY = "cannot be reached (Connection refused)"
+CHECK = "check the address, and that tune serve runs there"
+START = "start it with tune serve, or name another with --server or TUNE_SERVER"
+
+
+@pytest.mark.parametrize(
+    ("server", "said"),
+    [
+        (
+            None,
+            f"the server: http://127.0.0.1:1 {AWAY}; {START}",
+        ),
+        (
+            "http://127.0.0.1:2",
+            f"TUNE_SERVER: http://127.0.0.1:2 {AWAY}; {CHECK}",
+        ),
+        ("lab", "TUNE_SERVER: 'lab' is no address; write http://127.0.0.1:1"),
+    ],
+)
+def test_a_server_is_called_as_the_user_named_it(server, said, capsys, monkeypatch):
+    monkeypatch.setattr("tuner.service.client.DEFAULT_SERVER", "http://127.0.0.1:1")
+    monkeypatch.delenv("TUNE_SERVER", raising=False)
+    if server is not None:
+        monkeypatch.setenv("TUNE_SERVER", server)
+    assert main(["jobs"]) == 2
+    assert capsys.readouterr().err == f"tune: {said}\n"
+
+
+def test_a_server_that_is_away_is_told_once_and_waited_for(tmp_path, table, monkeypatch):
+    (tmp_path / "a.csv").write_bytes(table.read_bytes())
+    asked: list[int] = []
+    said: list[str] = []
+
+    def submitted(*_: object) -> str:
+        asked.append(1)
+        if len(asked) < 4:
+            raise PassingError("the server", "has no space left", "free some space and try again")
+        return "a.csv: job 1"
+
+    def stop_then(_: float) -> None:
+        if len(asked) == 4:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("tuner.service.client._submit", submitted)
+    monkeypatch.setattr("tuner.service.client.time.sleep", stop_then)
+    with pytest.raises(KeyboardInterrupt):
+        watch(tuner.connect(), tmp_path, settle=0, once=False, say=said.append)
+    refused = "tune: the server: has no space left; free some space and try again"
+    assert said == [refused, "a.csv: job 1"]
+
+
+@pytest.mark.parametrize(("status", "kind"), [(507, PassingError), (409, InputError)])
+def test_refusals_that_pass_are_told_from_others(status, kind):
+    content = {"where": "the server", "what": "is full", "remedy": "wait"}
+    answer = httpx.Response(status, json=content)
+    with pytest.raises(InputError) as refused:
+        tuner.connect("http://lab")._check(answer)
+    assert type(refused.value) is kind
 
 
 def test_the_client_gives_what_fit_gives(server, table, tmp_path, updated):
