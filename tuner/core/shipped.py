@@ -57,7 +57,7 @@ def find_config(kind: Kind, reference: str, base: Path) -> Path:
     if reference not in known:
         raise ConfigError(
             reference,
-            f"is neither a file nor one of the shipped {kind}",
+            f"is neither a file nor one of the shipped {kind.replace('topics', 'topic maps')}",
             did_you_mean(reference, known),
         )
     return known[reference]

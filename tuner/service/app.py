@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import logging
+import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -15,6 +16,7 @@ import uvicorn
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from sqlalchemy import make_url
 from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp
@@ -25,7 +27,7 @@ from tuner.core.runtime import installed
 from tuner.core.yaml_section import first_complaint
 from tuner.engine.engine import engine_for
 from tuner.service import tokens
-from tuner.service.errors import ServiceError, over_http
+from tuner.service.errors import ServiceError, on_the_web, over_http
 from tuner.service.http import api, watching
 from tuner.service.safety import Guard
 from tuner.service.service import Service
@@ -128,7 +130,8 @@ def _problem(request: Request, status: int, where: str, what: str, remedy: str) 
     """Return a refusal as a page, or as JSON."""
     detail = " ".join(f"{where}: {what}; {remedy}".split())
     if _wants_page(request):
-        return render("problem.html.jinja", status, title="This does not work", sentence=detail)
+        sentence = on_the_web(detail)
+        return render("problem.html.jinja", status, title="This does not work", sentence=sentence)
     where, what, remedy, detail = map(over_http, (where, what, remedy, detail))
     problem = Problem(where=where, what=what, remedy=remedy, detail=detail)
     headers = {"retry-after": "5"} if status in (429, 503) else {}
@@ -183,6 +186,8 @@ class _Server(uvicorn.Server):
         if self.started:
             port = self.servers[0].sockets[0].getsockname()[1]
             host = self.config.host
+            if host in ("0.0.0.0", "::"):  # all addresses: what others type is a name
+                host = socket.gethostname()
             self._say(f"Open http://{f'[{host}]' if ':' in host else host}:{port}/ in a browser.")
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
@@ -253,7 +258,10 @@ def _serve(service: Service, *, host: str, port: int, say: Callable[[str], None]
         timeout_graceful_shutdown=SHUTDOWN_S,
         h11_max_incomplete_event_size=2**16,
     )
-    say(f"Jobs and recordings are kept in {settings.data}.")
+    url = make_url(settings.database_url).render_as_string(hide_password=True)
+    table, store = settings.database and url, settings.store
+    places = f"Jobs are kept in {table or settings.data}, recordings in {store or settings.data}."
+    say(places if table or store else f"Jobs and recordings are kept in {settings.data}.")
     try:
         _Server(config, service, say).run()
     except SystemExit:

@@ -380,7 +380,9 @@ def is_success(job: dict[str, Any]) -> dict[str, Any]:
         The server could not finish it.
     """
     if job["state"] == "cancelled":
-        raise InputError(f"job {job['id']}", "was cancelled", "submit it again, or retry it")
+        raise InputError(
+            f"job {job['id']}", "was cancelled", "submit it again, or retry it on its page"
+        )
     if job["state"] != "failed":
         return job
     if job["exit_status"] == 2:

@@ -119,7 +119,7 @@ KEYS: Mapping[str, str] = {"config": "settings"}
 _OPTION = re.compile(rf"--({'|'.join(FIELD_PHRASES)})\b(?!-)( [A-Z]+\b)?")
 _ANY_OPTION = re.compile(r"--([a-z]+(?:-[a-z]+)*)\b")
 _REQUEST_FIELDS = {field.name for field in fields(Options)}
-_COMMAND = re.compile(r",? which tune inspect FILE --suggest begins")
+_COMMAND = re.compile(r",? which tune inspect FILE --suggest begins| with tune jobs$")
 
 
 def over_http(text: str) -> str:

@@ -36,7 +36,7 @@ def test_jobs_stand_in_order_with_their_intervals_and_days() -> None:
     assert panel.x_labels == ["2026-01-01"] * 2
     assert (interval.x, interval.y) == ((0, 0, 0, 1), (1.5, 2.5, None, None))
     assert (known.y, unknown.y) == ([2.0, None], [None, 3.0])
-    assert known.text[0] == "day: 2 ± 0.25 kg, from hop"
+    assert known.text[0] == "day: 2 kg, standard error 0.25, from hop"
     assert "<" not in charts_json([chart])  # no name ends the element that the charts stand in
     assert json.loads(charts_json([chart]))[0]["panels"][0]["marks"][2]["text"][1].startswith(name)
 

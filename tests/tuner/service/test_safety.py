@@ -255,6 +255,21 @@ def test_an_address_for_others_demands_a_token_before_it_is_served(settings):
         serve(replace(settings, demands_tokens=True), host="0.0.0.0", port=0, say=print)
 
 
+@pytest.mark.parametrize(
+    ("store", "said"),
+    [
+        ("", "Jobs and recordings are kept in {data}."),
+        ("{data}/else", "Jobs are kept in {data}, recordings in {data}/else."),
+    ],
+)
+def test_a_server_says_where_it_keeps_what(settings, store, said, monkeypatch):
+    monkeypatch.setattr(app._Server, "run", lambda server: server._service.close())
+    lines: list[str] = []
+    wanted = replace(settings, workers=0, store=store.format(data=settings.data))
+    serve(wanted, host="127.0.0.1", port=0, say=lines.append)
+    assert lines == [said.format(data=settings.data)]
+
+
 def test_a_visitor_asks_so_often_and_no_more():
     rate = RateLimit(per_second=1.0, burst=3)
     assert [rate.allows("a", 0.0) for _ in range(4)] == [True, True, True, False]

@@ -318,6 +318,11 @@ def test_a_card_has_the_page_s_fields_in_place_of_options(client):
     assert not re.search("--[a-z]", page)
 
 
+def test_a_refusal_on_a_page_names_no_command(client):
+    page = client.get("/jobs/nobody", headers={"accept": "text/html"})
+    assert (page.status_code, "list the jobs</" in page.text) == (404, True)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -327,6 +332,7 @@ def test_a_card_has_the_page_s_fields_in_place_of_options(client):
             "--fit: cannot stand beside --fix",
             "the setting 'free': cannot stand beside the setting 'fixed'",
         ),
+        ("job x: is not here; list the jobs with tune jobs", "job x: is not here; list the jobs"),
         ("--fitness and --mass-error are none", "--fitness and --mass-error are none"),
     ],
 )

@@ -163,8 +163,8 @@ def history_chart(name: str, history: CoefficientHistory) -> Chart:
     points = history.points
     ends = [(n, end) for n, point in enumerate(points) for end in (*(point.ci95 or ()), None)]
     texts = [
-        f"{point.name}: {figures(point.best)} ± {short(point.std_error)} {history.unit}, "
-        f"from {listed(point.flights)}"
+        f"{point.name}: {figures(point.best)} {history.unit}, standard error "
+        f"{short(point.std_error)}, from {listed(point.flights)}"
         for point in points
     ]
     places, values = zip(*ends, strict=True)
