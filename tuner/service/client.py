@@ -62,7 +62,7 @@ class Client:
     """
 
     def __init__(self, url: str | None = None, token: str | None = None) -> None:
-        with extra("service", "--server"):
+        with extra("service", "a tuning service"):
             import httpx  # noqa: PLC0415 (an extra)
         self._named_by, url = _first(("--server", url), "TUNE_SERVER", UNNAMED, DEFAULT_SERVER)
         self.url = url.rstrip("/")
@@ -318,8 +318,9 @@ class Client:
             raise self._no_token()
         if answer.status_code == 500:
             raise ServerFaultError(f"{self.url}: {what}; {remedy}")
-        passes = answer.status_code in PASSING
-        raise (PassingError if passes else InputError)(where, what, remedy)
+        if answer.status_code in PASSING:  # there, not here
+            raise PassingError(self.url, f"{where} {what}", remedy)
+        raise InputError(where, what, remedy)
 
     def _unreachable(self, error: Exception) -> PassingError:
         why = _OF_LIBRARIES.sub("", str(error)).strip() or "no answer"

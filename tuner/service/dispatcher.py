@@ -42,6 +42,25 @@ from tuner.service.settings import ServiceLimits, ServiceSettings
 from tuner.service.worker import RESULT_FOLDER, Assignment
 
 logger = logging.getLogger(__name__)
+SAID_AGAIN_AFTER_S = 600.0
+
+
+class _OnceInAWhile(logging.Filter):
+    """Lets no line through that was written a while ago: a full disk is met every second."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._written: dict[str, float] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        now, line = time.monotonic(), record.getMessage()
+        self._written = {
+            other: then for other, then in self._written.items() if now - then < SAID_AGAIN_AFTER_S
+        }
+        return self._written.setdefault(line, now) == now
+
+
+logger.addFilter(_OnceInAWhile())
 T = TypeVar("T")
 
 WORKER = [sys.executable, "-m", "tuner.service.worker"]

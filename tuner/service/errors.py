@@ -119,7 +119,8 @@ KEYS: Mapping[str, str] = {"config": "settings"}
 _OPTION = re.compile(rf"--({'|'.join(FIELD_PHRASES)})\b(?!-)( [A-Z]+\b)?")
 _ANY_OPTION = re.compile(r"--([a-z]+(?:-[a-z]+)*)\b")
 _REQUEST_FIELDS = {field.name for field in fields(Options)}
-_COMMAND = re.compile(r",? which tune inspect FILE --suggest begins| with tune jobs$")
+_COMMAND = re.compile(r",? which tune inspect FILE --suggest begins")
+_COMMAND_OF_TERMINAL = re.compile(r" with tune jobs$")
 
 
 def over_http(text: str) -> str:
@@ -134,7 +135,8 @@ def over_http(text: str) -> str:
 
 def on_the_web(text: str) -> str:
     """Return a message with fields of the page in place of options of the command line."""
-    return _OPTION.sub(lambda found: FIELD_PHRASES[found[1]], _COMMAND.sub("", text))
+    text = _COMMAND_OF_TERMINAL.sub("", _COMMAND.sub("", text))
+    return _OPTION.sub(lambda found: FIELD_PHRASES[found[1]], text)
 
 
 def is_plain_name(name: str) -> bool:

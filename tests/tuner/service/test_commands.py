@@ -176,13 +176,19 @@ def test_a_server_that_is_away_is_told_once_and_waited_for(tmp_path, table, monk
     assert said == [refused, "a.csv: job 1"]
 
 
-@pytest.mark.parametrize(("status", "kind"), [(507, PassingError), (409, InputError)])
-def test_refusals_that_pass_are_told_from_others(status, kind):
-    content = {"where": "the server", "what": "is full", "remedy": "wait"}
+@pytest.mark.parametrize(
+    ("status", "kind", "said"),
+    [
+        (507, PassingError, "http://lab: the server has no space left; free some"),
+        (409, InputError, "the server: has no space left; free some"),
+    ],
+)
+def test_refusals_that_pass_are_told_from_others(status, kind, said):
+    content = {"where": "the server", "what": "has no space left", "remedy": "free some"}
     answer = httpx.Response(status, json=content)
     with pytest.raises(InputError) as refused:
         tuner.connect("http://lab")._check(answer)
-    assert type(refused.value) is kind
+    assert (type(refused.value), str(refused.value)) == (kind, said)
 
 
 def test_the_client_gives_what_fit_gives(server, table, tmp_path, updated):
@@ -366,7 +372,7 @@ def test_plain_tune_loads_nothing_of_the_service():
     [
         ("fastapi", ["serve"], "tune serve: needs fastapi, which is not installed; pip install"),
         ("sqlalchemy", ["serve", "token", "list"], "needs sqlalchemy"),
-        ("httpx", ["jobs"], "--server: needs httpx, which is not installed; pip install"),
+        ("httpx", ["jobs"], "a tuning service: needs httpx, which is not installed; pip install"),
     ],
 )
 def test_a_missing_extra_is_named_in_one_line(package, arguments, said):

@@ -326,6 +326,14 @@ def test_a_disk_that_fills_while_a_result_is_stored_fails_the_job_and_a_retry_en
     assert again["log"][-1] == "begins at 5"
 
 
+def test_what_is_so_every_second_is_logged_once_in_a_while(caplog, monkeypatch):
+    clock = iter((0.0, 1.0, 1.0, 599.0, 601.0))
+    monkeypatch.setattr(dispatcher, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    for line in ("full", "full", "away", "full", "full"):
+        dispatcher.logger.warning(line)
+    assert caplog.messages == ["full", "away", "full"]
+
+
 @pytest.mark.parametrize("url", ["mysql://x/y", "nonsense", "sqlite+nothing://"])
 def test_another_kind_of_database_is_refused_in_words(url):
     with pytest.raises(InputError, match="--database: is no URL of SQLite or PostgreSQL"):
