@@ -25,6 +25,7 @@ from tuner.objective.criterion import Point, picked
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal_equations import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
+from tuner.objective.space import Space
 from tuner.recordings.content import ReadOptions
 from tuner.recordings.loader import reading_key
 from tuner.search.continuation import Undecided, run_stages
@@ -287,7 +288,8 @@ def _attempt(
             undecided={},
             on_progress=lambda _: None,
         )
-        progress = initial_progress(job.objective, np.asarray(through.points.coefficients))
+        shares = job.space.share(through.points.coefficients)
+        progress = initial_progress(job.objective, _off_bounds(job.space, shares))
     progress = run_stages(
         job.objective,
         stages,
@@ -390,8 +392,12 @@ def starting_vectors(job: Job) -> Array:
     centre, width = space.share(first), space.width
     reach = np.where(space.is_log, np.log(settings.spread), space.prior_sd) / width
     drawn = generator.uniform(-1.0, 1.0, (settings.starts - 1, len(space)))
-    shares = np.clip(centre + drawn * reach, BOUND_MARGIN, 1.0 - BOUND_MARGIN)
-    return np.vstack([first, space.at_share(shares)])
+    return np.vstack([first, _off_bounds(space, centre + drawn * reach)])
+
+
+def _off_bounds(space: Space, shares: Array) -> Array:
+    """Return search vectors (S, K) away from bounds, where there is no slope to leave them by."""
+    return space.at_share(np.clip(shares, BOUND_MARGIN, 1.0 - BOUND_MARGIN))
 
 
 def polished(

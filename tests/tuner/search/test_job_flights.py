@@ -20,6 +20,7 @@ from tuner.options import Options
 from tuner.recordings.flight import Series
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.states import initial_state
+from tuner.search import estimation
 from tuner.search.job_flights import (
     JobFlight,
     read_recordings,
@@ -320,3 +321,23 @@ def test_a_flight_that_begins_in_motion_is_met_to_its_noise_by_the_truth(setting
     assert abs(error["estimate_latency"]) < 2e-5
     assert abs(error["inertia_xx"]) < 0.002
     assert abs(error["inertia_yy"]) < 0.002
+
+
+def test_whole_flights_are_not_begun_on_a_bound_that_their_windows_end_on(
+    settings, flights, monkeypatch, tmp_path
+):
+    """There is no slope to leave it by: a latency of 2 ms had stayed at zero."""
+    moving = cut_from(flights[1], BEGUN, CUT_S)
+    job = job_of(settings, [JobFlight(moving, "reference", time_offset=0.0)])
+    least, begun = job.space.at_share(np.zeros(len(job.space))), []
+
+    def run(objective, _, progress, **__):
+        if objective is not job.windows:
+            begun.append(progress.points.coefficients[0])
+            raise StopIteration
+        return replace(progress, points=replace(progress.points, coefficients=least[None]))
+
+    monkeypatch.setattr(estimation, "run_stages", run)
+    with pytest.raises(StopIteration):
+        estimation.search(job, tmp_path, resume=False, on_progress=lambda *_: None)
+    assert (job.space.slope(begun[0]) > 1e3 * job.space.slope(least)).all()
