@@ -10,10 +10,10 @@ from pydantic import AfterValidator
 
 from tuner.core.yaml_section import refuse
 
-#: Stack -> the motor, from 1, that drives each rotor in PX4's order: front right, rear left, front
-#: left, rear right. Source: the motor maps in the documentation of each.
 ROTORS_OF_TYPE: Mapping[float, int] = {2: 4, 13: 6, 14: 8, 15: 3}
 """Type of vehicle, by MAVLink, of multirotors -> their rotors."""
+#: Stack -> the motor, from 1, that drives each rotor in PX4's order: front right, rear left, front
+#: left, rear right. Source: the motor maps in the documentation of each.
 MOTOR_ORDERS: Mapping[str, tuple[int, int, int, int]] = {
     "px4": (1, 2, 3, 4),
     "ardupilot": (1, 2, 3, 4),
