@@ -85,4 +85,4 @@ def test_of_tuples_of_any_length_another_item_is_checked_each_time():
             length((NUMBER, jnp.ones(1)))
         except TypeError:
             refused += 1
-    assert 10 < refused < 54  # of an item by chance
+    assert 20 < refused < 64  # of an item by chance, twice a call: three of four are refused
