@@ -157,9 +157,9 @@ def test_a_grid_goes_into_one_table(tmp_path):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"radius": -1.0}, "trajectory.radius is -1.0"),
-        ({"duration": 0.0}, "duration is 0.0"),
-        ({"rate": float("inf")}, "rate is inf"),
+        ({"radius": -1.0}, "--radius: is -1.0"),
+        ({"duration": 0.0}, "--duration: is 0.0"),
+        ({"rate": float("inf")}, "--rate: is inf"),
         ({"vehicle": "nope"}, "shipped vehicles"),
         ({"controller": "nope.yaml"}, "does not exist"),
     ],
