@@ -8,7 +8,7 @@ columns, the rotors' spins, the unit of speeds, and the commands of a commanded 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from typing import Literal
@@ -218,14 +218,8 @@ def motor_order(
             found.append(np.diagonal(across @ own) / np.sqrt(square))
         return found
 
-    correlation_of = {
-        order: max(min(axes[:2]) for axes in alike(order)) for order in permutations(range(4))
-    }
-    best, second = sorted(correlation_of, key=correlation_of.__getitem__, reverse=True)[:2]
-    if (
-        correlation_of[best] < MIN_CORRELATION
-        or correlation_of[second] > correlation_of[best] - MIN_LEAD
-    ):
+    best = leading_order(lambda order: max(min(axes[:2]) for axes in alike(order)))
+    if best is None:
         return None
     torques, count = [x @ arms[list(best)] for x in lagged], len(turning)
     parts = (slice(None), slice(0, count // 2), slice(count // 2, count))
@@ -235,6 +229,17 @@ def motor_order(
     if max(yaws) < -MIN_CORRELATION:
         return MotorOrder(best, reversed_spins=True)
     return MotorOrder(best, False if yaws[0] > MIN_CORRELATION else None)
+
+
+def leading_order(alike: Callable[[tuple[int, ...]], float]) -> tuple[int, ...] | None:
+    """Return the order of four motors that is clearly the one; None if none is.
+
+    ``alike`` returns the correlation of an order's torques, the lesser of roll and pitch.
+    """
+    correlation = {order: alike(order) for order in permutations(range(4))}
+    best, second = sorted(correlation, key=correlation.__getitem__, reverse=True)[:2]
+    clear = correlation[best] > max(MIN_CORRELATION, correlation[second] + MIN_LEAD)
+    return best if clear else None
 
 
 def lateness(

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -45,6 +44,7 @@ from tuner.objective.battery import log_voltage_of, with_readings_redrawn
 from tuner.objective.criterion import OFFSET_UNIT, Point
 from tuner.objective.inlets import linear_interpolation, zero_order_hold
 from tuner.objective.normal_equations import Objective
+from tuner.objective.rotor_signals import leading_order
 from tuner.objective.segments import CLOCK_OF, CLOCKS, stamped_earlier
 from tuner.objective.simulation import (
     BODY_ATTITUDE,
@@ -84,9 +84,6 @@ MIN_REPORTED_LAW_SHARE = 0.03
 """Least share of an axis' variation that a reported law explains."""
 FAR_OFF_GAIN = 1.3
 """Factor on a gain from which the file is another controller's: a battery changes it by less."""
-MIN_CORRELATION, MIN_LEAD = 0.4, 0.3
-"""Least correlation of recorded with simulated torques of roll and pitch for an order of motors,
-and least lead over any other order's."""
 GAIN_AXES = {"rate_gain_roll_pitch": ("roll", "pitch"), "rate_gain_yaw": ("yaw",)}
 """Coefficient -> axes of the rate controller whose gains it scales."""
 
@@ -526,7 +523,7 @@ def _order_of_motors(loops: Sequence[_Loop], mixer: MixerSettings) -> tuple[str,
             parts.append(both - both.mean(axis=0))
         return np.concatenate(parts)
 
-    own = tuple(range(loops[0].commands[0].shape[1]))
+    own = tuple(range(4))
     made = torques((loop.commands[1] for loop in loops), own)
 
     def alike(columns: Sequence[int]) -> float:
@@ -534,10 +531,8 @@ def _order_of_motors(loops: Sequence[_Loop], mixer: MixerSettings) -> tuple[str,
         sizes = np.sqrt((told * told).sum(axis=0) * (made * made).sum(axis=0))
         return float(((told * made).sum(axis=0) / np.maximum(sizes, 1e-300)).min())
 
-    correlation = {columns: alike(columns) for columns in permutations(own)}
-    best, second = sorted(correlation, key=correlation.__getitem__, reverse=True)[:2]
-    clear = correlation[best] > max(MIN_CORRELATION, correlation[second] + MIN_LEAD)
-    return tuple(str(1 + column) for column in best) if clear and best != own else ()
+    best = leading_order(alike)
+    return tuple(str(1 + column) for column in best) if best and best != own else ()
 
 
 def _controller_estimates(loops: Sequence[_Loop]) -> tuple[ControllerEstimate, ...]:
