@@ -163,6 +163,18 @@ def test_a_flight_of_another_payload_is_named(full_flight, full_bag, updated, li
         assert one.numbers["more"] == pytest.approx(lifts - 1.0, abs=0.01)
 
 
+@pytest.mark.parametrize(("share", "named"), [(None, False), (0.97, False), (0.7, True)])
+def test_rotors_that_stop_below_the_files_limit_are_named(
+    full_flight, full_bag, updated, monkeypatch, *, share, named
+):
+    job = job_through("actuator", full_flight, full_bag, updated)
+    allowed = updated.motor.max_rotor_velocity
+    limit = share and share * allowed
+    monkeypatch.setattr("tuner.job.prepare.rotor_limit", lambda _: limit)
+    said = [one.numbers for one in check_recordings(job) if one.code is Code.ROTORS_STOP]
+    assert said == ([{"limit": limit, "allowed": allowed}] if named else [])
+
+
 def test_settings_of_coefficients_that_are_not_fitted_are_named(full_flight, full_bag, updated):
     job = job_through("actuator", full_flight, full_bag, updated)
     bounded = CoefficientSettings(lower=1.0, upper=2.0)
