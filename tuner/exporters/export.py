@@ -119,12 +119,12 @@ def export(
         The file cannot be written.
     """
     target, into, out = target_of(options.format), options.into, options.out
-    own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
     if out is not None and out.name in OF_A_RUN:
         _refuse_overwrite(out, run.folder / out.name)
+    target = target.for_simulator(options.simulator, into)
+    own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
     if out is None or out.suffix:  # before anything is computed
         check_file(out or into or inside(run.folder, own))
-    target = target.for_simulator(options.simulator, into)
     physical, (run, effective) = run, run_in_simulator(run, target)
     vehicle, decided = exported_vehicle(run, today)
     check_every_coefficient(physical.vehicle, target)

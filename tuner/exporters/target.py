@@ -212,6 +212,8 @@ class Target:
     def for_simulator(self, simulator: str = "", into: Path | None = None) -> Target:
         """Return the target for a named simulator, or for that of a model.
 
+        Files for another than its first simulator are called after that, too.
+
         Raises
         ------
         ExportError
@@ -236,7 +238,9 @@ class Target:
             raise ExportError(
                 str(into), f"is a model for {is_for}", f"leave --simulator {is_for} out"
             )
-        return replace(self, simulator=known.get(is_for or simulator, self.simulator))
+        chosen = known.get(is_for or simulator, self.simulator)
+        suffix = self.suffix if chosen is self.simulator else f"_{chosen.name}{self.suffix}"
+        return replace(self, simulator=chosen, suffix=suffix)
 
 
 def target_of(name: str) -> Target:

@@ -275,11 +275,28 @@ def test_the_commands_of_gz_sim_are_px4_parameters(vehicle):
     assert "SIM_GZ" not in " / ".join(sdf_draft(CLASSIC, vehicle, "by a test").notes)
 
 
-def test_included_models_are_named(vehicle, tmp_path):
-    text = CLASSIC.read_text(encoding="utf-8").replace(
-        "<static>", "<include><uri>model://gps</uri></include><static>"
+@pytest.mark.parametrize("path", [CLASSIC, TEMPLATE], ids=lambda path: path.name)
+def test_a_byte_order_mark_survives(path, vehicle, tmp_path):
+    text, draft = path.read_text(encoding="utf-8"), sdf_draft(path, vehicle, "by a test")
+    assert patched(tmp_path, vehicle, "\ufeff" + text, path.name).text == "\ufeff" + draft.text
+
+
+def test_models_that_are_not_counted_are_named(vehicle, tmp_path):
+    more = (
+        "<include><uri>model://gps</uri></include>"
+        "<model name='gimbal'><link name='arm'><inertial><mass>0.3</mass></inertial></link></model>"
     )
-    assert any("model://gps" in note for note in patched(tmp_path, vehicle, text).notes)
+    text = CLASSIC.read_text(encoding="utf-8").replace("<static>", f"{more}<static>")
+    notes = patched(tmp_path, vehicle, text).notes
+    assert any(note.endswith("is not counted: model://gps, gimbal") for note in notes)
+
+
+def test_the_model_with_motors_is_patched_whatever_stands_before_it(vehicle, tmp_path):
+    pad = "<model name='pad'><link name='pad'/></model>"
+    text = GZ.read_text(encoding="utf-8").replace("<model", f"<world name='w'>{pad}<model", 1)
+    draft = patched(tmp_path, vehicle, text.replace("</sdf>", "</world></sdf>"))
+    assert pad in draft.text
+    assert "<mass>2.204</mass>" in draft.text
 
 
 @pytest.mark.parametrize(
@@ -302,6 +319,8 @@ def test_included_models_are_named(vehicle, tmp_path):
         ("<model name='quad_x'>", "<model name='quad_x'><b>", "not well-formed"),
         ("</sdf>", "{% if %}</sdf>", "cannot be rendered"),
         ("<ixx>0.021</ixx>", "<ixx>{% if a %}1{% else %}2{% endif %}</ixx>", "number of ours"),
+        ("<inertia>\n          <ixx>0.021", "<inertia/><inertia><ixx>0.021", "with <inertia>"),
+        ("</model>", "</model><model name='b'><plugin name='gazebo_motor_model'/></model>", "'b'"),
     ],
 )
 def test_a_model_we_cannot_serve_is_refused_in_one_line(vehicle, tmp_path, old, new, expected):
@@ -416,6 +435,12 @@ def test_a_model_for_another_vehicle_is_a_gate(vehicle, tmp_path):
     text = CLASSIC.read_text(encoding="utf-8").replace("ccw<", "cw<", 1)
     (gate,) = patched(tmp_path, vehicle, text).gates
     assert gate.objections == ("rotor_0 turns cw, the vehicle file's ccw",)
+    text = CLASSIC.read_text(encoding="utf-8").replace("<motorNumber>1<", "<motorNumber>0<")
+    (gate,) = patched(tmp_path, vehicle, text).gates
+    assert gate.objections[:2] == (
+        "rotor_0 has 2 motor plugins",
+        "rotor_1 has no motor plugins",
+    )
     wider = [r.replace(position=(1.2 * r.position[0], *r.position[1:])) for r in vehicle.rotors]
     draft = sdf_draft(CLASSIC, vehicle.replace(rotors=tuple(wider)), "by a test")
     assert len(draft.gates[0].objections) == 4
@@ -435,6 +460,8 @@ def test_format_and_model_agree_about_the_simulator():
     assert TARGET.for_simulator(into=GZ).simulator is GZ_SIM
     assert TARGET.for_simulator("gz-sim").simulator is GZ_SIM
     assert TARGET.for_simulator().simulator is GAZEBO_CLASSIC
+    assert TARGET.for_simulator("gazebo-classic").suffix == ".sdf"
+    assert TARGET.for_simulator(into=GZ).suffix == target_of("gz-sim").suffix == "_gz-sim.sdf"
     with pytest.raises(ExportError, match="is a model for gz-sim"):
         TARGET.for_simulator("gazebo-classic", GZ)
     with pytest.raises(ExportError, match="--format gz-sim is not for gazebo-classic"):

@@ -165,9 +165,13 @@ class SdfModel:
 
     @property
     def included(self) -> list[str]:
-        """The URIs of includes, whose mass is unknown."""
+        """The URIs of includes and the names of models inside, whose mass is not counted."""
         uris = (include.find("uri") for include in self.root.all("include"))
-        return [uri.value for uri in uris if uri is not None]
+        inside = (member for member, _ in self.members if member.tag == "model")
+        return [
+            *(uri.value for uri in uris if uri is not None),
+            *(model.attributes.get("name", "") for model in inside),
+        ]
 
     @property
     def is_gz(self) -> bool:
@@ -191,12 +195,7 @@ class SdfModel:
 
     def motors(self) -> list[Element]:
         """Return the motor plugins of the rotors, with those of templates without number."""
-        return [
-            plugin
-            for plugin in self.root.all("plugin")
-            if _CLASSIC_MOTOR in (names := _plugin_names(plugin)) or _GZ_MOTOR in names
-            if self._is_rotors(plugin, "motorNumber")
-        ]
+        return [motor for motor in _motors_in(self.root) if self._is_rotors(motor, "motorNumber")]
 
     def channels(self) -> list[Element]:
         """Return the control channels of the vehicle's rotors (Gazebo classic only)."""
@@ -258,6 +257,14 @@ def motor_number(motor: Element) -> int | None:
     """Return the number of a motor plugin's rotor; None if a template has none."""
     index = motor.numbers.get("motorNumber")
     return None if index is None else int(index)
+
+
+def _motors_in(model: Element) -> Iterator[Element]:
+    """Yield the motor plugins inside a model."""
+    for plugin in model.all("plugin"):
+        names = _plugin_names(plugin)
+        if _CLASSIC_MOTOR in names or _GZ_MOTOR in names:
+            yield plugin
 
 
 def _plugin_names(plugin: Element) -> str:
@@ -325,11 +332,25 @@ def read_sdf(
 
 
 def _model_in(root: Element) -> Element:
-    """Return the first ``<model>`` of a file."""
-    model = root if root.tag == "model" else root.first("model")
-    if model is None:
+    """Return the ``<model>`` of a file that has motors, else its first."""
+    models = [root] if root.tag == "model" else [*_outermost_models(root)]
+    if not models:
         raise ExportError(root.source.path, "holds no <model>", "give the SDF of a multirotor")
-    return model
+    flying = [model for model in models if next(_motors_in(model), None)]
+    if len(flying) > 1:
+        names = ", ".join(f"'{model.attributes.get('name', '')}'" for model in flying)
+        raise ExportError(
+            root.source.path, f"holds several multirotors: {names}", "give each a file of its own"
+        )
+    return (flying or models)[0]
+
+
+def _outermost_models(parent: Element) -> Iterator[Element]:
+    for child in parent.children:
+        if child.tag == "model":
+            yield child
+        else:
+            yield from _outermost_models(child)
 
 
 def _included_file(include: Element) -> Path | None:

@@ -123,6 +123,8 @@ def parse(text: str, path: Path, raw: str | None = None) -> Element:
     """
     # One byte per character, so that the parser's byte positions are positions in the text.
     plain = re.sub(r"[^\x00-\x7f]", "x", without_comments(text))
+    if text.startswith("\ufeff"):  # no declaration may follow a byte order mark that became a space
+        plain = re.sub(r"x(<\?xml.*?\?>)?", lambda match: " " * len(match.group()), plain, count=1)
     parser = expat.ParserCreate("utf-8")
     source = ModelFile(path, text if raw is None else raw, text)
     top = Element(source, "", {}, 0, 0)

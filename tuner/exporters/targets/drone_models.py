@@ -1,4 +1,4 @@
-"""Parameters of drone-models, which crazyflow flies: a table of its ``params.toml``."""
+"""Parameters of drone-models and crazyflow: a table of their ``params.toml``."""
 
 from __future__ import annotations
 
@@ -52,10 +52,16 @@ def params(vehicle: VehicleFile) -> dict[str, Any]:
     }
 
 
+_USE = """
+drone-models: into data/params.toml; into first_principles/params.toml the name in brackets alone.
+crazyflow: into dynamics/first_principles/params.toml; drones/ needs a Drone and an MJCF so called.
+"""
+
+
 def table(vehicle: VehicleFile, provenance: str) -> str:
-    """Return a table to put into drone-models' ``data/params.toml``."""
+    """Return a table to put into drone-models' or crazyflow's ``params.toml``."""
     lines = "".join(f"{name} = {value!r}\n" for name, value in params(vehicle).items())
-    return f'{commented(provenance)}["{file_name(vehicle.name, "")}"]\n{lines}'
+    return f'{commented(provenance + _USE.rstrip())}["{file_name(vehicle.name, "")}"]\n{lines}'
 
 
 def _rotor_gates(vehicle: VehicleFile) -> tuple[Gate, ...]:
@@ -147,7 +153,7 @@ DRONE_MODELS = Simulator(
     deviations=(
         "drag is linear in the body's velocity, at the centre of mass",
         "rotors sit in a square at the height of the centre of mass",
-        "the gyroscopic moment about forward has the other sign",
+        "the gyroscopic moment about forward has the other sign (not in crazyflow)",
     ),
     entry=entries(
         "drone-models",

@@ -8,4 +8,4 @@ from tuner.exporters.simulators import GZ_SIM
 from tuner.exporters.target import Target
 from tuner.exporters.targets.sdf import TARGET as SDF
 
-TARGET: Target = replace(SDF, name="gz-sim", suffix="_gz.sdf", simulator=GZ_SIM, others=())
+TARGET: Target = replace(SDF.for_simulator(GZ_SIM.name), name="gz-sim", others=())

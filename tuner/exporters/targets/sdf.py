@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -346,7 +347,7 @@ def _edits(
     """
     inertial = model.base.find("inertial")
     tensor = inertial.find("inertia") if inertial else None
-    if inertial is None or tensor is None:
+    if inertial is None or tensor is None or tensor.content == tensor.end:  # <inertia/>
         raise ExportError(
             model.path,
             f"base link '{model.base.attributes.get('name')}' has no <inertial> with <inertia>",
@@ -457,6 +458,12 @@ def _rotors_there(model: SdfModel, vehicle: VehicleFile) -> tuple[VehicleFile, t
     """Return a vehicle with a model's rotors, and a clause for each difference of its own."""
     more = _more_rotors(model, vehicle)
     clauses, rotors = [more] if more else [], list(vehicle.rotors)
+    driven = Counter(map(motor_number, model.motors()))
+    clauses += [
+        f"rotor_{index} has {driven[index] or 'no'} motor plugins"
+        for index in range(len(rotors))
+        if driven[index] != 1 and None not in driven
+    ]
     centre = composite(model).pose.position
     offset = np.array([*center_of_mass(vehicle).values()] or [0.0] * 3)
     for index, (link, turns) in sorted(model.rotor_links().items()):
