@@ -556,8 +556,9 @@ def root_mean_squares(objective: Objective, sums: SegmentSums) -> dict[str, Arra
     """
     owner, residual = np.eye(objective.flights)[objective.flight], {}
     for name, squares in sums.squares.items():
-        counts = np.asarray(sums.counts[name]) @ owner
-        mean = np.asarray(squares) @ owner / np.maximum(counts, 1.0)
+        counts, finite = np.asarray(sums.counts[name]) @ owner, np.isfinite(squares)
+        mean = np.where(finite, squares, 0.0) @ owner / np.maximum(counts, 1.0)
+        mean[~finite @ owner > 0] = np.inf  # and no other flight's
         residual[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
     return residual
 

@@ -281,6 +281,7 @@ def huber_loss(error: Array, limit: float) -> Array:
     return np.where(beyond, 2.0 * limit * size - limit * limit, error * error)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of chaotic derivatives, which are zeroed as such
 def gauss_newton(columns: Array, scaled: Array, scale: Array, huber: float) -> tuple[Array, Array]:
     """Return gradient (F, Q) and Gauss-Newton Hessian (F, Q, Q) of one channel's robust loss.
 

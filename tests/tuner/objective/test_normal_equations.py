@@ -1,6 +1,7 @@
 """Gradient and Hessian against finite differences, on two short simulated flights."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,8 +11,13 @@ import pytest
 from sim_jax.schedule import Schedule
 from tests.tuner.uncertainty.making import criterion_of, problem, truth, with_data
 from tuner.objective.criterion import OFFSET_UNIT, Point
-from tuner.objective.normal_equations import VECTORS_AT_ONCE, evaluate, normal_equations
-from tuner.objective.residuals import Reading, at_stamps, residuals
+from tuner.objective.normal_equations import (
+    VECTORS_AT_ONCE,
+    evaluate,
+    normal_equations,
+    root_mean_squares,
+)
+from tuner.objective.residuals import Reading, at_stamps, gauss_newton, residuals
 from tuner.objective.segments import (
     CLOCK_OF,
     CLOCKS,
@@ -315,3 +321,18 @@ def test_a_steady_rounded_command_counts_as_one_reading(flight):
     told = [(weight**2).sum(axis=0) * 1e-6 for weight in weights]
     assert told[0] == pytest.approx(np.ones(4))
     assert told[1] == pytest.approx(np.full(4, len(series.time)), rel=0.05)
+
+
+def test_a_flight_that_is_off_without_bound_leaves_the_others_residuals():
+    objective = SimpleNamespace(flights=3, flight=np.array([0, 1, 1]))
+    squares = {"position": np.array([[8.0, 2.0, np.inf], [8.0, 2.0, 6.0]])}
+    counts = {"position": np.array([[2.0, 1.0, 1.0]] * 2)}
+    found = root_mean_squares(objective, SimpleNamespace(squares=squares, counts=counts))
+    np.testing.assert_array_equal(found["position"], [[2.0, np.inf, np.nan], [2.0, 2.0, np.nan]])
+
+
+def test_derivatives_without_bound_count_nothing():
+    columns = np.array([[[[1e200, np.inf]]], [[[1.0, 2.0]]]])
+    gradient, hessian = gauss_newton(columns, np.ones((2, 1, 1)), np.ones(2), 3.0)
+    np.testing.assert_array_equal(gradient, [[0.0, 0.0], [1.0, 2.0]])
+    np.testing.assert_array_equal(hessian, [np.zeros((2, 2)), [[1.0, 2.0], [2.0, 4.0]]])
