@@ -103,12 +103,17 @@ def awaited(found: Callable[[], object]) -> object:
     return outcome
 
 
-def address_said_in(folder: Path) -> str:
+def address_said_in(folder: Path, host: str) -> str:
+    """Return where a server listens that says a host's name, once it has."""
+
     def said() -> re.Match[str] | None:
         file = folder / "said"
-        return re.search(r"Open http://[^:]+:(\d+)/", file.read_text() if file.exists() else "")
+        return re.search(r"Open http://(.+):(\d+)/", file.read_text() if file.exists() else "")
 
-    return f"http://127.0.0.1:{awaited(said)[1]}"  # type: ignore[index]
+    address = awaited(said)
+    assert isinstance(address, re.Match)
+    assert address[1] == host
+    return f"http://127.0.0.1:{address[2]}"
 
 
 @pytest.fixture
@@ -160,7 +165,8 @@ def test_servers_start_and_demand_tokens_where_others_can_ask(
     (health,) = instruction("HEALTHCHECK")
     with running([[*arguments, "--port", "0"] for arguments in words], folders):
         for line, folder in zip(lines, folders, strict=True):
-            address = address_said_in(folder)
+            everywhere = "--host 0.0.0.0" in line
+            address = address_said_in(folder, socket.gethostname() if everywhere else "127.0.0.1")
             jobs = f"{address}/api/v1/jobs"
             get = partial(httpx.get, verify=False)  # which reads no certificates
             assert get(jobs).status_code == (401 if line in tokens else 200), line

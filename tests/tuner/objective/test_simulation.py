@@ -349,6 +349,19 @@ def test_a_noisy_attitude_is_no_smaller_gain(flight):
     assert not any(f.code is Code.SETPOINTS_SCALED for f in setpoint_findings(noisy, OURS))
 
 
+@pytest.mark.parametrize(("constant", "gain"), [(0.06, None), (0.066, 1.0 / 1.1)])
+def test_a_noisy_altitude_is_no_smaller_thrust(flight, constant, gain):
+    series = flight.series["position"]
+    noise = 0.0015 * np.random.default_rng(0).normal(size=(len(series.time), 1)) * np.eye(3)[2]
+    read = Series(series.time, series.values + noise)
+    noisy = replace(flight, series={**flight.series, "position": read})
+    file = OURS.replace(thrust=OURS.thrust.replace(normalized_constant=constant))
+    assert match_setpoints(noisy, file).thrust.gain < (gain or 1.0) / 1.08
+    found = [f for f in setpoint_findings(noisy, file) if f.code is Code.SETPOINTS_SCALED]
+    told = [] if gain is None else [pytest.approx(gain, rel=0.04)]
+    assert [finding.numbers["gain"] for finding in found] == told
+
+
 def test_set_points_that_answer_an_old_state_are_reported(flight):
     prompt = match_setpoints(flight, OURS).delay
     assert prompt < 0.03
