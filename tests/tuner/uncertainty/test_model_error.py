@@ -35,6 +35,7 @@ from tuner.terms.candidates import with_terms
 from tuner.uncertainty.examination import examine
 from tuner.uncertainty.model_error import (
     ModelErrors,
+    _flown,
     alternatives_of,
     answers_of,
     gains_far_off,
@@ -339,6 +340,29 @@ def test_clocks_that_a_fit_found_late_are_no_error_of_its_model():
     fitted = making.fitted_of(objective, point)
     assert model_errors_of(fitted, flights) is None
     assert not answers_of(fitted, flights)
+
+
+def test_flights_are_flown_from_the_starts_that_the_fit_found():
+    """Else recordings are compared with simulations that take seconds to forget another start."""
+    truth = problem({})
+    fitted = fitted_at(truth, making.truth(truth), [])
+    free = np.zeros((len(SPIN_ROWS), FLIGHTS))
+    free[0] = 0.2
+    segments = replace(truth.segments, start_sd=np.full_like(free, 2.0))
+    found = replace(
+        fitted,
+        objective=replace(truth, segments=segments),
+        criterion=replace(fitted.criterion, states=free),
+    )
+    moved = eqx.tree_at(
+        lambda s: s.start.motion.position.x, truth.segments, replace_fn=lambda x: x + 0.4
+    )
+    simulated, wanted = (
+        _flown(found),
+        _flown(replace(fitted, objective=replace(truth, segments=moved))),
+    )
+    for name, values in wanted[0].channels.items():
+        np.testing.assert_allclose(simulated[0].channels[name], values, rtol=1e-9, atol=1e-9)
 
 
 def flown_with_p(factor):
