@@ -118,10 +118,17 @@ def with_one_drag(vehicle: VehicleFile) -> VehicleFile:
     return with_effects(with_linear_drag(vehicle), (), dict.fromkeys(LINEAR_DRAG, fmean((x, y))))
 
 
-def with_one_damping(vehicle: VehicleFile) -> VehicleFile:
-    """Return a vehicle with the mean damping of rotation about all axes."""
-    damping = fmean(max(vehicle.effects.get(name, 0.0), 0.0) for name in ANGULAR_DRAG)
-    damped = dict.fromkeys(ANGULAR_DRAG, damping) if damping > 0 else {}
+def with_one_damping(vehicle: VehicleFile, *, of_rate: bool = False) -> VehicleFile:
+    """Return a vehicle with the mean damping of rotation about all axes.
+
+    With ``of_rate`` body rates decay equally about all axes, in 1/s; otherwise the moments are
+    equal, in N m s/rad.
+    """
+    weights = [moment if of_rate else 1.0 for _, moment in vehicle.inertia]
+    moments = (max(vehicle.effects.get(name, 0.0), 0.0) for name in ANGULAR_DRAG)
+    damping = fmean(moment / weight for moment, weight in zip(moments, weights, strict=True))
+    each = (damping * weight for weight in weights)
+    damped = dict(zip(ANGULAR_DRAG, each, strict=True)) if damping > 0 else {}
     return with_effects(vehicle, ANGULAR_DRAG, damped)
 
 

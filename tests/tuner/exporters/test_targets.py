@@ -65,6 +65,18 @@ def test_laws_applied_twice_change_nothing(kind, vehicle):
     assert values_of(target.simulator.flown(once)) == pytest.approx(values_of(once), rel=1e-12)
 
 
+def test_body_rates_decay_equally_in_isaac_lab(vehicle):
+    """PhysX's angular_damping is in 1/s, whatever the moment of inertia."""
+    damped = vehicle.replace(effects={"angular_drag_x": 0.012, "angular_drag_z": 0.03})
+    target = target_of("isaaclab")
+    draft = target.draft(damped, "by a test", target.simulator, None)
+    flown, inertia = draft.vehicle.effects, vehicle.inertia
+    rate = (0.012 / inertia.xx + 0.03 / inertia.zz) / 3
+    assert f"'angular_damping': {rate!r}"[:30] in draft.text
+    for axis, moment in (("x", inertia.xx), ("y", inertia.yy), ("z", inertia.zz)):
+        assert flown[f"angular_drag_{axis}"] / moment == pytest.approx(rate)
+
+
 @EVERY
 def test_thrust_and_hover_are_carried(kind, vehicle):
     flown = target_of(kind).simulator.flown(vehicle)

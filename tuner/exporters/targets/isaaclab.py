@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 from tuner.core.yaml_section import commented
@@ -85,7 +86,7 @@ ISAAC_LAB = Simulator(
     source="isaaclab_contrib/actuators/thruster.py, assets/multirotor",
     deviations=(
         "one drag in all directions, linear in the velocity and at the centre of mass",
-        "one damping of rotation about all axes",
+        "one damping of rotation about all axes, by which body rates decay equally",
     ),
     entry=entries(
         "Isaac Lab",
@@ -98,7 +99,11 @@ ISAAC_LAB = Simulator(
         rotor_drag_coefficient="linear_damping",
         **laws.CENTRE,
     ),
-    laws=(laws.about_centre_of_mass, laws.with_one_drag, laws.with_one_damping),
+    laws=(
+        laws.about_centre_of_mass,
+        laws.with_one_drag,
+        partial(laws.with_one_damping, of_rate=True),
+    ),
     free=laws.LINEAR_DRAG,
     ties=(laws.LINEAR_DRAG,),
 )
