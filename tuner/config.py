@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from annotated_types import Interval, Le, Len
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from tuner.core.disk import exists, find_flights
+from tuner.core.disk import exists, expanded, find_flights
 from tuner.core.errors import ConfigError, InputError, did_you_mean
 from tuner.core.shipped import EXPORT_TARGETS, KINDS, Kind, configs_folder, find_config
 from tuner.core.yaml_section import (
@@ -336,7 +336,7 @@ def read_job(path: str | Path) -> JobFile:
             except ConfigError as error:
                 raise ConfigError(path, f"{key} '{reference}' {error.what}", error.remedy) from None
     if job.export.into is not None:
-        into = path.parent / job.export.into.expanduser()
+        into = path.parent / expanded(job.export.into)
         return job.model_copy(update=paths | {"export": job.export.replace(into=into)})
     return job.model_copy(update=paths)
 
@@ -406,7 +406,7 @@ def resolve_settings(asked: FlightOptions, *, fits: bool = True) -> Settings:
     known: dict[str, Any] = {f.name: getattr(asked, f.name, f.default) for f in fields(Options)}
     options = asked if isinstance(asked, Options) else Options(**known)
     flights = find_flights(options.flights)
-    job_path = Path(options.config).expanduser() if options.config else find_job_file(flights)
+    job_path = expanded(options.config) if options.config else find_job_file(flights)
     job = read_job(job_path) if job_path else JobFile()
     origin: dict[str, str] = {}
 

@@ -262,17 +262,33 @@ def readable(path: Path) -> Iterator[None]:
         raise RecordingError(path, what, "check its rights and the disk") from None
 
 
+def home_folder() -> Path:
+    """Return the user's home; where there is none, as in a container, one that keeps nothing."""
+    try:
+        return Path.home()
+    except RuntimeError:
+        return Path(os.devnull)
+
+
+def expanded(path: str | Path) -> Path:
+    """Return a path with a home for its ``~``; as it is, if there is none."""
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        return Path(path)
+
+
 def cache_folder() -> Path:
     """Return the folder in which this program may keep what it can make again."""
     chosen = Path(os.environ.get("XDG_CACHE_HOME", ""))
     if chosen.is_absolute():  # another would be a folder wherever a command runs
         base = chosen
     elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
+        base = home_folder() / "Library" / "Caches"
     elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+        base = Path(os.environ.get("LOCALAPPDATA", home_folder() / "AppData" / "Local"))
     else:
-        base = Path.home() / ".cache"
+        base = home_folder() / ".cache"
     return base / "multirotor-tune"
 
 
@@ -292,7 +308,7 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
     """
     recordings: dict[Path, Path] = {}
     for pattern in patterns:
-        path = Path(pattern).expanduser()
+        path = expanded(pattern)
         if exists(path):
             matches = [path]
         elif glob.has_magic(pattern):

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-from tuner.core.disk import exists
+from tuner.core.disk import exists, expanded
 from tuner.core.errors import ConfigError, did_you_mean
 
 Kind = Literal["vehicles", "controllers", "topics"]
@@ -50,7 +50,7 @@ def find_config(kind: Kind, reference: str, base: Path) -> Path:
     ConfigError
         A bare name is no shipped file's. Whether a path can be read is checked by its reader.
     """
-    path = base / Path(reference).expanduser()
+    path = base / expanded(reference)
     if path.suffix in {".yaml", ".yml"} or len(Path(reference).parts) != 1 or exists(path):
         return path
     known = shipped(kind)

@@ -39,7 +39,7 @@ from distributed.comm import CommClosedError
 from distributed.security import Security
 
 from tuner.core.content_store import ContentStore
-from tuner.core.disk import cache_folder
+from tuner.core.disk import cache_folder, expanded
 from tuner.core.errors import EngineError, InputError
 from tuner.core.runtime import configure, extra
 from tuner.engine.engine import (
@@ -429,7 +429,7 @@ def _jobs(
         "python": jobs.python,
         "interface": jobs.interface,
         "local_directory": jobs.scratch,
-        "log_directory": None if jobs.logs is None else str(Path(jobs.logs).expanduser()),
+        "log_directory": None if jobs.logs is None else str(expanded(jobs.logs)),
     }
     scheduler = dask.config.get(f"jobqueue.{jobs.system}.scheduler-options", {})
     cluster: AbstractContextManager[Any] = kind(

@@ -23,6 +23,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 from annotated_types import Interval
 from pydantic import StringConstraints, model_validator
 
+from tuner.core.disk import expanded
 from tuner.core.errors import ConfigError
 from tuner.core.runtime import extra
 from tuner.core.yaml_section import Section, Whole, build, build_options, read_model, refuse
@@ -275,7 +276,7 @@ def read_cluster(reference: str) -> ClusterFile:
     """
     if reference.startswith(SCHEMES):
         return build(ClusterFile, {"address": reference}, "--cluster")
-    path = Path(reference).expanduser()
+    path = expanded(reference)
     file = read_model(ClusterFile, path)
     if file.tls is None:
         return file

@@ -17,6 +17,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from sim_jax.constants import RAD_S_PER_RPM
+from tuner.core.disk import expanded
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import Array, robust_sd, student_factor
 from tuner.ground.measurement import Curve
@@ -216,7 +217,7 @@ MIN_VERTICAL_COSINE = 0.9
 
 def recording_path(folder: Path, recording: str | None) -> Path:
     """Return the path of a recording, or of a table, that ``bench.yaml`` names."""
-    return folder / Path(recording or "").expanduser()
+    return folder / expanded(recording or "")
 
 
 def open_table(path: Path) -> TabularRecording:

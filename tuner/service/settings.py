@@ -7,6 +7,8 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from tuner.core.disk import home_folder
+
 MIB = 2**20
 GIB = 2**30
 
@@ -126,7 +128,7 @@ def size_in_words(size: int) -> str:
 def default_data() -> Path:
     """Return the folder of a server whose user names none."""
     base = os.environ.get("XDG_DATA_HOME")
-    return (Path(base) if base else Path.home() / ".local" / "share") / "multirotor-tune"
+    return (Path(base) if base else home_folder() / ".local" / "share") / "multirotor-tune"
 
 
 def limit_process(*, memory_bytes: int, file_bytes: int, cpu_seconds: int | None = None) -> None:

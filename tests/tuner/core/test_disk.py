@@ -21,6 +21,7 @@ from tuner.core.disk import (
     check_file,
     check_folder,
     exists,
+    find_flights,
     make_folder,
     read_bytes,
     result_folder,
@@ -132,6 +133,14 @@ def test_cache_folder_follows_the_platform(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(sys, "platform", "darwin")
     assert cache_folder() == tmp_path / "Library" / "Caches" / "multirotor-tune"
+
+
+def test_without_a_home_nothing_is_kept_and_its_sign_is_a_name(monkeypatch):
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(os.path, "expanduser", str)  # as where neither HOME nor a user is known
+    assert cache_folder().is_relative_to(os.devnull)
+    with pytest.raises(InputError, match=r"~/x\.bag: does not exist"):
+        find_flights(["~/x.bag"])
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 not a zip", b"plain text", b"\x93NUMPY"])
