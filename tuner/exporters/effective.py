@@ -17,17 +17,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from tuner.config import CoefficientSettings, JobFile, Settings
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.files import ResultFile
+from tuner.core.numerics import Array
 from tuner.core.phrases import listed
 from tuner.core.runtime import installed
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.records import AxesRmse
 from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
 from tuner.objective.criterion import Point, units_of
+from tuner.objective.space import Space
 from tuner.result import EFFECTIVE, EffectiveResult, LostTerm, PoseRmse, Run, RunResult
 from tuner.search.estimation import BOTH_POLISHES, polished
 from tuner.search.job_flights import (
@@ -54,6 +57,8 @@ from tuner.vehicle import (
 ALL_STAGES, LAST_STAGES = slice(None), slice(-3, None)
 """Stages of the fit: the last are whole flights, then polishes with weights for missing terms."""
 MOMENTS = frozenset(name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia")
+BOUND_TOLERANCE = 1e-4
+"""Share of the distance between bounds within which a coefficient is on one."""
 MIN_TOLERANCE = 1e-4
 """Relative reduction of the loss at which a stage ends. With a hundredth a moment constant ends a
 quarter off: a model without a term has a long valley, in which each step gains half of that."""
@@ -184,8 +189,8 @@ def fit_effective(
     """Return a simulator's vehicle fitted to a run's flights, and whether the fit converged.
 
     Prior knowledge is about the vehicle, not about a simulator without some terms: each coefficient
-    has a weak prior at its start. If the moments of inertia end as impossible, they are fixed at
-    their start, and the others are polished again.
+    has a weak prior at its start. Those that end on a bound are fixed at their start, as are the
+    moments of inertia if they end as impossible, and the others are fitted again.
     """
     settings, recordings = recorded
     begins = run.vehicle if simulator.start is None else simulator.start(run.vehicle)
@@ -225,13 +230,37 @@ def fit_effective(
     moves, fixed = np.ones(len(space), bool), np.zeros(begun.point.offsets.shape, bool)
     stages = LAST_STAGES if simulator.start is None else ALL_STAGES
     fitted = fit(begun, free=Point(moves, fixed), stages=stages)
-    with suppress(ConfigError):  # together the moments are no rigid body's
-        return vehicle(fitted), fitted.converged
-    moves = np.array([not MOMENTS.intersection(p.ratios) for p in space.parameters])
-    at_start = np.where(moves, fitted.point.coefficients, space.initial)
-    begun = replace(begun, point=Point(at_start, fitted.point.offsets), scales=fitted.scales)
-    fitted = fit(begun, free=Point(moves, fixed), stages=BOTH_POLISHES)
-    return vehicle(fitted), fitted.converged
+    while True:
+        held = moves & _on_bounds(space, fitted.point.coefficients)
+        if not held.any():
+            with suppress(ConfigError):  # together the moments are no rigid body's
+                return vehicle(fitted), fitted.converged
+            held = np.array([not MOMENTS.isdisjoint(p.ratios) for p in space.parameters])
+        moves = moves & ~held
+        if not moves.any():
+            return start, fitted.converged
+        at_start = np.where(moves, fitted.point.coefficients, space.initial)
+        begun = replace(begun, point=Point(at_start, fitted.point.offsets), scales=fitted.scales)
+        fitted = fit(begun, free=Point(moves, fixed), stages=BOTH_POLISHES)
+
+
+def _on_bounds(space: Space, vector: Array) -> NDArray[np.bool_]:
+    """Return whether each parameter is on a bound at a search vector, shape (K,)."""
+    rows = zip(space.parameters, space.at(vector), strict=True)
+    return np.array([bound_at(p.initial, at, p.lower, p.upper) is not None for p, at in rows])
+
+
+def bound_at(initial: float, value: float, lower: float | None, upper: float | None) -> str | None:
+    """Return the bound, ``lower`` or ``upper``, on which a coefficient ends; None without.
+
+    None, too, where it began there: a set-up without a delay has a latency of zero.
+    """
+    span = upper - lower if lower is not None and upper is not None else None
+    for side, bound in (("lower", lower), ("upper", upper)):
+        near = BOUND_TOLERANCE * (abs(bound or 0.0) if span is None else span)
+        if bound and abs(value - bound) <= near < abs(initial - bound):
+            return side
+    return None
 
 
 def _bounds(run: Run, start: VehicleFile, free: Sequence[str]) -> dict[str, CoefficientSettings]:

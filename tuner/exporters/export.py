@@ -19,6 +19,7 @@ from tuner.exporters import laws
 from tuner.exporters.draws import draws_of, write_draws
 from tuner.exporters.effective import (
     Effective,
+    bound_at,
     cached_effective,
     exported_numbers,
     lost_groups,
@@ -53,8 +54,6 @@ FOLDER = EXPORTS
 #: Simulates all flights of a run with a vehicle -> flight name -> RMSE, None for a crash.
 Refly = Callable[[Run, VehicleFile], Mapping[str, AxesRmse]]
 
-#: Share of the distance between bounds within which a coefficient is on one.
-BOUND_TOLERANCE = 1e-4
 #: Share by which the RMSE of a flight that checks the run may grow in the fit.
 MAX_RMSE_INCREASE = 0.01
 #: Equal RMSEs differ by less, relatively or in m and degrees.
@@ -514,13 +513,7 @@ def _on_bounds(run: Run) -> Iterator[str]:
     The others move no flight: notes of the export name them.
     """
     for name, coefficient in run.result.coefficients.items():
-        lower, upper = coefficient.lower, coefficient.upper
-        if not coefficient.fitted or coefficient.identifiable is False:
-            continue
-        span = upper - lower if lower is not None and upper is not None else None
-        for side, bound in (("lower", lower), ("upper", upper)):
-            near = BOUND_TOLERANCE * (abs(bound or 0.0) if span is None else span)
-            if bound is None or abs(coefficient.initial - bound) <= near:
-                continue  # the search began there: a set-up without a delay has a latency of zero
-            if bound != 0.0 and abs(coefficient.best - bound) <= near:
-                yield f"{name} {coefficient.best:g} is its {side} bound"
+        if coefficient.fitted and coefficient.identifiable is not False:
+            best, bounds = coefficient.best, (coefficient.lower, coefficient.upper)
+            if side := bound_at(coefficient.initial, best, *bounds):
+                yield f"{name} {best:g} is its {side} bound"

@@ -128,6 +128,24 @@ def test_moments_of_inertia_that_a_job_ties_are_refitted_tied(run):
     assert after["inertia_yy"] / before["inertia_yy"] == pytest.approx(moved, rel=1e-9)
 
 
+@pytest.mark.parametrize(("room", "moves"), [(1.1, False), (3.0, True)])
+def test_a_coefficient_that_ends_on_a_bound_stays_as_it_is(run, room, moves):
+    """Half of the drag is a body's, without which that of rotors would double."""
+    name = "rotor_drag_coefficient"
+    less = 0.5 * values_of(run.vehicle)[name]
+    vehicle = with_values(run.vehicle, {name: less})
+    run = of_vehicle(
+        as_fitted(run), aerodynamics=vehicle.aerodynamics, effects={"linear_drag_x": 0.1}
+    )
+    bounds = {"lower": 0.9 * less, "upper": room * less}
+    rows = run.result.coefficients
+    rows = rows | {name: rows[name].model_copy(update=bounds)}
+    run = run.model_copy(update={"result": run.result.model_copy(update={"coefficients": rows})})
+    found = find_effective(run, GAZEBO_CLASSIC, recordings_of)
+    ends = values_of(found.vehicle)[name]
+    assert ends == (pytest.approx(2 * less, rel=0.1) if moves else pytest.approx(less, rel=1e-9))
+
+
 def test_nothing_free_is_nothing_refitted(run):
     run = of_vehicle(as_fitted(run), effects={"fuselage_drag": 0.04})
     fixed = {
