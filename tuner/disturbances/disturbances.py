@@ -10,7 +10,10 @@ with the sign of that velocity. Taken for a force it resembles an inflow of thru
 also pushes, by what the terms lack; upwards a force of its own is what is left of the length.
 
 Forces and moments are accelerations: fixed gains then correct a motion by the same amount while
-mass and inertia move, and have no information on mass and inertia.
+mass and inertia move, and have no information on mass and inertia. So are gusts, by the drag of
+rotors that hover: fixed gains have no information on drag but for that of the vehicle's own
+motion. A hover tells the wind times the drag; how much of it is wind, and so the draught that takes
+thrust, is known no better than the drag.
 
 Sources: Gelb, "Applied optimal estimation", 1974, ch. 2 (Gauss-Markov process); MIL-F-8785C, 1980,
 3.7.3.4 (near the ground gusts are half as strong upwards as sideways).
@@ -65,9 +68,10 @@ class Processes(eqx.Module):
     Attributes
     ----------
     sd
-        (D, F) in m/s, m/s² and rad/s², each segment's own.
+        (D, F) in m/s² and rad/s², each segment's own.
     acts
-        (D,) force and moment of each process over its acceleration, kg and kg m²; 1 of gusts.
+        (D, F) force and moment of each process over its acceleration, kg and kg m²; of gusts their
+        velocity over it, s.
     pushes
         (F,) kg/s, force of a gust sideways over its velocity, beside what the airspeed does.
     retention
@@ -75,7 +79,7 @@ class Processes(eqx.Module):
     """
 
     sd: Float[Array, "D *F"]
-    acts: Float[Array, " D"]
+    acts: Float[Array, "D *F"]
     pushes: Float[Array, "*F"]
     retention: Float[Array, "D *F"]
 
@@ -87,7 +91,7 @@ class Processes(eqx.Module):
     def disturbance(self, values: Float[Array, "D F"]) -> Disturbance:
         """Return the disturbance of values in units of ``sd``, constant over a tick."""
         rows: dict[str, Array] = {}
-        for name, value in zip((*SLOW, *FAST), (self.acts * values.T).T, strict=True):
+        for name, value in zip((*SLOW, *FAST), (self.acts.T * values.T).T, strict=True):
             rows[name] = rows[name] + value if name in rows else value
         gust, moment = (
             Vec3(*(rows[f"{kind}_{axis}"][None] for axis in "xyz")) for kind in ("gust", "moment")
@@ -119,11 +123,14 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, "8 *F"], rate: float)
     sd = [wind, wind, UPWARDS * wind, lift * weight, roll * weight * arm, roll * weight * arm]
     sd += [own * count**0.5, own * width, own * length, own * turning * count**0.5]
     lasts = [gust_lasts] * len(SLOW) + [turbulence_lasts] * len(FAST)
-    itself = jnp.ones_like(body.mass)
-    acts = [itself, itself, itself, body.mass, *turns[:2], body.mass, *turns]
+    pushes, rotors = gust * weight / wind, vehicle.aerodynamics
+    speed = rotors.speed_at(jnp.asarray(weight / count))
+    answers = body.mass / (pushes + count * speed * rotors.rotor_drag_coefficient)
+    acts = [answers, answers, answers, body.mass, *turns[:2], body.mass, *turns]
+    acts = [jnp.broadcast_to(act, pushes.shape) for act in acts]
     accelerations = [each / act for each, act in zip(sd, acts, strict=True)]
     retention = jnp.exp(-1.0 / rate / jnp.stack(lasts))
-    return Processes(jnp.stack(accelerations), jnp.stack(acts), gust * weight / wind, retention)
+    return Processes(jnp.stack(accelerations), jnp.stack(acts), pushes, retention)
 
 
 def clipped(strengths: Sequence[float] | np.ndarray) -> np.ndarray:

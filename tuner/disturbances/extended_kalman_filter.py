@@ -91,7 +91,7 @@ class Gains(eqx.Module):
     factors
         (F, T, m, m) L, lower triangular.
     draught
-        (F, T) m/s, standard error of the gusts upwards, as the filter estimates them.
+        (F, T) m/s², standard error of the gusts upwards, as the filter estimates them.
     rate
         Hz of the filter's physics steps. With finer steps there are more commands in flight: the
         correction of each is repeated for those of its time.
@@ -315,6 +315,7 @@ def _filter(
     shown = len(first_errors(first, 0))  # to samples: commands on their way are not, nor pushes
     process_noise = jnp.concatenate([jnp.zeros(size - PROCESSES), processes.added])
     gust = size - PROCESSES + SLOW.index("gust_z")
+    least = MIN_VARIANCE / processes.acts[SLOW.index("gust_z")] ** 2
 
     def tick(carried: Any, number: Array) -> Any:
         state, pushed, matrices, before, beyond = carried
@@ -337,7 +338,7 @@ def _filter(
             SparseMatrix.of(changes, shown),
             *_sampled(given, number),
         )
-        draught = jnp.sqrt(jnp.maximum(covariance[gust, gust], MIN_VARIANCE))
+        draught = jnp.sqrt(jnp.maximum(covariance[gust, gust], least))
         update = innovations_of(covariance, gain, samples)
         white, factors = update.white, update.factors
         root = jnp.stack([factors[i, i] for i in range(wide)])

@@ -22,7 +22,7 @@ from sim_jax.rollout import start_simulation
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroMemory
 from sim_jax.state import AIRBORNE, State
-from tuner.disturbances.disturbances import Processes, processes_of
+from tuner.disturbances.disturbances import SLOW, Processes, processes_of
 from tuner.disturbances.ticks import TickSamples
 from tuner.objective.criterion import OFFSET_UNIT, AnyArray, units_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
@@ -177,7 +177,7 @@ class Observer(eqx.Module):
     def next(self, state: State, pushed: Array, tick: Array, draught: Array) -> State:
         """Return the state a tick later, with disturbances of values (D, *F).
 
-        ``draught`` (*F) is the standard error of the estimated gusts upwards, in m/s.
+        ``draught`` (*F) is the standard error of the estimated gusts upwards, in m/s².
         """
         acting = self.processes.disturbance(pushed)
         if self.plant.environment.disturbance is not None:
@@ -186,7 +186,7 @@ class Observer(eqx.Module):
         environment = eqx.tree_at(
             lambda e: (e.disturbance, e.draught),
             self.plant.environment,
-            (acting, draught),
+            (acting, self.processes.acts[SLOW.index("gust_z")] * draught),
             is_leaf=lambda leaf: leaf is None,
         )
         plant = eqx.tree_at(lambda p: p.environment, self.plant, environment)

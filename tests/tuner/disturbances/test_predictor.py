@@ -50,6 +50,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 FREE = ("inertia_xx", "inertia_yy", "time_constant_up", "motor_constant", "rotor_drag_coefficient")
 STRENGTHS = np.log([0.004, 1e-4, 1e-4, 0.004, 1.0, 0.03, 1.0, 0.03])
+BLOWN = np.log([1e-4, 1e-4, 1e-4, 0.004, 1.0, 0.02, 1.0, 0.1])
+"""Of flights that are blown by wind alone."""
 SEED = 3
 NOISE = {**making.NOISE, "command": 3e-4}
 OFFSETS = np.zeros((5, 2), bool)
@@ -76,10 +78,12 @@ def flown(objective: Objective, processes: Processes, pushes: jax.Array):
     return channels, flight.log.setpoints
 
 
-def gusty(exact: Objective, seed: int) -> tuple[Objective, list[Flight]]:
+def gusty(
+    exact: Objective, seed: int, strengths: np.ndarray = STRENGTHS
+) -> tuple[Objective, list[Flight]]:
     """Return the problem and its flights with gusts, turbulence and measurement noise."""
     rng, rate = np.random.default_rng(seed), 100.0
-    processes = processes_of(exact.model.vehicle, jnp.asarray(STRENGTHS), rate)
+    processes = processes_of(exact.model.vehicle, jnp.asarray(strengths), rate)
     ticks = round(making.SECONDS * rate) + 2
     pushes = np.zeros((PROCESSES, ticks, 2))
     pushes[:, 0] = np.asarray(processes.sd)[:, None] * rng.standard_normal((PROCESSES, 2))
@@ -254,7 +258,7 @@ def test_near_the_estimate_one_step_ends_at_it(monkeypatch, fitted, exact) -> No
     error = error_of(problem, predictor, point)
     slope = exact.space.slope(np.asarray(point.coefficients))
     shift = np.zeros(len(FREE))
-    shift[0] = error[0]
+    shift[1] = error[1]
     where = Point(jnp.asarray(point.coefficients + shift / slope), point.offsets)
     passes, at = [], Predictor.at
     monkeypatch.setattr(Predictor, "at", lambda *a: passes.append(1) or at(*a))
@@ -487,3 +491,31 @@ def test_a_voltage_that_is_read_higher_moves_innovations_as_faster_motors_do(fit
     )
     np.testing.assert_allclose(found, expected, atol=1e-9)
     assert np.abs(found - same).max() > 0.1
+
+
+def test_hovers_in_gusts_quote_how_little_they_know_of_drag_and_of_the_draught() -> None:
+    """They tell the wind times the drag, and the draught that takes thrust is the wind's."""
+    exact = making.problem(("motor_constant", "rotor_drag_coefficient"))
+    points = exact.segments.inlet.points.position
+    still = Vec3(jnp.zeros_like(points.x), jnp.zeros_like(points.x), jnp.ones_like(points.x))
+    exact = eqx.tree_at(
+        lambda o: (o.segments.inlet.points.position, o.segments.inlet.spins),
+        exact,
+        (still, jnp.zeros(2, bool)),
+    )
+    exact, truth = making.with_data(exact, making.truth(exact)), making.truth(exact)
+    free, right = np.concatenate([np.ones(2, bool), OFFSETS.ravel()]), exact.space.initial
+    missed = []
+    for seed in range(8):
+        problem, flights = gusty(exact, seed, BLOWN)
+        predictor = Predictor.of(problem, truth, flights)
+        assert predictor is not None
+        criterion = making.fitted_of(problem, truth).criterion
+        predictor, point = maximise_likelihood(
+            predictor, flights, (problem, truth, criterion), free
+        )
+        fit = making.fitted_of(problem, point)
+        error = examine(fit, predictor=predictor, effects=False).uncertainty.covariance.error
+        away = exact.space.scaled(point.coefficients) - exact.space.scaled(right)
+        missed.append(np.asarray(away) / error)
+    assert (np.median(np.abs(missed), axis=0) < 1.5).all(), missed  # 0.67 of many

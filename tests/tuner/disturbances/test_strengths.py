@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sim_jax.constants import GRAVITY
+from sim_jax.environment import Air, Environment
+from sim_jax.geometry import Vec3
+from sim_jax.state import hover
+from sim_jax.terms import rotor_drag
 from tests.sim_jax.support import vehicle
 from tuner.disturbances.disturbances import (
     FAST,
@@ -134,3 +139,27 @@ def test_a_gust_is_wind_that_also_pushes() -> None:
     np.testing.assert_allclose(
         acting.force.stacked()[:, 0, 0], weight * np.array([gust, gust, lift])
     )
+
+
+@pytest.mark.parametrize("drag", [0.0, 1e-4, 2e-3])
+@pytest.mark.parametrize("wind", [0.01, 1.0])
+def test_a_gust_moves_a_hovering_vehicle_by_as_much_whatever_its_drag(drag, wind) -> None:
+    """As fixed gains have no information on it."""
+    craft = vehicle()
+    rotors = replace(craft.aerodynamics, rotor_drag_coefficient=jnp.asarray(drag))
+    craft = replace(craft, aerodynamics=rotors)
+    strengths = np.array(INITIAL_STRENGTHS)
+    strengths[STRENGTHS.index("wind")] = np.log(wind)
+    processes = processes_of(craft, jnp.asarray(strengths), 400.0)
+    asked = np.zeros(len(ORDER))
+    asked[[ORDER.index("gust_x"), ORDER.index("gust_y")]] = 0.3, -0.2
+    acting = processes.disturbance(jnp.asarray(asked))
+    assert acting.gust is not None
+    assert acting.force is not None
+    start = hover(craft, Vec3.zeros(jnp.asarray(0.0)))
+    blown = Vec3(*(part[0] for part in (acting.gust.x, acting.gust.y, acting.gust.z)))
+    air = Air.around(craft, start.motion, Environment(wind=blown))
+    dragged = rotor_drag(craft, start.motion, start.rotor_speed, air)
+    assert dragged is not None
+    force = acting.force.stacked()[:, 0] + sum(part.stacked() for part in dragged.at_rotors)
+    np.testing.assert_allclose(force / craft.body.mass, [0.3, -0.2, 0.0], rtol=1e-9)
