@@ -74,7 +74,7 @@ def _digest(path: Path, files: Iterable[Path]) -> str:
     total = hashlib.sha256()
     for file in files:
         if path.is_dir():
-            total.update(str(file.relative_to(path)).encode())
+            total.update(os.fsencode(file.relative_to(path)))
         with file.open("rb") as stream:
             while block := stream.read(1 << 20):
                 total.update(block)

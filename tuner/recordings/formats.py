@@ -249,10 +249,11 @@ def layout_of(path: Path) -> Layout:
         units = dict(zip(columns, _cells(lines[place], separator), strict=False))
         place += 1
     first = lines[place] if place < len(lines) else ""
-    width = len(_cells(first, separator))
-    if width == len(columns) - 1 and not columns[-1]:
+    cells = _cells(first, separator)
+    if len(cells) == len(columns) - 1 and not columns[-1]:
         columns = columns[:-1]
-    columns += [""] * (width == len(columns) + 1)  # every row ends with a separator
+    if len(cells) == len(columns) + 1:  # every row ends with a separator, or begins with its name
+        columns = ["", *columns] if cells[-1] else [*columns, ""]
     rows = [row for row in lines[place : place + 20] if row]
     comma = separator != "," and any(re.search(r"\d,\d", row) for row in rows)
     return Layout(encoding, separator, comma, _unique_names(columns), units, place)
@@ -271,8 +272,8 @@ def _separator(line: str) -> str:
 
 def _cells(line: str, separator: str) -> list[str]:
     text = line.strip("\r\n").lstrip("\ufeff")
-    if separator == " ":
-        return text.split()
+    if separator == " " or len(text) > csv.field_size_limit():
+        return text.split(None if separator == " " else separator)
     return [cell.strip().strip('"') for cell in next(csv.reader([text], delimiter=separator), [])]
 
 

@@ -170,6 +170,8 @@ class TableRecording(TabularRecording):
 
                 return parquet.read_table(self.path, columns=names, memory_map=False)
             return self._read_csv(names)
+        except RecordingError:
+            raise
         except MemoryError:
             raise RecordingError(self.path, "claims an absurd size", "write it again") from None
         except Exception as err:  # whatever a hostile table makes of the library
@@ -202,6 +204,10 @@ class TableRecording(TabularRecording):
                 strings_can_be_null=False,
             ),
         )
+        if not table.num_rows:
+            what = f"has no row of {len(self.columns)} cells beneath its line of column names"
+            remedy = "write a name for each cell of a row, and rows"
+            raise RecordingError(self.path, what, remedy)
         if not layout.decimal_comma:
             return table
         cells = [compute.replace_substring(table.column(name), ",", ".") for name in names]

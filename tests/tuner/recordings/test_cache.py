@@ -154,6 +154,9 @@ def test_folder_digest_sees_names_and_contents(tmp_path: Path) -> None:
     assert digest(folder) == before
     (folder / "metadata.yaml").rename(folder / "other.yaml")
     assert digest(folder) != before
+    if sys.platform == "linux":
+        (folder / os.fsdecode(b"\xff")).touch()  # a name that is not UTF-8
+        assert digest(folder) != before
 
 
 def test_the_version_is_of_all_source_in_the_folder(tmp_path: Path, monkeypatch) -> None:

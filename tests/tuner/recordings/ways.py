@@ -260,12 +260,23 @@ TABLES: Mapping[str, Callable[[], str | bytes]] = {
     "an index first": lambda: "\n".join(
         f"{i - 1 if i else ''},{row}" for i, row in enumerate(pose(*POSE).splitlines())
     ),
+    "an index without a name, as of R": lambda: "\n".join(
+        f"{i},{row}" if i else row for i, row in enumerate(pose(*POSE).splitlines())
+    ),
 }
 """Way -> the content of a table that holds a pose."""
 
 NOT_READ: Mapping[str, tuple[Callable[[], str], str]] = {
     "no time": (
         lambda: renamed({n: n for n in POSE[1:]}), "no column that is a time among x, y, z",
+    ),
+    "two cells without a name": (
+        lambda: pose(*POSE).replace("\n", ",1,2\n").replace(",1,2\n", "\n", 1),
+        "has no row of 8 cells beneath its line of column names",
+    ),
+    "no rows": (lambda: pose(*POSE).partition("\n")[0] + "\n", "has no row of 8 cells"),
+    "a cell without an end": (
+        lambda: pose(*POSE).partition("\n")[0] + "\n" + "1" * 200_000, "has no row of 8 cells"
     ),
     "no attitude": (
         lambda: renamed({n: n for n in POSE[:4]}), "by their names are its attitude, among time, x",
