@@ -60,3 +60,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     names = sorted(known)
     close = difflib.get_close_matches(str(word), names, n=1, cutoff=0.55)
     return f"did you mean '{close[0]}'?" if close else f"known are {', '.join(names)}"
+
+
+def short_reason(err: Exception) -> str:
+    """Return a library's error in one line, short enough for a message."""
+    return " ".join(str(err).split())[:120]

@@ -19,8 +19,10 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow
 
-from tuner.core.errors import RecordingError
+from tuner.core.errors import RecordingError, short_reason
 from tuner.core.numerics import Array
+from tuner.recordings import matlab_columns
+from tuner.recordings.matlab_columns import MAX_DEPTH, Described, described
 from tuner.recordings.notes import Note
 from tuner.recordings.recording import (
     TABLE_TOPIC,
@@ -28,7 +30,6 @@ from tuner.recordings.recording import (
     ReadResult,
     TabularRecording,
     TopicSamples,
-    short_reason,
 )
 from tuner.recordings.sources import column_meaning
 from tuner.recordings.table import NO_TIME, read_times
@@ -36,10 +37,6 @@ from tuner.recordings.table import NO_TIME, read_times
 MAGIC, MAGIC_7_3 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 #: All arrays together have no more bytes, and are no more: scipy recurses into nested ones.
 MAX_BYTES, MAX_ARRAYS = 1 << 30, 4000
-#: A matrix with more columns holds no signals side by side.
-MAX_MATRIX_COLUMNS = 32
-#: Structures may be nested so deep.
-MAX_DEPTH = 8
 #: The column that stands for the time of each structure, if several have their own.
 ANY_TIME = "*.time"
 
@@ -56,7 +53,7 @@ class MatlabRecording(TabularRecording):
     def __init__(self, path: Path) -> None:
         with path.open("rb") as stream:
             newer = stream.read(len(MAGIC_7_3)) == MAGIC_7_3
-        self._columns, whole = _described(_load_hdf5(path)) if newer else _load(path)
+        self._columns, whole = described(_load_hdf5(path)) if newer else _load(path)
         if not self._columns:
             raise RecordingError(
                 path,
@@ -115,10 +112,6 @@ class MatlabRecording(TabularRecording):
         return TopicSamples(time[known], time[known], values), notes
 
 
-Described = tuple[dict[str, Array], list[str]]
-"""Columns by their names, and the names of whole matrices."""
-
-
 def _load(path: Path) -> Described:
     """Read a file of version 5 to 7, in a process of its own: scipy may crash on a hostile one."""
     data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
@@ -134,7 +127,7 @@ def _load(path: Path) -> Described:
         raise RecordingError(
             path, f"holds more than {MAX_ARRAYS} arrays", "save each signal as one array"
         )
-    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()"]
+    command = [sys.executable, "-P", "-m", matlab_columns.__name__]
     done = subprocess.run(command, input=data, capture_output=True, check=False)
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
@@ -142,25 +135,6 @@ def _load(path: Path) -> Described:
     with np.load(io.BytesIO(done.stdout)) as held:
         names, whole, *columns = (held[f"arr_{number}"] for number in range(len(held.files)))
     return dict(zip(names.tolist(), columns, strict=True)), whole.tolist()
-
-
-def main() -> None:
-    """Write the columns of the MATLAB file on standard input to standard output, as npz."""
-    from scipy.io import loadmat  # noqa: PLC0415 (slow to import)
-
-    try:
-        data = io.BytesIO(sys.stdin.buffer.read())
-        columns, whole = _described(loadmat(data, simplify_cells=True))
-    except Exception as err:  # whatever a hostile file makes of the library
-        sys.exit(short_reason(err))
-    written = io.BytesIO()
-    np.savez(written, np.array(list(columns), str), np.array(whole, str), *columns.values())
-    sys.stdout.buffer.write(written.getbuffer())
-
-
-def _described(content: Mapping[str, Any]) -> Described:
-    whole = [name for name, value in content.items() if _is_matrix(value)]
-    return dict(_columns("", content, 0)), whole
 
 
 def _unreadable(path: Path, reason: str) -> RecordingError:
@@ -229,38 +203,6 @@ def _group_arrays(h5py: Any, group: Any, read: list[int], depth: int) -> dict[st
                 )
             held[name] = np.asarray(item).T
     return held
-
-
-def _columns(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, Array]]:
-    """Yield the numeric columns of a structure, by name."""
-    if isinstance(value, Mapping):
-        label = value.get("label")
-        for name, of in value.items() if depth < MAX_DEPTH else ():
-            if not str(name).startswith("__"):
-                # Simulink has a signal's name beside its values
-                own = label if name == "values" and isinstance(label, str) and label else name
-                yield from _columns(f"{prefix}.{own}" if prefix else str(own), of, depth + 1)
-    elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
-        for of in (
-            list(value)[:MAX_MATRIX_COLUMNS] if depth < MAX_DEPTH else ()
-        ):  # what Simulink calls signals
-            yield from _columns(prefix, of, depth + 1)
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
-        if 1 in value.shape or value.ndim == 1:
-            yield prefix, np.asarray(value.ravel(), dtype=np.float64)
-        elif _is_matrix(value):
-            table = value if value.shape[0] > value.shape[1] else value.T
-            for i, column in enumerate(table.T):
-                yield f"{prefix}[{i}]", np.asarray(column, dtype=np.float64)
-
-
-def _is_matrix(value: object) -> bool:
-    return (
-        isinstance(value, np.ndarray)
-        and value.ndim == 2
-        and value.dtype.kind in "fiu"
-        and 1 < min(value.shape) <= MAX_MATRIX_COLUMNS < max(value.shape)
-    )
 
 
 def _time_of(name: str, columns: Mapping[str, Array]) -> str | None:

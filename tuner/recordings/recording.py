@@ -23,11 +23,6 @@ NS_PER_SECOND = 1_000_000_000
 NS_PER_UNIT = {"s": NS_PER_SECOND, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 
-def short_reason(err: Exception) -> str:
-    """Return a library's error in one line, short enough for a message."""
-    return " ".join(str(err).split())[:120]
-
-
 #: The one topic of a table.
 TABLE_TOPIC = ""
 

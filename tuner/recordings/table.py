@@ -27,7 +27,7 @@ from pyarrow import (
 )
 from pyarrow import csv as arrow_csv
 
-from tuner.core.errors import RecordingError
+from tuner.core.errors import RecordingError, short_reason
 from tuner.core.numerics import Array
 from tuner.recordings.formats import MAX_LINE_BYTES, layout_of
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode
@@ -40,7 +40,6 @@ from tuner.recordings.recording import (
     ReadResult,
     TabularRecording,
     TopicSamples,
-    short_reason,
 )
 
 #: Tables with more columns, or more cells to be read, are no flight.

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from tuner.core.disk import readable
-from tuner.core.errors import RecordingError
+from tuner.core.errors import RecordingError, short_reason
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import (
     NS_PER_UNIT,
@@ -32,7 +32,6 @@ from tuner.recordings.recording import (
     Recording,
     Topic,
     TopicSamples,
-    short_reason,
 )
 
 #: No ULog message is longer; a format that claims so is damaged.

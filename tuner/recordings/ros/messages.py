@@ -21,8 +21,8 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat, Nodet
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from tuner.core.disk import read_bytes
-from tuner.core.errors import ConfigError, InputError, RecordingError
-from tuner.recordings.recording import FieldLayout, short_reason
+from tuner.core.errors import ConfigError, InputError, RecordingError, short_reason
+from tuner.recordings.recording import FieldLayout
 
 #: Fields of a message type in their order: name and rosbags' description of its type.
 Fields = list[tuple[str, Any]]
