@@ -72,7 +72,7 @@ STAGES: Mapping[str, tuple[str, ...]] = {
         "lifts_otherwise",
         *("still_axes", "no_yaw", "implausible", "start_on_bound"),
         *("not_finite", "nothing_has", "no_effect", "singular", "setpoints", "heading_flown"),
-        *("input_late", "turning_regressed", "turning_not"),
+        *("rate_loop", "input_late", "turning_regressed", "turning_not"),
     ),
     "Without a pose": ("scales_with", "no_tacho", "yaw_open", "rate_"),
     "Of ground measurements": ("ground_conflict", "bench_conflict"),
@@ -119,6 +119,11 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "Compare it with the autopilot's parameters, and the vehicle file's arms with the vehicle's; "
     "intervals hold what the difference moves. Where one flight alone has another P, the line "
     "names it: leave it out.",
+    Code.RATE_LOOP_DIFFERS: "Before the search the controller file's rate loop is replayed on the "
+    "recorded rate set-points and body rates: the recorded commands follow from other gains, "
+    "filters or another rate of it, which the line names with their values. Correct the controller "
+    "file by the autopilot's parameters. Where no term of the fit stands for what differs, the run "
+    "calls itself not usable.",
     Code.ROTOR_SPEEDS_LATE: "Recorded rotor speeds come after the turning that they make, or "
     "before it: they were filtered, or are stamped otherwise than the gyro. Intervals hold what "
     "that moves.",

@@ -199,7 +199,7 @@ def _axis_estimates(
     scores, square = [], np.zeros((3, 3))
     for (z, _), (x, torque), signals in zip(made, real, recorded, strict=True):
         left = torque - x @ supposed
-        square += _square_of_sum(z, left, max(1, round(MEMORY_S / signals.step)))
+        square += square_of_sum(z, left, max(1, round(MEMORY_S / signals.step)))
         many = max(round(len(left) * signals.step / STRETCH_S), 1)
         scores += [z[rows].T @ left[rows] for rows in np.array_split(np.arange(len(left)), many)]
     inverse = np.linalg.inv(total)
@@ -225,7 +225,7 @@ def _as_instrument(made: tuple[Array, Array], torque: Array) -> tuple[Array, Arr
     return follows * columns, follows * of_file
 
 
-def _square_of_sum(instruments: Array, left: Array, memory: int) -> Array:
+def square_of_sum(instruments: Array, left: Array, memory: int) -> Array:
     """Return the mean square (3, 3) of the sum of instruments (N, 3) times residuals (N,)."""
     count = len(left)
     square = np.mean(left**2) * instruments.T @ instruments

@@ -378,6 +378,11 @@ class Code(CodeWithText):
             else "Leave it out, or fit it by itself with the gains that flew."
         ),
     )
+    RATE_LOOP_DIFFERS = (
+        "rate_loop_differs",  # SETTING, SETTING_error, SETTING_file; names: SETTINGs
+        sentences.rate_loop_differs,
+        sentences.rate_loop_remedy,
+    )
     ROTOR_SPEEDS_LATE = (
         "rotor_speeds_late",  # seconds
         sentences.rotor_speeds_late,

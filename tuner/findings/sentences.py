@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from tuner.core.phrases import as_sentence, listed, percent, with_error
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode, damage_sentence, note_in_words
+from tuner.vehicle.controller import PARAMETER_OF
 
 if TYPE_CHECKING:
     from tuner.findings.findings import Finding
@@ -245,6 +246,29 @@ def controller_gains_differ(finding: Finding) -> str:
     if finding.subject != CONTROLLER_FILE:
         return as_sentence(f"{difference}, and the other flights do not")
     return as_sentence(f"{difference}; intervals hold what that moves")
+
+
+def rate_loop_differs(finding: Finding) -> str:
+    """Return the settings of the rate loop with which recorded commands were made."""
+    numbers, parts = finding.numbers, []
+    for name in finding.names:
+        unit = " Hz" if name == "rate.rate" or name.endswith("cutoff") else ""
+        value, error, of_file = (numbers[f"{name}{of}"] for of in ("", "_error", "_file"))
+        known = with_error(value, error) if error else f"{value:g}"
+        parts.append(f"{name} {known}{unit} instead of {of_file:g}{unit}")
+    return (
+        "Another rate loop flew than the controller file's: from recorded set-points and body "
+        f"rates, it gave the recorded motor commands with {listed(parts)}."
+    )
+
+
+def rate_loop_remedy(finding: Finding) -> str:
+    """Return the autopilot's parameters by which the controller file is to be corrected."""
+    parameters = [PARAMETER_OF[tuple(name.split("."))] for name in finding.names]
+    return (
+        f"Correct the controller file by the autopilot's parameters ({', '.join(parameters)}), and "
+        "fit again."
+    )
 
 
 def rotor_speeds_late(finding: Finding) -> str:

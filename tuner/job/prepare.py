@@ -27,6 +27,7 @@ from tuner.core.spans import span
 from tuner.engine.beside import do_beside
 from tuner.equation_error.estimate import TORQUE_GAINS, RegressionEstimate, estimate
 from tuner.equation_error.model_accelerations import moves_rotors
+from tuner.equation_error.rate_loop import rate_loop_findings
 from tuner.equation_error.recorded_accelerations import (
     MIN_SAMPLES,
     rows_of,
@@ -144,6 +145,7 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
         *merged_by_flight(
             (*_recordings(job), *_sparse_inputs(job), *_motor_orders(job), *_controllers(job))
         ),
+        *_rate_loop(job),
         *_recorded_twice(job),
         *_default_mass(job),
         *_no_tachometer(job),
@@ -368,6 +370,13 @@ def _controllers(job: Job) -> Iterator[Finding]:
     for flight, inlet in zip(job.fitted, job.inlets, strict=True):
         if INLETS[inlet].closed_loop:
             yield from setpoint_findings(flight, job.settings.controller)
+
+
+def _rate_loop(job: Job) -> Iterator[Finding]:
+    """Warn of a rate loop, of those that are simulated, other than the controller file's."""
+    pairs = zip(job.fitted, job.inlets, strict=True)
+    flown = [flight for flight, inlet in pairs if inlet in ("reference", "body_rate")]
+    return rate_loop_findings(flown, job.settings.controller)
 
 
 def _is_default(origin: Mapping[str, str], setting: str) -> bool:

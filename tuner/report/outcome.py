@@ -68,7 +68,12 @@ CONFLICT_CODES = WRONG_INPUT_CODES | {
     Code.ROTORS_UNEQUAL,
 }
 """Warnings of inputs or measurements that contradict the flights, to be resolved next."""
-CAUSE_CODES = WRONG_INPUT_CODES | {Code.CONTROLLER_ANSWERS, Code.TERM_SHOWS, Code.INLET_CHOSEN}
+CAUSE_CODES = WRONG_INPUT_CODES | {
+    Code.CONTROLLER_ANSWERS,
+    Code.RATE_LOOP_DIFFERS,
+    Code.TERM_SHOWS,
+    Code.INLET_CHOSEN,
+}
 """Warnings that cause others."""
 DOUBT_CODES = CONFLICT_CODES | frozenset(
     {
@@ -90,6 +95,19 @@ DOUBT_CODES = CONFLICT_CODES | frozenset(
     }
 )
 """Warnings that cast doubt on the numbers."""
+
+
+COEFFICIENT_OF = {
+    "rate.roll.k": "rate_gain_roll_pitch",
+    "rate.pitch.k": "rate_gain_roll_pitch",
+    "rate.yaw.k": "rate_gain_yaw",
+    "rate.roll.i": "integral_gain",
+    "rate.pitch.i": "integral_gain",
+    "rate.yaw.i": "integral_gain",
+    "filters.gyro_cutoff": "gyro_cutoff_factor",
+    "filters.dgyro_cutoff": "derivative_cutoff_factor",
+}
+"""Key of a rate loop in the controller file -> coefficient that stands for it."""
 
 
 class Usability(StrEnum):
@@ -352,11 +370,17 @@ def _is_unfounded(result: RunResult, flights: Sequence[FlightOutcome]) -> bool:
 
 
 def _is_of_another_loop(result: RunResult) -> bool:
-    """Return whether recorded commands have both P and I of another rate loop than the fitted one.
+    """Return whether recorded commands are those of another rate loop than the fitted one.
 
-    A fit finds gains that differ from the file's alone; one that contradicts the commands of all
-    its flights has put the error of a vehicle file, or of a controller file, into its coefficients.
+    They are where they show a setting that no fitted coefficient stands for, or both another P and
+    another I. A fit finds gains that differ from the file's alone; one that contradicts the
+    commands of all its flights has put the error of a vehicle file, or of a controller file, into
+    its coefficients.
     """
+    fitted = {name for name, row in result.coefficients.items() if row.fitted}
+    loops = [found for found in result.findings if found.code is Code.RATE_LOOP_DIFFERS]
+    if any(COEFFICIENT_OF.get(name) not in fitted for found in loops for name in found.names):
+        return True
     parts = {
         found.names[0]
         for found in result.findings

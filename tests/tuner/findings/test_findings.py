@@ -192,6 +192,13 @@ MADE = {
         {"roll": 1.05, "roll_error": 0.004},
         ("P", "roll"),
     ),
+    Code.RATE_LOOP_DIFFERS: Finding(
+        Code.RATE_LOOP_DIFFERS,
+        "warning",
+        "controller file",
+        {"rate.rate": 250.0, "rate.rate_error": 0.0, "rate.rate_file": 400.0},
+        ("rate.rate",),
+    ),
     Code.ROTOR_SPEEDS_LATE: Finding(
         Code.ROTOR_SPEEDS_LATE, "warning", "rotor speeds", {"seconds": 0.009}
     ),

@@ -192,6 +192,30 @@ def test_commands_of_another_rate_loop_than_the_fitted_one_forbid_it(result, ans
     assert command == "tune report x --open"
 
 
+@pytest.mark.parametrize(
+    ("setting", "fitted", "expected"),
+    [
+        ("rate.rate", (), Usability.UNUSABLE),
+        ("rate.roll.ff", ("rate_gain_roll_pitch",), Usability.UNUSABLE),
+        ("filters.gyro_cutoff", (), Usability.UNUSABLE),
+        ("filters.gyro_cutoff", ("gyro_cutoff_factor",), Usability.USABLE),
+        ("rate.yaw.k", ("rate_gain_yaw",), Usability.USABLE),
+    ],
+)
+def test_a_setting_of_the_rate_loop_that_no_coefficient_stands_for_forbids_it(
+    result, setting, fitted, expected
+):
+    numbers = {setting: 25.0, f"{setting}_error": 1.0, f"{setting}_file": 40.0}
+    loop = Finding(Code.RATE_LOOP_DIFFERS, "warning", CONTROLLER_FILE, numbers, (setting,))
+    row = result.coefficients["inertia_xx"].model_copy(update={"fitted": True})
+    rows = {**result.coefficients, **dict.fromkeys(fitted, row)}
+    said = noticing(result.model_copy(update={"coefficients": rows}), loop)
+    found = outcome(said)
+    assert found.usability is expected
+    if expected is Usability.UNUSABLE:
+        assert next_step(said, found, Path("x"))[0] == remedy(loop)
+
+
 def test_flights_that_tell_nothing_of_the_vehicle_and_check_nothing_are_not_usable(result):
     rows = {
         name: row.model_copy(update={"identifiable": COEFFICIENTS[name].is_effect})
