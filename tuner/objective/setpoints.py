@@ -92,7 +92,7 @@ class SetpointMatch:
     axes
         Roll, pitch, yaw.
     delay
-        s, age of the recorded state in the controller, by roll and pitch.
+        s, age of the recorded state in the controller: with it what is compared is likeliest.
     thrust
         Of the thrust set-points; None without recorded ones.
     """
@@ -129,16 +129,18 @@ def match_setpoints(flight: Flight, controller: ControllerFile) -> SetpointMatch
     chosen = np.linspace(0, inside.sum() - 1, COMPARED_SETPOINTS).astype(np.intp)
     time, wanted = recorded.time[inside][chosen], recorded.values[inside][chosen]
     computed = _computed(flight, controller, time)
-    matches = [tuple(_axis(wanted[:, i], of[:, i]) for i in range(3)) for of in computed]
-    best = max(
-        range(len(matches)), key=lambda at: sum(axis.correlation for axis in matches[at][:2])
-    )
-    thrust, linear = None, computed[best, :, -1] > 0.0
-    if flight.has("thrust_setpoint") and linear.sum() >= 50:
+    told = None
+    if flight.has("thrust_setpoint"):
         told = zero_order_hold(flight.series["thrust_setpoint"], time).ravel()
-        same = _same_but_for_markers(computed[best, linear, 4:-1])
-        thrust = _axis(same(told[linear]), same(computed[best, linear, 3]))
-    return SetpointMatch(matches[best], float(LATENCIES_S[best]), thrust)
+    matches = [
+        SetpointMatch(
+            tuple(_axis(wanted[:, i], of[:, i]) for i in range(3)),
+            float(late),
+            None if told is None else _thrust(told, of),
+        )
+        for late, of in zip(LATENCIES_S, computed, strict=True)
+    ]
+    return max(matches, key=_likelihood)
 
 
 def setpoint_findings(flight: Flight, controller: ControllerFile) -> Iterator[Finding]:
@@ -186,6 +188,26 @@ def setpoint_findings(flight: Flight, controller: ControllerFile) -> Iterator[Fi
     if not match.heading_is_ours:
         heading = round(match.axes[2].correlation, 2)
         yield Code.HEADING_FLOWN.warning(flight.name, correlation=heading)
+
+
+def _likelihood(match: SetpointMatch) -> float:
+    """Return the log-likelihood of a match by roll, pitch and thrust, per sample.
+
+    But for a constant, of regressions whose variance is what they leave: thrust of vertical flights
+    tells the delay, where roll and pitch, which noise commands, tell little.
+    """
+    compared = [*match.axes[:2], *([] if match.thrust is None else [match.thrust])]
+    told = np.array([max(axis.correlation, 0.0) for axis in compared])
+    return -0.5 * float(np.sum(np.log(1.0 - told**2 + 1e-12)))
+
+
+def _thrust(told: Array, computed: Array) -> AxisMatch | None:
+    """Return the comparison of thrust set-points (n,) with computed ones (n, 10); None for few."""
+    linear = computed[:, -1] > 0.0
+    if linear.sum() < 50:
+        return None
+    same = _same_but_for_markers(computed[linear, 4:-1])
+    return _axis(same(told[linear]), same(computed[linear, 3]))
 
 
 def _guess(gain: float, controller: ControllerFile) -> str:

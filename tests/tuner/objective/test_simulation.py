@@ -376,6 +376,14 @@ def test_set_points_that_answer_an_old_state_are_reported(flight):
     assert "ms old" in one_line(finding)
 
 
+def test_thrust_tells_how_old_a_state_is_where_noise_commands_roll_and_pitch(flight):
+    """Vertical flights: a wrong age made their thrust set-points 7 % less and 12 % more."""
+    prompt, random = match_setpoints(flight, OURS).delay, np.random.default_rng(0)
+    for _ in range(6):
+        shaken = with_setpoints(flight, lambda v: v + random.normal(0.0, [5.0, 5.0, 0.0], v.shape))
+        assert match_setpoints(shaken, OURS).delay == pytest.approx(prompt, abs=0.005)
+
+
 def test_set_points_of_another_controller_enter_below_the_reference(flight):
     foreign = with_setpoints(flight, lambda values: values[::-1] * [1.0, -1.0, 1.0])
     inlet, because = choose_inlet(foreign, "auto", None, OURS)
