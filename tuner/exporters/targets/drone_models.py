@@ -66,7 +66,11 @@ def table(vehicle: VehicleFile, provenance: str) -> str:
 
 def _rotor_gates(vehicle: VehicleFile) -> tuple[Gate, ...]:
     arms = [abs(r.position[axis]) for r in vehicle.rotors for axis in (0, 1)]
-    objections = () if vehicle.is_quad else ("it has four rotors",)
+    objections = (
+        ()
+        if vehicle.is_quad
+        else (f"the vehicle has {len(vehicle.rotors)} rotors, the simulator four",)
+    )
     if max(arms) - min(arms) > PLACE_TOLERANCE_M:
         objections = (f"its rotors sit in no square: arms of {min(arms):g} to {max(arms):g} m",)
     return (Gate("the simulator has such rotors", objections),)

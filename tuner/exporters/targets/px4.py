@@ -90,7 +90,7 @@ def parameters(vehicle: VehicleFile, simulator: Simulator) -> dict[str, float | 
     if hover is None:
         raise ExportError(
             vehicle.name,
-            f"cannot hover: it needs {laws.hover_speed(flown):.0f} rad/s, its rotors turn at "
+            f"cannot hover: it needs {laws.hover_speed(flown):.4g} rad/s, its rotors turn at "
             f"{laws.rotor_speed(flown, 0):.0f} to {laws.rotor_speed(flown, 1):.0f}",
             "check mass, motor_constant and input_scaling",
         )
