@@ -506,8 +506,6 @@ BY_REGRESSION = (
     "moment_constant",
 )
 """Coefficients that simulations cannot separate from `TORQUE_GAINS`."""
-INFLOW = "max_relative_airspeed"
-"""A coefficient of every vehicle, whose law many do not follow: it is a candidate here."""
 
 
 def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
@@ -527,8 +525,6 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     if steps is None:
         return job, ()
     candidates = dict(candidate_groups(job))
-    if INFLOW not in (*job.space.free, *own.fixed):
-        candidates[INFLOW] = (INFLOW,)
     names = [name for group in candidates.values() for name in group]
     effects = neutral_values([n for n in (*names, *TORQUE_GAINS) if COEFFICIENTS[n].is_effect])
     initial = initial_values(settings.vehicle, settings.controller, names)

@@ -138,6 +138,20 @@ def test_thrust_drag_and_battery_come_back_from_a_sparse_log(sparse, updated, fu
     )
 
 
+def test_thrust_that_airspeed_costs_is_no_lesser_motor_constant(dense, updated, full_bag, tmp_path):
+    truth = values_of(updated)
+    start = with_values(updated, {"max_relative_airspeed": 100.0, "motor_constant": 8e-6})
+    # nothing of an attitude that is followed tells the motor map
+    fixed = ("input_scaling", "zero_position_armed", "time_constant_up", "time_constant_down")
+    followed = {dense.name: FlightSettings(inlet="attitude")}
+    settings = settings_of(start, full_bag, fixed=fixed, flights=followed)
+    job = job_of(settings, recordings_of(settings, [dense]))
+    fitted = search(job, tmp_path, resume=False, on_progress=lambda *_: None)
+    found = job.space.numbers(fitted.point.coefficients)
+    assert found["motor_constant"] == pytest.approx(truth["motor_constant"], rel=0.002)
+    assert found["max_relative_airspeed"] == pytest.approx(25.0, rel=0.1)
+
+
 def test_a_flight_held_out_is_followed_where_all_fitted_ones_are(
     sparse, dense, updated, full_bag, monkeypatch
 ):
