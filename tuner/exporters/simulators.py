@@ -90,7 +90,8 @@ class Simulator:
         groups: dict[str, tuple[str, ...]] = {}
         for name, value in acting.items():
             if self.built_in(name) not in (None, value):
-                group = REGISTRY[name].group or name
+                row = REGISTRY[name]
+                group = row.group if row.group and row.by_law is None else name
                 groups[group] = (*groups.get(group, ()), name)
         return groups
 

@@ -161,7 +161,7 @@ class RecordedInlet(ABC):
     frees: ClassVar[tuple[str, ...]] = ()
     """Coefficients that are free besides the usual ones: no loop compensates them here."""
     terms: ClassVar[tuple[str, ...]] = ()
-    """Terms, by group or coefficient, free from the start if the job leaves the choice."""
+    """Groups of terms that are free from the start, if the job leaves the choice."""
     computed_at: ClassVar[str | None] = None
     """The rate of a `Schedule` at which the flight controller computes the signal."""
     remedy: ClassVar[str] = "use inlet: auto"
@@ -241,12 +241,9 @@ class RecordedInlet(ABC):
 STEADY_TORQUE = ("torque_trim_x", "torque_trim_y", "torque_trim_z")
 """Trims of recorded inputs: as rotors differ and the mass is off centre, these hold a steady torque
 that turns nothing."""
-INFLOW_LOSS = "max_relative_airspeed"
-"""By Gazebo's law axial airspeed of either sign costs thrust, as on few vehicles; held at the
-file's, motor_constant would be biased to make up for it."""
-DAMPING_TERMS = ("linear_drag", "angular_drag", "flapping_moment", "thrust_inflow", INFLOW_LOSS)
-"""Terms of aerodynamic damping, by group or coefficient, free from the start in open loop: without
-them the torque of the recorded inputs would be biased to make up for it."""
+DAMPING_TERMS = ("linear_drag", "angular_drag", "flapping_moment", "thrust_inflow")
+"""Groups of terms of aerodynamic damping, free from the start in open loop: without them the torque
+of the recorded inputs would be biased to make up for it."""
 
 
 class RecordedReference(RecordedInlet):
@@ -361,7 +358,6 @@ class RecordedAttitude(RecordedInlet):
     needs = ("attitude",)
     not_compared = ("attitude", "body_rate", "command", "rotor_speed")
     replaces = ("estimate", "rate control", "turning", "tachometer")
-    terms = (INFLOW_LOSS,)
     ignores = ("attitude", "body_rate", "rate_integral", "trim")
     starts_recorded = False
     window = 1.0
@@ -434,7 +430,7 @@ def also_free_by(names: Collection[InletName], *, terms: bool) -> frozenset[str]
     of_inlet = [
         {
             *INLETS[name].frees,
-            *(member for g in INLETS[name].terms if terms for member in groups.get(g, (g,))),
+            *(member for g in INLETS[name].terms if terms for member in groups[g]),
         }
         for name in names
     ]

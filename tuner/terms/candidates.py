@@ -33,7 +33,7 @@ def candidate_groups(job: Job) -> Groups:
         group: names
         for group, names in groups.items()
         if not taken.intersection(names)
-        and all(values.get(name) in (None, COEFFICIENTS[name].neutral) for name in names)
+        and all(values.get(name) in (None, COEFFICIENTS[name].unselected) for name in names)
     }
 
 
@@ -102,8 +102,8 @@ def prior_presence_of(names: Collection[str]) -> float:
 
 
 def neutral_values(names: Sequence[str]) -> dict[str, float]:
-    """Return the neutral values of some coefficients; each of a term has one."""
-    return {n: value for n in names if (value := COEFFICIENTS[n].neutral) is not None}
+    """Return the neutral values of some coefficients; each of a term has one, or one by law."""
+    return {n: value for n in names if (value := COEFFICIENTS[n].unselected) is not None}
 
 
 def with_terms(

@@ -334,7 +334,7 @@ def linearise(
 
 def neutral_of(space: Space) -> Array:
     """Return the scaled neutral values (K,) of the terms' coefficients; zero for others."""
-    rows = [(parameter, COEFFICIENTS[parameter.name].neutral) for parameter in space.parameters]
+    rows = [(parameter, COEFFICIENTS[parameter.name].unselected) for parameter in space.parameters]
     return np.array(
         [
             0.0

@@ -117,9 +117,11 @@ class Coefficient(ScaledQuantity):
         before those that flights show. None comes last.
     neutral
         The value at which its term vanishes.
+    by_law
+        Of a coefficient of Gazebo's law that other vehicles may not follow: its value there.
     group
-        Of an effect: the group that a selection of terms adds together; empty for one that follows
-        from others.
+        The group that a selection of terms adds together; empty for an effect that follows from
+        others, and for most coefficients of the base model.
     is_aggregate
         Of an effect: whether it is the sum of other terms' effects.
     expected
@@ -164,6 +166,7 @@ class Coefficient(ScaledQuantity):
     length_exponent: float = 0.0
     hold_rank: int | None = None
     neutral: float | None = None
+    by_law: float | None = None
     group: str = ""
     is_aggregate: bool = False
     expected: bool = False
@@ -188,6 +191,11 @@ class Coefficient(ScaledQuantity):
     def is_effect(self) -> bool:
         """Whether it belongs to an optional term."""
         return self.place[0] == EFFECTS
+
+    @property
+    def unselected(self) -> float | None:
+        """Its value where a selection of terms leaves its group out."""
+        return self.neutral if self.by_law is None else self.by_law
 
     @property
     def is_optional(self) -> bool:

@@ -211,8 +211,10 @@ _ROWS = (
         meaning="axial airspeed at which thrust vanishes",
         source="thesis Eq. 6.6; 25 m/s in gazebo_motor_model.cpp",
         place=("aerodynamics", "max_relative_airspeed"),
-        bounds=10.0,
+        bounds=1000.0,
         prior_sd=1.0,
+        by_law=25.0,
+        group="thrust_inflow",
         exported_as={
             "sdf": NoExportTag("the motor plugins have 25 m/s built in", 25.0),
             "px4": NoExportTag("the SIH model's thrust does not depend on the airspeed", NO_LOSS),

@@ -28,7 +28,7 @@ NOBODY = cast(Any, None)
 MODEL = ("inertia_xx", "estimate_latency")
 USUAL = {
     "fuselage_drag": COEFFICIENTS["fuselage_drag"].prior_sd,
-    "thrust_inflow_coefficient": COEFFICIENTS["thrust_inflow_coefficient"].prior_sd,
+    "rotor_drag_ratio_y": COEFFICIENTS["rotor_drag_ratio_y"].prior_sd,
 }
 MARKERS_UNSEEN = SimpleNamespace(controller=SimpleNamespace(sees_markers=0.0))
 STEPS, STRETCHES, FLIGHTS = 50, 40, 4
@@ -147,18 +147,18 @@ def chosen(monkeypatch: pytest.MonkeyPatch):
 
 
 DRAG = row("fuselage_drag", SelectionCode.NOT_SIGNIFICANT)
-INFLOW = row("thrust_inflow", SelectionCode.IMMATERIAL)
+RATIO = row("rotor_drag_ratio", SelectionCode.IMMATERIAL)
 FLAPPING = row("flapping_moment", SelectionCode.NOT_PREDICTED)
 
 
 def test_a_term_that_least_squares_missed_is_called_for(chosen) -> None:
-    rows = [DRAG, INFLOW, FLAPPING]
+    rows = [DRAG, RATIO, FLAPPING]
     innovation = seen(rows, {"fuselage_drag": 0.5})
     selected, found = chosen(innovation)
     assert set(found["groups"]) == {"fuselage_drag"}
     assert [r.kept for r in selected.rows] == [True, False, False]
     assert selected.rows[0].reason is SelectionCode.PREDICTS_SAMPLES
-    assert selected.left_out == (INFLOW.names, FLAPPING.names)
+    assert selected.left_out == (RATIO.names, FLAPPING.names)
     numbers = innovation.space.numbers(
         np.array([found["vector"][name] for name in innovation.space.names])
     )
@@ -166,7 +166,7 @@ def test_a_term_that_least_squares_missed_is_called_for(chosen) -> None:
 
 
 def test_chance_adds_no_term(chosen) -> None:
-    assert chosen(seen([DRAG, INFLOW, FLAPPING], {})) is None
+    assert chosen(seen([DRAG, RATIO, FLAPPING], {})) is None
 
 
 def test_a_term_as_good_as_absent_is_not_worth_a_coefficient(chosen) -> None:
@@ -177,22 +177,22 @@ def test_a_term_as_good_as_absent_is_not_worth_a_coefficient(chosen) -> None:
 def test_a_small_term_that_another_would_make_up_for_is_worth_one(chosen) -> None:
     """Sizes that are usual of large vehicles are not of small ones."""
     alike = {"fuselage_drag": "inertia_xx"}
-    _, found = chosen(seen([DRAG, INFLOW], {"fuselage_drag": 0.05}, alike))
+    _, found = chosen(seen([DRAG, RATIO], {"fuselage_drag": 0.05}, alike))
     assert set(found["groups"]) == {"fuselage_drag"}
-    assert chosen(seen([DRAG, INFLOW], {"fuselage_drag": 0.05})) is None
+    assert chosen(seen([DRAG, RATIO], {"fuselage_drag": 0.05})) is None
 
 
 def test_a_term_that_replaced_another_is_removed_as_that_one_is_added(chosen) -> None:
     there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
     innovation = seen(
-        [there, INFLOW],
-        {"thrust_inflow_coefficient": 0.5, "angular_drag_x": 0.0},
-        {"angular_drag_x": "thrust_inflow_coefficient"},
+        [there, RATIO],
+        {"rotor_drag_ratio_y": 0.5, "angular_drag_x": 0.0},
+        {"angular_drag_x": "rotor_drag_ratio_y"},
     )
     selected, found = chosen(innovation)
-    assert set(found["groups"]) == {"thrust_inflow"}
+    assert set(found["groups"]) == {"rotor_drag_ratio"}
     assert [(r.group, r.reason) for r in selected.rows] == [
-        ("thrust_inflow", SelectionCode.PREDICTS_SAMPLES),
+        ("rotor_drag_ratio", SelectionCode.PREDICTS_SAMPLES),
         ("angular_drag", SelectionCode.NOT_SIGNIFICANT),
     ]
 
@@ -203,23 +203,23 @@ def test_a_lumped_term_of_least_squares_is_removed_first_and_returns_where_no_ot
     """Gusts pass for it, and from there what it stands in for looks as if it were not there."""
     truth, had = {"angular_drag_x": 0.5}, ["angular_drag"]
     there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
-    assert chosen(seen([there, INFLOW], truth), had) is None  # it stays where it was judged before
-    selected, found = chosen(seen([there, INFLOW], truth), had, first=True)
+    assert chosen(seen([there, RATIO], truth), had) is None  # it stays where it was judged before
+    selected, found = chosen(seen([there, RATIO], truth), had, first=True)
     assert not found["groups"]
     assert not any(r.kept for r in selected.rows)
     gone = row("angular_drag", SelectionCode.NOT_SIGNIFICANT)
-    _, found = chosen(seen([gone, INFLOW], truth), had)
+    _, found = chosen(seen([gone, RATIO], truth), had)
     assert set(found["groups"]) == {"angular_drag"}
-    assert chosen(seen([gone, INFLOW], truth), ()) is None
+    assert chosen(seen([gone, RATIO], truth), ()) is None
 
 
 def test_others_are_judged_without_the_lumped_term(chosen) -> None:
     """A fit with it leaves nothing for another to do that does the same."""
     there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
     innovation = seen(
-        [there, INFLOW],
+        [there, RATIO],
         {},
-        {"angular_drag_x": "thrust_inflow_coefficient"},
+        {"angular_drag_x": "rotor_drag_ratio_y"},
     )
     moved = innovation.linear.scaled.copy()
     moved[list(innovation.space.names).index("angular_drag_x")] = (
@@ -227,7 +227,7 @@ def test_others_are_judged_without_the_lumped_term(chosen) -> None:
     )
     stood_in = replace(innovation, linear=replace(innovation.linear, scaled=moved))
     _, found = chosen(stood_in, first=True)
-    assert set(found["groups"]) == {"thrust_inflow"}
+    assert set(found["groups"]) == {"rotor_drag_ratio"}
 
 
 @pytest.mark.parametrize(
@@ -256,7 +256,7 @@ def test_a_term_equivalent_to_another_at_neutral_starts_away_from_it(chosen) -> 
         row("motor_lag", SelectionCode.IMMATERIAL),
         row("fuselage_drag", SelectionCode.SIGNIFICANT, kept=True),
     )
-    innovation = seen([lag, drag, INFLOW], {"time_constant_second": 0.1})
+    innovation = seen([lag, drag, RATIO], {"time_constant_second": 0.1})
     selected, found = chosen(innovation, lags=True)
     assert set(found["groups"]) == {"motor_lag", "fuselage_drag"}
     assert [r.group for r in selected.rows if r.kept] == ["motor_lag", "fuselage_drag"]
@@ -303,7 +303,7 @@ def test_an_insignificant_term_is_not_refitted(chosen) -> None:
 
 @pytest.mark.parametrize(("size", "needed"), [(0.5, True), (1e-3, False)])
 def test_a_term_in_the_fit_is_needed_where_samples_contradict_its_absence(size, needed) -> None:
-    there = fitted_at({"fuselage_drag": size * USUAL["fuselage_drag"]}, [DRAG], [INFLOW])
+    there = fitted_at({"fuselage_drag": size * USUAL["fuselage_drag"]}, [DRAG], [RATIO])
     assert there.called_for(["fuselage_drag"]) == (("fuselage_drag",) if needed else ())
 
 
