@@ -201,7 +201,8 @@ def sort_by_weight(findings: Sequence[Finding]) -> list[Finding]:
     refuted = any(finding.code is Code.FLIGHTS_REFUTE for finding in found)
 
     def weight(finding: Finding) -> tuple[bool, ...]:
-        is_cause, is_doubt = (finding.code in codes for codes in (CAUSE_CODES, DOUBT_CODES))
+        is_cause = finding.code in CAUSE_CODES
+        is_doubt = is_cause or finding.code in DOUBT_CODES
         cause = refuted and finding.code in WRONG_VEHICLE_CODES
         left_out = finding.code is Code.LEFT_OUT
         return not cause, finding.level != "failure", not is_cause, not left_out, not is_doubt

@@ -14,6 +14,7 @@ from tuner.report.outcome import (
     flights_table,
     next_step,
     outcome,
+    sort_by_weight,
     verdict_counts,
     warnings_of,
 )
@@ -209,6 +210,10 @@ def test_a_setting_of_the_rate_loop_that_no_coefficient_stands_for_forbids_it(
     loop = Finding(Code.RATE_LOOP_DIFFERS, "warning", CONTROLLER_FILE, numbers, (setting,))
     row = result.coefficients["inertia_xx"].model_copy(update={"fitted": True})
     rows = {**result.coefficients, **dict.fromkeys(fitted, row)}
+    answers = {"roll": 1.2, "roll_error": 0.01}
+    follows = Finding(Code.CONTROLLER_ANSWERS, "warning", CONTROLLER_FILE, answers, ("P", "roll"))
+    said = noticing(result.model_copy(update={"coefficients": rows}), loop, follows)
+    assert sort_by_weight(said.findings)[0] == loop
     said = noticing(result.model_copy(update={"coefficients": rows}), loop)
     found = outcome(said)
     assert found.usability is expected
