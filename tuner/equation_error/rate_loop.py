@@ -188,14 +188,14 @@ class _Loop:
             there &= np.diff(series.time, prepend=-np.inf) > 0.0
             known[name] = Series(series.time[there], series.values[there])
         told, gyro, command = (known[name] for name in SIGNALS)
-        fewest = min(len(part.time) for part in known.values())
-        if fewest < LAGS + FIRST_LAG + 2 or command.values.shape[1] != ROTORS:
+        fewest, least = min(len(part.time) for part in known.values()), LAGS + FIRST_LAG + 2
+        if fewest < least or command.values.shape[1] != ROTORS:
             return None
         even = all(float(np.ptp(np.diff(part.time))) < UNEVEN_S for part in known.values())
         begin = max(gyro.time[0], told.time[0])
         end = min(gyro.time[-1], begin + seconds)
         inside = np.flatnonzero((command.time >= begin) & (command.time <= end))
-        if len(inside) < 2:
+        if len(inside) < least:
             return None
         gap = float(np.median(np.diff(command.time)))
         inside = inside[:: max(1, round(SAMPLE_S / gap))]

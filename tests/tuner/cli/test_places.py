@@ -60,9 +60,9 @@ IN = [
     (("report", "{bag}/x"), "is no folder"),
     (("report", "{lab}/folder.csv"), "result.json"),
     (("export", LONG, "--format", "px4"), "cannot be read"),
-    ((*EXPORT, "sdf", "--into", "{lab}/folder.csv"), A_FOLDER),
+    ((*EXPORT, "sdf", "--into", "{lab}/folder.csv"), "cannot be read (Is a directory)"),
     ((*EXPORT, "sdf", "--into", "{lab}/none.sdf"), "does not exist"),
-    ((*EXPORT, "sdf", "--into", LONG), TOO_LONG),
+    ((*EXPORT, "sdf", "--into", LONG), "cannot be read (File name too long)"),
 ]
 
 

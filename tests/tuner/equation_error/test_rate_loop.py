@@ -159,3 +159,12 @@ def test_flights_without_signals_or_with_motors_at_their_limit_say_nothing():
     assert not said([replace(second, series=clipped)])
     ((names, _),) = said([first, replace(second, series=clipped)])
     assert names == ("rate.pitch.p",)
+
+
+def test_a_short_log_of_few_samples_says_nothing():
+    flight = recorded(0)
+    rows = slice(0, 260, 20)
+    command = flight.series["command"]
+    few = Series(command.time[rows], command.values[rows])
+    short = replace(flight, series={**flight.series, "command": few})
+    assert not list(rate_loop_findings([short], FILE))
