@@ -5,7 +5,8 @@ their initial values would worsen the fit; so one of every such group, the stand
 the others are fitted given its value.
 
 A selected term that the flights do not determine and that ends at a bound is in the model by
-chance: it goes back to its initial value, whatever the loss.
+chance: it goes back to its initial value, whatever the loss. A law that a vehicle does not follow
+(`by_law`) is no such term: far from its value there it has no effect, and flights tell no more.
 
 The profile of the likelihood shows how far one coefficient may go where all others follow.
 """
@@ -129,7 +130,8 @@ def _undetermined_terms(job: Job, fitted: Fit, uncertainty: Uncertainty) -> tupl
     return tuple(
         name
         for name in uncertainty.names
-        if COEFFICIENTS[name].group
+        if (row := COEFFICIENTS[name]).group
+        and row.by_law is None
         and name not in held | chosen
         and not uncertainty.estimates[name].reason.identifiable
         and uncertainty.estimates[name].reason.bound is not None
@@ -150,7 +152,8 @@ def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:
 
     A coefficient is its own stand-in unless it trades off against another one. Coefficients that
     noise alone would leave determined keep their values, with a wide interval: the initial value
-    is no better. So do all where the flights refute the fit.
+    is no better. So do those of a law, unless they trade off, and all where the flights refute the
+    fit.
     """
     undetermined = [
         name
@@ -172,7 +175,8 @@ def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:
             for name, rank in ranks.items()
         }
         stand_ins |= dict.fromkeys(members, min(members, key=order.__getitem__))
-    return stand_ins | {name: name for name in undetermined if name not in stand_ins}
+    alone = (name for name in undetermined if name not in stand_ins)
+    return stand_ins | {name: name for name in alone if COEFFICIENTS[name].by_law is None}
 
 
 def _narrow_by_noise(uncertainty: Uncertainty) -> frozenset[str]:

@@ -213,6 +213,7 @@ _ROWS = (
         place=("aerodynamics", "max_relative_airspeed"),
         bounds=1000.0,
         prior_sd=1.0,
+        hold_rank=4,
         by_law=25.0,
         group="thrust_inflow",
         exported_as={

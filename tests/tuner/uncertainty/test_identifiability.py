@@ -14,12 +14,12 @@ from tuner.uncertainty.verdict import Reason, ReasonCode
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 
-def known(error, *, beyond_noise, code=ReasonCode.WIDE_INTERVAL):
+def known(error, *, beyond_noise, code=ReasonCode.WIDE_INTERVAL, name="time_constant_up"):
     """Return the uncertainty of one coefficient."""
     estimate = SimpleNamespace(reason=Reason(code=code), identifiable=code is ReasonCode.INTERVAL)
     return SimpleNamespace(
-        names=("time_constant_up",),
-        estimates={"time_constant_up": estimate},
+        names=(name,),
+        estimates={name: estimate},
         covariance=SimpleNamespace(
             data_error=np.array([error]), beyond_noise=np.array([beyond_noise])
         ),
@@ -36,8 +36,16 @@ def known(error, *, beyond_noise, code=ReasonCode.WIDE_INTERVAL):
         (known(0.4, beyond_noise=50.0), False),
         (known(20.0, beyond_noise=50.0, code=ReasonCode.NO_INFORMATION), True),
         (known(0.4, beyond_noise=50.0, code=ReasonCode.PRIOR_DOMINATES), True),
+        (known(0.4, beyond_noise=1.0, name="max_relative_airspeed"), False),
     ],
-    ids=["known", "noise leaves it open", "gusts do", "neither tells", "the prior alone tells"],
+    ids=[
+        "known",
+        "noise leaves it open",
+        "gusts do",
+        "neither tells",
+        "the prior alone tells",
+        "of a law that is not followed",
+    ],
 )
 def test_held_coefficients(uncertainty, held):
     assert bool(stand_ins_of(uncertainty)) is held
@@ -85,8 +93,9 @@ IDLE = {"name": "ground_effect", "bound": "upper", "code": ReasonCode.NULL_DIREC
         (IDLE, JobFile(terms=["ground_effect"]), False),
         (IDLE, JobFile(free=["ground_effect"]), False),
         (IDLE | {"name": "motor_constant"}, JobFile(), False),
+        (IDLE | {"name": "max_relative_airspeed"}, JobFile(), False),
     ],
-    ids=["idle", "inside", "identified", "named", "asked to be free", "of the base model"],
+    ids=["idle", "inside", "identified", "named", "asked to be free", "of the base model", "a law"],
 )
 def test_a_term_at_its_bound_that_flights_do_not_identify_is_removed(
     monkeypatch, start_sd, idle, file, goes
@@ -124,3 +133,17 @@ def test_a_term_at_its_bound_that_flights_do_not_identify_is_removed(
     assert after.kept is not goes
     assert (after.reason is SelectionCode.NO_INFORMATION) is goes
     assert others == [asked]
+
+
+def test_where_thrust_inflow_and_the_law_of_airspeed_trade_off_the_law_stays():
+    names = ("max_relative_airspeed", "thrust_inflow_coefficient")
+    lost = SimpleNamespace(reason=Reason(code=ReasonCode.NULL_DIRECTION), identifiable=False)
+    traded = SimpleNamespace(moves=dict(zip(names, (0.6, 0.8), strict=True)), null=True)
+    uncertainty = SimpleNamespace(
+        names=names,
+        estimates=dict.fromkeys(names, lost),
+        covariance=SimpleNamespace(data_error=np.full(2, 9.0), beyond_noise=np.ones(2)),
+        reference=np.ones(2),
+        directions=(traded,),
+    )
+    assert stand_ins_of(uncertainty) == dict.fromkeys(names, "max_relative_airspeed")
